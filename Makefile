@@ -1,0 +1,78 @@
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help .venv demo test test-slow docs lock format clean
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --no-deps
+
+# Held back where a newer release refuses an early 3.11.
+LOCK_CONSTRAINTS := soupsieve<3
+
+# $(call require,CONDITION ON THE VERSION,MESSAGE)
+require = @command -v "$(PYTHON)" >/dev/null || { echo "$(PYTHON) was not found; name an interpreter with PYTHON=..." >&2; exit 1; }; \
+	"$(PYTHON)" -c 'import sys; sys.exit(not sys.version_info$(1))' || { echo "$(2)" >&2; exit 1; }
+
+help:
+	@echo "make demo       run the relaxed rigid body; results go to demo_output/"
+	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
+	@echo "make test-slow  the slow tests"
+	@echo "make docs       build the documentation in docs/_build/html"
+	@echo "make format     format the code and repair what the linter can"
+	@echo "make lock       choose new exact versions for requirements.lock (needs Python 3.11)"
+	@echo "make clean      remove .venv and everything built"
+	@echo
+	@echo "Each sets up .venv by itself. Another interpreter: make test PYTHON=python3.12"
+
+# Each stamp is written last, so a set-up that was interrupted starts again.
+.venv: .venv/installed
+
+.venv/locked: requirements.lock
+	$(call require, >= (3$(comma) 11),liethermo needs Python 3.11 or newer and $(PYTHON) is older. Name a newer one with PYTHON=...)
+	rm -rf .venv
+	"$(PYTHON)" -m venv .venv
+	$(PIP_INSTALL) -r requirements.lock
+	@touch $@
+
+.venv/installed: .venv/locked pyproject.toml
+	$(PIP_INSTALL) --no-build-isolation -e .
+	@touch $@
+
+comma := ,
+
+demo: .venv
+	$(BIN)/liethermo run examples/relaxed_rigid_body.toml --out demo_output
+
+test: .venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -n 2
+
+test-slow: .venv
+	$(BIN)/python -m pytest -n 2 -m slow
+
+docs: .venv
+	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+
+format: .venv
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock:
+	$(call require,[:2] == (3$(comma) 11),The lock is made with Python 3.11$(comma) the oldest one supported: make lock PYTHON=python3.11)
+	@set -e; folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
+	"$(PYTHON)" -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; print(*p["dependencies"], *e["test"], *e["docs"], "setuptools", "wheel", sep="\n")' > "$$folder/wanted"; \
+	echo "$(LOCK_CONSTRAINTS)" > "$$folder/constraints"; \
+	"$(PYTHON)" -m venv "$$folder/venv"; \
+	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check --upgrade -c "$$folder/constraints" -r "$$folder/wanted"; \
+	{ echo "# Exact versions of everything that the library, its tests and its documentation need."; \
+	  echo "# Written from pyproject.toml by 'make lock'; not edited by hand."; \
+	  "$$folder/venv/bin/python" -m pip freeze --all --exclude pip; } > "$$folder/lock"; \
+	cp "$$folder/lock" requirements.lock
+
+clean:
+	rm -rf .venv build *.egg-info demo_output docs/_build docs/auto_examples docs/generated docs/sg_execution_times.rst
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,91 @@
+"""Time integration that obeys the two laws of thermodynamics exactly, on Lie algebras, Lie groups and manifolds.
+
+Importing this package switches JAX to 64-bit floating point (see :mod:`manifolds`).
+"""
+
+from __future__ import annotations
+
+import importlib
+
+import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
+
+from . import models
+from .audit import Audit
+from .dissipation import (
+    Dissipation,
+    DoubleBracket,
+    EulerPoincareForce,
+    FourBracket,
+    FrictionOperator,
+    InnerProductDissipation,
+    KillingDissipation,
+    ProjectedMetric,
+)
+from .energy import Energy, Function, Quadratic
+from .errors import (
+    AxiomError,
+    CasimirError,
+    ConvergenceError,
+    FileError,
+    FunctionError,
+    IndefiniteError,
+    InputError,
+    IntegrationError,
+    LiethermoError,
+    NonFiniteError,
+)
+from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
+from .integrate import integrate
+from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .solution import Solution, Stats, Status, load
+from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
+
+__all__ = [
+    "Audit",
+    "AxiomError",
+    "CasimirError",
+    "ConvergenceError",
+    "CoordinateIncrement",
+    "DiscreteGradient",
+    "Dissipation",
+    "DoubleBracket",
+    "Energy",
+    "EulerPoincareForce",
+    "EulerPoincareSystem",
+    "FileError",
+    "FourBracket",
+    "FrictionOperator",
+    "Function",
+    "FunctionError",
+    "Gonzalez",
+    "IndefiniteError",
+    "InnerProductDissipation",
+    "InputError",
+    "IntegrationError",
+    "KillingDissipation",
+    "LiePoissonSystem",
+    "LiethermoError",
+    "MeanValue",
+    "MetriplecticMidpoint",
+    "MetriplecticSystem",
+    "NonFiniteError",
+    "OneStepMethod",
+    "ProjectedMetric",
+    "Quadratic",
+    "Reference",
+    "Solution",
+    "Stats",
+    "Status",
+    "System",
+    "integrate",
+    "load",
+    "models",
+    "plot",
+    "registered_methods",
+]
+
+
+def __getattr__(name: str):
+    if name == "plot":  # matplotlib is imported only when a picture is wanted
+        return importlib.import_module(".plot", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,141 @@
+"""Energies and entropies: functions of the state as sums of terms, quadratic or general.
+
+The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
+midpoint is one already; a general term gets a correction of its own [EQUATIONS: "Sums of energies"].
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import manifolds as mf
+
+from .errors import FunctionError, InputError
+
+
+class Energy(eqx.Module):
+    """A real function of the state with a gradient; energies add with ``+``.
+
+    Calling one evaluates it: shape (..., n) to shape (...).
+    """
+
+    @abstractmethod
+    def value(self, x) -> jax.Array:
+        """The value at one state, shape (n,) to shape ()."""
+
+    def gradient(self, x) -> jax.Array:
+        """The gradient at one state, shape (n,)."""
+        return jax.grad(self.value)(x)
+
+    @property
+    def terms(self) -> tuple[Energy, ...]:
+        """The summands, none of them a sum itself."""
+        return (self,)
+
+    def __call__(self, x) -> jax.Array:
+        return jnp.vectorize(self.value, signature="(n)->()")(jnp.asarray(x, dtype=jnp.float64))
+
+    def __add__(self, other) -> Energy:
+        return Sum((*self.terms, *as_energy(other, "a term of a sum").terms))
+
+    __radd__ = __add__
+
+
+class Quadratic(Energy):
+    """``x . A x / 2 + b . x + c``.
+
+    Parameters
+    ----------
+    A : array, shape (n, n) symmetric, or (n,) for a diagonal matrix
+    b : array, shape (n,), optional
+    c : float, optional
+    """
+
+    A: jax.Array
+    b: jax.Array | None
+    c: jax.Array
+
+    def __init__(self, A, b=None, c=0.0):
+        self.A = jnp.asarray(A, dtype=jnp.float64)
+        self.b = None if b is None else jnp.asarray(b, dtype=jnp.float64)
+        self.c = jnp.asarray(c, dtype=jnp.float64)
+        if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
+            raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
+        if self.b is not None and self.b.shape != self.A.shape[:1]:
+            raise InputError(f"b has shape {self.A.shape[:1]} beside this A, not {self.b.shape}")
+        if self.A.ndim == 2 and not isinstance(self.A, jax.core.Tracer):
+            asymmetry = float(jnp.max(jnp.abs(self.A - self.A.T)))
+            if asymmetry > 1e-12 * float(jnp.max(jnp.abs(self.A))):
+                raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
+
+    def linear_part(self, x) -> jax.Array:
+        """``A x``."""
+        return self.A * x if self.A.ndim == 1 else self.A @ x
+
+    def value(self, x) -> jax.Array:
+        linear = 0.0 if self.b is None else jnp.dot(self.b, x)
+        return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
+
+    def gradient(self, x) -> jax.Array:
+        return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
+
+
+class Function(Energy):
+    """An energy given by a plain function from a JAX array, shape (n,), to a scalar; differentiated by JAX.
+
+    The function may be an ``equinox.Module``: its arrays are then parameters of the system.
+    """
+
+    function: Callable
+
+    def value(self, x) -> jax.Array:
+        return jnp.asarray(self.function(x))
+
+
+class Sum(Energy):
+    """A sum of energies."""
+
+    summands: tuple[Energy, ...]
+
+    @property
+    def terms(self) -> tuple[Energy, ...]:
+        return self.summands
+
+    def value(self, x) -> jax.Array:
+        return sum((term.value(x) for term in self.summands[1:]), self.summands[0].value(x))
+
+    def gradient(self, x) -> jax.Array:
+        return sum((term.gradient(x) for term in self.summands[1:]), self.summands[0].gradient(x))
+
+
+def as_energy(function, role: str) -> Energy:
+    """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function."""
+    if isinstance(function, Energy):
+        return function
+    if isinstance(function, mf.Polynomial) and function.degree <= 2:
+        origin = jnp.zeros(function.dim)
+        value, gradient = jax.value_and_grad(function)(origin)
+        return Quadratic(jax.hessian(function)(origin), gradient, value)
+    if callable(function):
+        return Function(function)
+    raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
+
+
+def check_scalar(energy: Energy, dim: int, role: str) -> None:
+    """Raise unless the energy maps a state of this dimension to one real number."""
+    state = jax.ShapeDtypeStruct((dim,), jnp.float64)
+    try:
+        result = jax.eval_shape(energy.value, state)
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        raise FunctionError(
+            f"{role} could not be evaluated on a state of shape ({dim},): {type(error).__name__}: {error}. "
+            "It must be written with jax.numpy and accept one array"
+        ) from error
+    if result.shape != ():
+        raise FunctionError(f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?")
+    if not jnp.issubdtype(result.dtype, jnp.floating):
+        raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")

@@ -1,0 +1,1 @@
+"""Engines: how the definition of a step becomes fast code."""

@@ -1,0 +1,76 @@
+"""Errors of the dynamics layer; each message says what was found, what is allowed and what to do."""
+
+from __future__ import annotations
+
+
+class LiethermoError(Exception):
+    """Base class of every error raised on purpose by :mod:`liethermo`."""
+
+
+class InputError(LiethermoError, ValueError):
+    """A value that cannot be used: wrong shape, not finite, not positive, an unknown name."""
+
+
+class FunctionError(LiethermoError, TypeError):
+    """A user's function that does not return what its role asks for."""
+
+
+class AxiomError(LiethermoError, ValueError):
+    """A system that is not metriplectic: some axiom fails at a point.
+
+    Attributes
+    ----------
+    residual, tolerance : float
+    """
+
+    def __init__(self, message: str, *, residual: float, tolerance: float):
+        super().__init__(message)
+        self.residual, self.tolerance = residual, tolerance
+
+
+class CasimirError(AxiomError):
+    """The entropy is not a Casimir function: ``Pi grad S != 0``."""
+
+
+class IndefiniteError(AxiomError):
+    """A form that has to be positive semidefinite has a negative eigenvalue (given as ``residual``)."""
+
+
+class FileError(LiethermoError, OSError):
+    """A result file that is missing, cut short or not one of this library's."""
+
+
+class IntegrationError(LiethermoError, ArithmeticError):
+    """A run that stopped early.
+
+    Attributes
+    ----------
+    solution : Solution
+        The trajectory up to the last good step; ``solution.status`` says where and why it stopped.
+    """
+
+    def __init__(self, message: str, solution):
+        super().__init__(message)
+        self.solution = solution
+
+
+class ConvergenceError(IntegrationError):
+    """The implicit equations of a step could not be solved."""
+
+
+class NonFiniteError(IntegrationError):
+    """A step met NaN or infinity: usually a user's function outside its domain."""
+
+
+class SpecError(LiethermoError, ValueError):
+    """A spec file that cannot be run.
+
+    Attributes
+    ----------
+    problems : tuple of str
+        Everything found wrong, a line each: the key, the value given and what is allowed.
+    """
+
+    def __init__(self, path, problems):
+        self.problems = tuple(problems)
+        super().__init__("\n  ".join([f"{path} cannot be run:", *self.problems]))

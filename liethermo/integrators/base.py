@@ -1,0 +1,76 @@
+"""What an integrator is: a fixed-point equation for its stage slopes, and the step they make."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..systems import System
+
+_registry: list[OneStepMethod] = []
+
+
+class OneStepMethod(eqx.Module):
+    """An implicit one-step method: ``stages`` slopes ``k``, shape (stages, n), that solve ``k = slopes(system, x, low, h, k)``.
+
+    The state is ``x + low``, an unevaluated sum: low is what rounding has kept from x in the steps before (compensated
+    summation), and a scheme should form its points as ``x + (low + …)``.
+
+    A subclass is complete when it gives the abstract members and is registered with
+    :func:`register`: the shared test-suite then holds it to its order and its guarantees. Both engines run it from
+    these definitions alone.
+
+    Attributes
+    ----------
+    order : int
+    preserves : frozenset of str
+        Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"`` (for every
+        entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"quadratic_invariants"`` and
+        ``"linear_invariants"`` (of the system).
+    stages : int
+    """
+
+    @property
+    @abstractmethod
+    def stages(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def order(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def preserves(self) -> frozenset[str]: ...
+
+    @abstractmethod
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
+
+    @abstractmethod
+    def increment(self, h, k) -> jax.Array:
+        """``x' - x``, shape (n,), from the solved slopes."""
+
+    def start(self, system: System, x) -> jax.Array:
+        """Slopes to begin the iteration of a first step with."""
+        return jnp.tile(system.vector_field(x), (self.stages, 1))
+
+    def predict(self, k, before) -> jax.Array:
+        """Slopes to begin the next step with, extrapolated from those of the last two steps."""
+        return 2.0 * k - before
+
+    def __str__(self) -> str:
+        return type(self).__name__
+
+
+def register(*methods: OneStepMethod) -> None:
+    """Add instances to those that the shared test-suite runs."""
+    _registry.extend(methods)
+
+
+def registered_methods() -> Iterator[OneStepMethod]:
+    """The registered instances, one after another."""
+    yield from _registry

@@ -1,0 +1,50 @@
+"""The relaxed rigid body [BFM Example 3.2, §4.3, Fig. 1], and the free one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import manifolds as mf
+
+from ..dissipation import KillingDissipation
+from ..energy import Quadratic
+from ..errors import InputError
+from ..systems import LiePoissonSystem
+
+
+def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -> LiePoissonSystem:
+    """A rigid body whose internal friction keeps its energy and lets it settle on its axis of greatest inertia.
+
+    ``Pi' = Pi × Omega + rate (|Omega|^2 Pi - (Omega . Pi) Omega)``, ``Omega_i = Pi_i / I_i``, with the energy
+    ``H = sum Pi_i^2 / (2 I_i)`` and the entropy ``S = |Pi|^2 / 2``. As t grows S tends to ``max(I) * H``.
+
+    Parameters
+    ----------
+    inertia : three positive numbers
+        Principal moments of inertia (mass * length**2).
+    rate : float, >= 0
+        1 is the equation as printed in the paper, where 𝒦 is the dot product: ``KillingDissipation(rate / 2)``, since the
+        Killing form of so(3) is -2 times it.
+    """
+    return LiePoissonSystem(
+        mf.so(3),
+        energy=Quadratic(1.0 / _inertia(inertia)),
+        entropy=Quadratic(jnp.ones(3)),
+        dissipation=KillingDissipation(0.5 * jnp.asarray(rate, dtype=jnp.float64)),
+    )
+
+
+def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePoissonSystem:
+    """The free rigid body ``Pi' = Pi × Omega``: energy and ``|Pi|^2 / 2`` both conserved."""
+    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / _inertia(inertia)), entropy=Quadratic(jnp.ones(3)))
+
+
+def _inertia(inertia) -> jax.Array:
+    moments = jnp.asarray(inertia, dtype=jnp.float64)
+    if moments.shape != (3,):
+        raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
+    if not isinstance(moments, jax.core.Tracer) and not bool((moments > 0.0).all() & jnp.isfinite(moments).all()):
+        raise InputError(f"moments of inertia are positive and finite, not {moments.tolist()}")
+    return moments

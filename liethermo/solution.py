@@ -1,0 +1,219 @@
+"""What a run returns: the trajectory, the record of its laws, how it ended, and where it came from."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .audit import Audit, Tolerances, audit
+from .errors import FileError
+
+if TYPE_CHECKING:
+    import xarray
+
+FORMAT = "liethermo-solution-1"
+
+
+@dataclass(frozen=True)
+class Status:
+    """How a run ended.
+
+    Attributes
+    ----------
+    code : {"completed", "not_converged", "non_finite", "interrupted", "reference_failed"}
+    message : str
+        A full sentence: what happened, where, and what to try.
+    step : int
+        Steps taken; where ``ok`` is false the step after it is the one that failed.
+    time : float
+        Time reached.
+    residual : float
+        ``h |k - slopes(k)| / |x|`` of the last step tried.
+    """
+
+    code: str
+    message: str
+    step: int
+    time: float
+    residual: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        return self.code == "completed"
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.message}"
+
+
+@dataclass(frozen=True)
+class Stats:
+    """The work of a run and its extremes over *all* steps, saved or not.
+
+    Attributes
+    ----------
+    steps, fixed_point_iterations, newton_iterations, most_iterations : int
+        ``most_iterations`` is the largest number in one step.
+    worst_residual : float
+        Largest ``h |k - slopes(k)| / |x|`` accepted.
+    energy_range : (float, float)
+        Smallest and largest energy met.
+    least_entropy_increment, largest_energy_increment : float
+        Of one step.
+    wall_time : float
+        Seconds, compilation included.
+    """
+
+    steps: int = 0
+    fixed_point_iterations: int = 0
+    newton_iterations: int = 0
+    most_iterations: int = 0
+    worst_residual: float = 0.0
+    energy_range: tuple[float, float] = (np.inf, -np.inf)
+    least_entropy_increment: float = np.inf
+    largest_energy_increment: float = -np.inf
+    wall_time: float = 0.0
+
+    @property
+    def iterations_per_step(self) -> float:
+        return (self.fixed_point_iterations + self.newton_iterations) / max(self.steps, 1)
+
+
+@dataclass(frozen=True)
+class Laws:
+    """What the system promises: the law of the energy, of the entropy, and the functions it conserves."""
+
+    energy: str = "conserved"
+    entropy: str | None = None
+    conserved: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A trajectory with its laws.
+
+    Attributes
+    ----------
+    t : ndarray, shape (times,)
+    x : ndarray, shape (times, n)
+    energy : ndarray, shape (times,)
+    entropy : ndarray, shape (times,), or None
+    casimirs : dict of ndarray, shape (times,)
+        Casimirs, momentum maps and preserved functions along the run, by name.
+    status : Status
+    stats : Stats
+    laws : Laws
+    provenance : dict
+        Library version, method, step, system, date, spec: JSON data.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    energy: np.ndarray
+    entropy: np.ndarray | None
+    casimirs: dict[str, np.ndarray]
+    status: Status
+    stats: Stats
+    laws: Laws
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def audit(self, **tolerances: float) -> Audit:
+        """Whether the laws held, as a table; see :class:`liethermo.audit.Tolerances` for the keywords."""
+        return audit(self, Tolerances(**tolerances))
+
+    def with_provenance(self, **entries) -> Solution:
+        """The same solution with more said about where it comes from."""
+        return replace(self, provenance={**self.provenance, **entries})
+
+    def to_xarray(self) -> xarray.Dataset:
+        """An ``xarray.Dataset`` with coordinate ``time`` and all series; the rest as attributes (JSON)."""
+        import xarray
+
+        series = {"energy": ("time", self.energy)}
+        if self.entropy is not None:
+            series["entropy"] = ("time", self.entropy)
+        variables: dict[str, Any] = {"x": (("time", "component"), self.x), **series}
+        variables["invariant"] = (
+            ("invariant_name", "time"),
+            np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
+        )
+        coordinates = {"time": self.t, "invariant_name": np.array(list(self.casimirs), dtype=object)}
+        attributes = {
+            "format": FORMAT,
+            "times": len(self.t),
+            "status": json.dumps(asdict(self.status)),
+            "stats": json.dumps(asdict(self.stats)),
+            "laws": json.dumps(asdict(self.laws)),
+            "provenance": json.dumps(self.provenance),
+        }
+        return xarray.Dataset(variables, coordinates, attributes)
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write a NetCDF file; it appears whole or not at all."""
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".part")
+            os.close(handle)
+        except OSError as error:
+            raise FileError(f"cannot write {path}: {error}") from error
+        try:
+            self.to_xarray().to_netcdf(temporary, engine="h5netcdf")
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+        return path
+
+    def __repr__(self) -> str:
+        return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
+
+
+def load(path: str | os.PathLike) -> Solution:
+    """Read a file written by :meth:`Solution.save`.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, cut short, or not a result of this library.
+    """
+    import xarray
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"there is no file {path}")
+    try:
+        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
+            dataset.load()
+    except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
+        raise FileError(
+            f"{path} cannot be read as NetCDF ({type(error).__name__}: {error}): it is cut short, damaged or of another kind"
+        ) from error
+    if dataset.attrs.get("format") != FORMAT:
+        raise FileError(f"{path} is a NetCDF file, but not a liethermo result (its format is {dataset.attrs.get('format')!r})")
+    try:
+        stored = {name: json.loads(dataset.attrs[name]) for name in ("status", "stats", "laws", "provenance")}
+        t, x = dataset["time"].values, dataset["x"].values
+        if len(t) != int(dataset.attrs["times"]):
+            raise ValueError(f"{len(t)} times of {dataset.attrs['times']}")
+        names = [str(name) for name in dataset["invariant_name"].values]
+        stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
+        stored["laws"]["conserved"] = tuple(stored["laws"]["conserved"])
+        return Solution(
+            t=t,
+            x=x,
+            energy=dataset["energy"].values,
+            entropy=dataset["entropy"].values if "entropy" in dataset else None,
+            casimirs=dict(zip(names, dataset["invariant"].values, strict=True)),
+            status=Status(**stored["status"]),
+            stats=Stats(**stored["stats"]),
+            laws=Laws(**stored["laws"]),
+            provenance=stored["provenance"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error

@@ -1,0 +1,8 @@
+"""Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
+
+from .base import System
+from .euler_poincare import EulerPoincareSystem, Legendre
+from .lie_poisson import LiePoissonSystem
+from .metriplectic import MetriplecticSystem
+
+__all__ = ["EulerPoincareSystem", "Legendre", "LiePoissonSystem", "MetriplecticSystem", "System"]

@@ -1,0 +1,207 @@
+"""What every system has in common: ``x' = Pi(x) dH + force(x; dH, dS)`` and the laws that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import manifolds as mf
+import numpy as np
+
+from ..dissipation import Dissipation, Law
+from ..energy import Energy, as_energy, check_scalar
+from ..errors import AxiomError, CasimirError, FunctionError, InputError
+from .check import AXIOM_TOLERANCE, CheckReport, check_system
+
+
+class System(eqx.Module):
+    """A metriplectic system on R^n [BFM §2.3]; see the subclasses for how to build one.
+
+    A system is a pytree: its parameters (those of ``lt.Quadratic``, the rates, the arrays of ``equinox`` modules used as
+    functions) are leaves, which can be swept, batched and differentiated.
+
+    Attributes
+    ----------
+    poisson : manifolds.PoissonStructure
+    energy, entropy : Energy
+        Callable on states of shape (..., n). ``entropy`` is None for a system without one.
+    dissipation : Dissipation or None
+    momentum_maps : dict of Energy
+        Further functions that are claimed to be conserved, by name.
+    dim : int
+        Number of state components.
+    """
+
+    poisson: mf.PoissonStructure
+    energy: Energy
+    entropy: Energy | None
+    dissipation: Dissipation | None
+    momentum_maps: dict[str, Energy]
+    dim: int = eqx.field(static=True)
+
+    def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate) -> None:
+        """Shared by the constructors of the subclasses, after they have set what is their own."""
+        self.poisson, self.dim = poisson, dim
+        self.energy = as_energy(energy, "the energy")
+        self.entropy = None if entropy is None else as_energy(entropy, "the entropy")
+        if not isinstance(momentum_maps, Mapping):
+            momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
+        self.momentum_maps = {name: as_energy(J, f"momentum map {name!r}") for name, J in momentum_maps.items()}
+        check_scalar(self.energy, dim, "the energy")
+        if self.entropy is not None:
+            check_scalar(self.entropy, dim, "the entropy")
+        for name, J in self.momentum_maps.items():
+            check_scalar(J, dim, f"momentum map {name!r}")
+        if dissipation is not None and not isinstance(dissipation, Dissipation):
+            raise InputError(
+                f"dissipation must be one of the library's Dissipation objects or None, not {type(dissipation).__name__}"
+            )
+        if dissipation is not None and self.entropy is None and dissipation.needs_entropy:
+            raise InputError(f"{type(dissipation).__name__} drives the entropy up, so the system needs an entropy")
+        self.dissipation = None
+        if dissipation is not None:
+            for L in dissipation.preserve:
+                check_scalar(L, dim, "a preserved function")
+            self.dissipation = dissipation.prepared(self)
+        if validate and not _has_tracers(self):
+            self._validate()
+
+    # -- dynamics -------------------------------------------------------------------------------------------------
+
+    def field(self, x, dH, dS, dL=()) -> jax.Array:
+        """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
+
+        This is the one definition of the dynamics; integrators differ in the gradients they hand it.
+        """
+        motion = self.poisson.sharp(x, dH)
+        return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
+
+    def vector_field(self, x) -> jax.Array:
+        """``x'`` at a state or a batch of states, shape (..., n)."""
+        x = self.state(x, batch=True)
+        return jnp.vectorize(self._vector_field, signature="(n)->(n)")(x)
+
+    def entropy_production(self, x) -> jax.Array:
+        """``grad S . x'``, the rate of growth of the entropy, shape (...)."""
+        entropy = self._needed_entropy()
+        return jnp.vectorize(lambda y: jnp.dot(entropy.gradient(y), self._vector_field(y)), signature="(n)->()")(
+            self.state(x, batch=True)
+        )
+
+    def friction_matrix(self, x) -> jax.Array:
+        """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``."""
+        x = self.state(x)
+        if self.dissipation is None:
+            return jnp.zeros((self.dim, self.dim))
+        dH, dL = self.energy.gradient(x), self._preserved_gradients(x)
+        return jax.jacfwd(lambda dS: self.dissipation.force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
+
+    @property
+    def preserved(self) -> tuple[Energy, ...]:
+        """The functions that the dissipation is told to preserve besides the energy."""
+        return () if self.dissipation is None else self.dissipation.preserve
+
+    @property
+    def energy_law(self) -> Law:
+        """"conserved", or "nonincreasing" under double-bracket dissipation."""
+        return "conserved" if self.dissipation is None else self.dissipation.energy_law
+
+    @property
+    def entropy_law(self) -> Law | None:
+        """"nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
+        if self.entropy is None:
+            return None
+        return "conserved" if self.dissipation is None else self.dissipation.entropy_law
+
+    def invariants(self) -> dict[str, tuple[Energy, bool]]:
+        """Further functions worth recording along a run, by name, each with whether the system conserves it."""
+        found = {name: (J, True) for name, J in self.momentum_maps.items()}
+        for i, L in enumerate(self.preserved):
+            found.setdefault(f"preserved {i + 1}", (L, True))
+        return found
+
+    # -- checks ---------------------------------------------------------------------------------------------------
+
+    def state(self, x, batch: bool = False) -> jax.Array:
+        """``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
+
+        Raises
+        ------
+        InputError
+        """
+        try:
+            x = jnp.asarray(x)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"a state is an array of {self.dim} real numbers: {error}") from None
+        if jnp.iscomplexobj(x):
+            raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
+        if not jnp.issubdtype(x.dtype, jnp.number):
+            raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
+        if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
+            expected = f"(..., {self.dim})" if batch else f"({self.dim},)"
+            raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
+        if not isinstance(x, jax.core.Tracer) and not bool(jnp.isfinite(x).all()):
+            where = np.argwhere(~np.isfinite(np.asarray(x)))[0]
+            raise InputError(f"the state is not finite: component {tuple(map(int, where))} is {x[tuple(where)]}")
+        return x.astype(jnp.float64)
+
+    def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0) -> CheckReport:
+        """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
+
+        Parameters
+        ----------
+        points : array, shape (m, n), optional
+            Where to test. By default ``samples`` normally distributed points of standard deviation ``scale``.
+        samples, seed, scale
+            Of the random points.
+
+        Returns
+        -------
+        CheckReport
+            ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
+        """
+        return check_system(self, points, samples, seed, scale)
+
+    def _validate(self) -> None:
+        """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""
+        for row in check_system(self, None, 4, 0, 1.0).rows:
+            if row.passed is not False:
+                continue
+            kind = CasimirError if row.axiom == "Pi grad S = 0" else AxiomError
+            raise kind(
+                f"{row.axiom} fails: residual {row.residual:.3g}, tolerance {row.tolerance:.1g}. {row.note}".rstrip()
+                + " (validate=False builds the system all the same)",
+                residual=row.residual,
+                tolerance=row.tolerance,
+            )
+
+    def _vector_field(self, x) -> jax.Array:
+        dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
+        return self.field(x, self.energy.gradient(x), dS, self._preserved_gradients(x))
+
+    def _preserved_gradients(self, x) -> tuple[jax.Array, ...]:
+        return tuple(L.gradient(x) for L in self.preserved)
+
+    def _needed_entropy(self) -> Energy:
+        if self.entropy is None:
+            raise InputError("this system has no entropy")
+        return self.entropy
+
+
+def square_field(function: Callable, dim: int, what: str) -> None:
+    """Raise unless ``function`` maps a state to a (dim, dim) matrix."""
+    try:
+        shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(f"{what} could not be evaluated on a state of shape ({dim},): {error}") from error
+    if shape != (dim, dim):
+        raise FunctionError(f"{what} must return a ({dim}, {dim}) matrix, but it returns shape {shape}")
+
+
+def _has_tracers(tree) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
+
+
+__all__ = ["AXIOM_TOLERANCE", "System", "square_field"]

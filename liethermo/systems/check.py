@@ -1,0 +1,153 @@
+"""The axioms of a metriplectic system, tested at points [BFM §2.3]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from .base import System
+
+AXIOM_TOLERANCE = 1e-10
+"""Largest residual of an axiom, relative to the size of what should cancel (second derivatives round at about 1e-13)."""
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """One axiom: its worst relative residual over the points. ``passed`` is None for a report without a verdict."""
+
+    axiom: str
+    residual: float
+    tolerance: float
+    passed: bool | None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The axioms of a system and how far each is from holding. Printing it gives a table."""
+
+    rows: tuple[CheckRow, ...]
+    points: int
+
+    @property
+    def passed(self) -> bool:
+        return all(row.passed is not False for row in self.rows)
+
+    def __str__(self) -> str:
+        width = max(len(row.axiom) for row in self.rows)
+        verdict = {True: "ok", False: "FAILS", None: "-"}
+        lines = [f"{'axiom':<{width}}  {'residual':>9}  {'tolerance':>9}  "]
+        for row in self.rows:
+            tolerance = f"{row.tolerance:9.1e}" if row.passed is not None else " " * 9
+            lines.append(f"{row.axiom:<{width}}  {row.residual:9.1e}  {tolerance}  {verdict[row.passed]:<5} {row.note}")
+        total = "all axioms hold" if self.passed else "NOT metriplectic"
+        return "\n".join(line.rstrip() for line in [*lines, f"{total} (at {self.points} points)"])
+
+
+def check_system(system: System, points, samples: int, seed: int, scale: float) -> CheckReport:
+    """See :meth:`liethermo.systems.base.System.check`."""
+    if points is None:
+        if samples < 1:
+            raise InputError(f"samples must be a positive integer, not {samples}")
+        points = scale * np.random.default_rng(seed).standard_normal((samples, system.dim))
+    points = jnp.atleast_2d(system.state(points, batch=True)).reshape(-1, system.dim)
+    measured = {name: np.asarray(value) for name, value in _measure(system, points).items()}
+    inside = np.isfinite(measured["domain"])
+    if not inside.any():
+        raise InputError(
+            f"energy, entropy or dissipation is not finite at any of the {len(points)} test points: give points inside "
+            "their domain to system.check(points=...), and validate=False to the constructor"
+        )
+    rows = [
+        _row(system, name, values[inside], axiom, note)
+        for name, values in measured.items()
+        if name in _AXIOMS
+        for axiom, note in [_AXIOMS[name]]
+    ]
+    rows += [
+        _row(system, name, values[inside], name, "a momentum map has to commute with H and lie in the kernel of K")
+        for name, values in measured.items()
+        if name.startswith("momentum map")
+    ]
+    if not inside.all():
+        rows.append(CheckRow("domain", float((~inside).sum()), 0.0, None, "points outside the domain, left out"))
+    return CheckReport(tuple(rows), int(inside.sum()))
+
+
+_AXIOMS = {
+    "skew": ("Pi skew", "the Poisson tensor must be antisymmetric"),
+    "jacobi": ("Jacobi", "Pi is not a Poisson tensor"),
+    "casimir": (
+        "Pi grad S = 0",
+        "The entropy is not a Casimir function; on a Lie algebra g, g.casimirs(degree) lists polynomial ones",
+    ),
+    "symmetric": ("K symmetric", "the friction matrix must be symmetric"),
+    "kernel": ("K grad H = 0", "the dissipation would change the energy"),
+    "semidefinite": ("K >= 0", "the friction matrix has a negative eigenvalue, so entropy could fall"),
+    "preserved": ("K grad L = 0", "the dissipation does not keep the functions it is told to preserve"),
+    "first law": ("energy law", "dH/dt along the vector field has the wrong size or sign"),
+    "second law": ("entropy law", "dS/dt along the vector field has the wrong sign"),
+    "production": ("min dS/dt", "smallest entropy production found (no guarantee asked)"),
+}
+
+
+def _row(system: System, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
+    worst = float(values.max())
+    if name == "production":
+        return CheckRow(axiom, float(values.min()), 0.0, None, note)
+    passed = worst <= AXIOM_TOLERANCE
+    return CheckRow(axiom, worst, AXIOM_TOLERANCE, passed, "" if passed else note)
+
+
+@eqx.filter_jit
+def _measure(system: System, points: jax.Array) -> dict[str, jax.Array]:
+    """Residual of each axiom at each point, relative to the size of the terms that cancel."""
+    return jax.vmap(lambda x: _residuals(system, x))(points)
+
+
+def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
+    size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
+    relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
+    tensor, dH = system.poisson.tensor(x), system.energy.gradient(x)
+    dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
+    rate = system.vector_field(x)
+    found = {
+        "domain": jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate),
+        "skew": relative(size(tensor + tensor.T), size(tensor)),
+        "jacobi": relative(system.poisson.jacobi_residual(x), size(tensor) * size(jax.jacfwd(system.poisson.tensor)(x))),
+    }
+    if system.entropy is not None:
+        found["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
+    dissipation = system.dissipation
+    if dissipation is not None and dissipation.entropy_law == "nondecreasing":
+        K = system.friction_matrix(x)
+        found["symmetric"] = relative(size(K - K.T), size(K))
+        found["kernel"] = relative(size(K @ dH), size(K) * size(dH))
+        found["semidefinite"] = relative(-jnp.minimum(jnp.linalg.eigvalsh((K + K.T) / 2)[0], 0.0), size(K))
+        for L in system.preserved:
+            dL = L.gradient(x)
+            residual = relative(size(K @ dL), size(K) * size(dL))
+            found["preserved"] = jnp.maximum(found.get("preserved", 0.0), residual)
+    flow = jnp.dot(dH, rate)
+    flow = jnp.abs(flow) if system.energy_law == "conserved" else jnp.maximum(flow, 0.0)
+    found["first law"] = relative(flow, size(dH) * size(rate))
+    if system.entropy is not None:
+        production = jnp.dot(dS, rate)
+        if system.entropy_law is None:
+            found["production"] = production
+        else:
+            wrong = jnp.abs(production) if system.entropy_law == "conserved" else jnp.maximum(-production, 0.0)
+            found["second law"] = relative(wrong, size(dS) * size(rate))
+    for name, J in system.momentum_maps.items():
+        dJ = J.gradient(x)
+        found[f"momentum map {name}"] = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * size(rate))
+    return found

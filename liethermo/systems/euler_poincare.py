@@ -1,0 +1,162 @@
+"""Euler-Poincaré systems: a Lagrangian on the Lie algebra, the Legendre transform inside [BFM 3.1-3.4]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import manifolds as mf
+import numpy as np
+
+from ..dissipation import Dissipation, EulerPoincareForce
+from ..energy import Energy, Quadratic, as_energy, check_scalar
+from ..errors import InputError
+from .lie_poisson import LiePoissonSystem
+
+NEWTON_STEPS = 50
+_SINGULAR = "the Lagrangian is singular: its Hessian has no inverse, so the momentum mu does not determine the velocity xi"
+
+
+class Legendre(Energy):
+    """The Hamiltonian ``H(mu) = <mu, xi> - l(xi)`` at the xi with ``dl/dxi = mu``.
+
+    Its gradient is xi(mu). The equation is solved by damped Newton, and differentiated as an implicit function.
+
+    Attributes
+    ----------
+    lagrangian : Energy
+    """
+
+    lagrangian: Energy
+
+    def velocity(self, mu) -> jax.Array:
+        """xi with ``dl/dxi = mu``, shape (n,); NaN where Newton's method finds none."""
+        return _inverse_gradient(self.lagrangian, jnp.asarray(mu))
+
+    def momentum(self, xi) -> jax.Array:
+        """``dl/dxi``, shape (n,)."""
+        return self.lagrangian.gradient(jnp.asarray(xi))
+
+    def value(self, x) -> jax.Array:
+        xi = self.velocity(x)
+        return jnp.dot(x, xi) - self.lagrangian.value(xi)
+
+    def gradient(self, x) -> jax.Array:
+        return self.velocity(x)
+
+
+class EulerPoincareSystem(LiePoissonSystem):
+    """Forced Euler-Poincaré equations ``d/dt dl/dxi = ad*_xi (dl/dxi + F(xi))`` in the momentum mu = dl/dxi [BFM 3.2, 3.4].
+
+    The state is mu; ``system.velocity(mu)`` gives xi and ``system.momentum(xi)`` the way back. A quadratic Lagrangian
+    given as ``lt.Quadratic`` is transformed in closed form.
+
+    Parameters
+    ----------
+    algebra : manifolds.LieAlgebra
+    lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
+        Its Hessian must be invertible (regular Lagrangian).
+    entropy, dissipation, momentum_maps, validate
+        As for :class:`LiePoissonSystem`; functions of mu.
+    force : function from xi to a covector, optional
+        F of (3.2): conserves the energy whatever it is. For a force that raises an entropy use ``dissipation``.
+    """
+
+    lagrangian: Energy
+
+    def __init__(
+        self,
+        algebra: mf.LieAlgebra,
+        lagrangian,
+        entropy=None,
+        dissipation: Dissipation | None = None,
+        force: Callable | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+    ):
+        self.lagrangian = as_energy(lagrangian, "the Lagrangian")
+        check_scalar(self.lagrangian, algebra.dim, "the Lagrangian")
+        if force is not None:
+            forced = EulerPoincareForce(force)
+            dissipation = forced if dissipation is None else dissipation + forced
+        energy = _hamiltonian(self.lagrangian, algebra.dim)
+        super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate)
+
+    def velocity(self, mu) -> jax.Array:
+        """xi = dH/dmu at a state or batch of states, shape (..., dim)."""
+        return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(self.state(mu, batch=True))
+
+    def momentum(self, xi) -> jax.Array:
+        """mu = dl/dxi, shape (..., dim)."""
+        return jnp.vectorize(self.lagrangian.gradient, signature="(n)->(n)")(self.state(xi, batch=True))
+
+
+def _hamiltonian(lagrangian: Energy, dim: int) -> Energy:
+    if not isinstance(lagrangian, Quadratic):
+        _need_regular(lagrangian, dim)
+        return Legendre(lagrangian)
+    A, b = lagrangian.A, lagrangian.b
+    b = jnp.zeros(dim) if b is None else b
+    if not isinstance(A, jax.core.Tracer):
+        singular = np.abs(A) if A.ndim == 1 else np.linalg.svd(np.asarray(A), compute_uv=False)
+        if not singular.min() > 1e-14 * singular.max():
+            raise InputError(_SINGULAR)
+    inverse = 1.0 / A if A.ndim == 1 else jnp.linalg.inv(A)
+    if inverse.ndim == 2:
+        inverse = 0.5 * (inverse + inverse.T)
+    shift = -inverse * b if inverse.ndim == 1 else -inverse @ b
+    return Quadratic(inverse, None if lagrangian.b is None else shift, -0.5 * jnp.dot(b, shift) - lagrangian.c)
+
+
+def _need_regular(lagrangian: Energy, dim: int) -> None:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(lagrangian)):
+        return
+    points = np.random.default_rng(0).standard_normal((4, dim))
+    singular = np.linalg.svd(jax.vmap(jax.hessian(lagrangian.value))(points), compute_uv=False)
+    if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+        raise InputError(_SINGULAR)
+
+
+@eqx.filter_custom_jvp
+def _inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
+    def residual(xi):
+        return lagrangian.gradient(xi) - mu
+
+    def refine(carry):
+        xi, r, _, k = carry
+        step = jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), r)
+
+        def shorten(state):
+            t, _ = state
+            return 0.5 * t, residual(xi - 0.5 * t * step)
+
+        def too_long(state):
+            t, trial = state
+            return (t > 1e-4) & ~(jnp.linalg.norm(trial) <= (1.0 - 0.25 * t) * jnp.linalg.norm(r) + 1e-300)
+
+        t, trial = jax.lax.while_loop(too_long, shorten, (1.0, residual(xi - step)))
+        shrinking = jnp.linalg.norm(trial) < jnp.linalg.norm(r)
+        return jnp.where(shrinking, xi - t * step, xi), jnp.where(shrinking, trial, r), shrinking, k + 1
+
+    def unfinished(carry):
+        _, _, shrinking, k = carry
+        return shrinking & (k < NEWTON_STEPS)
+
+    start = jnp.zeros_like(mu)
+    xi, r, _, _ = jax.lax.while_loop(unfinished, refine, (start, residual(start), True, 0))
+    return jnp.where(jnp.linalg.norm(r) <= 1e-10 * (1.0 + jnp.linalg.norm(mu)), xi, jnp.nan)
+
+
+@_inverse_gradient.def_jvp
+def _inverse_gradient_jvp(primals, tangents):
+    lagrangian, mu = primals
+    lagrangian_dot, mu_dot = tangents
+    xi = _inverse_gradient(lagrangian, mu)
+    # d(grad l)(xi) + l''(xi) dxi = dmu
+    change = jnp.zeros_like(mu) if mu_dot is None else mu_dot
+    if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):
+        _, moved = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
+        change = change - moved
+    return xi, jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), change)

@@ -1,0 +1,71 @@
+"""Geometry for thermodynamic integrators: Lie algebras, their groups, Casimirs and Poisson structures.
+
+Importing this package switches JAX to 64-bit floating point: the laws are kept to rounding, and single precision would
+round them away.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from .casimirs import NoPolynomialCasimirWarning  # noqa: E402
+from .catalogue import (  # noqa: E402
+    abelian,
+    aff,
+    bianchi,
+    galilei,
+    gl,
+    heisenberg,
+    registered,
+    se,
+    sl,
+    so,
+    sp,
+    su,
+)
+from .errors import (  # noqa: E402
+    AntisymmetryError,
+    ClosureError,
+    ComponentError,
+    DomainError,
+    JacobiError,
+    LieAlgebraError,
+    ManifoldsError,
+    ParameterError,
+    RepresentationError,
+    ShapeError,
+)
+from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
+from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
+from .polynomial import Polynomial  # noqa: E402
+
+__all__ = [
+    "AntisymmetryError",
+    "Canonical",
+    "ClosureError",
+    "ComponentError",
+    "DomainError",
+    "JacobiError",
+    "LieAlgebra",
+    "LieAlgebraError",
+    "ManifoldsError",
+    "NoPolynomialCasimirWarning",
+    "ParameterError",
+    "Polynomial",
+    "RepresentationError",
+    "ShapeError",
+    "abelian",
+    "aff",
+    "bianchi",
+    "direct_sum",
+    "galilei",
+    "gl",
+    "heisenberg",
+    "registered",
+    "se",
+    "semidirect_sum",
+    "sl",
+    "so",
+    "sp",
+    "su",
+]

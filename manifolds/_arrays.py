@@ -1,0 +1,49 @@
+"""Checks on arrays at the public boundary."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .errors import ComponentError, ShapeError
+
+
+def is_traced(*values) -> bool:
+    """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
+
+
+def real_components(x, dim: int, what: str) -> jax.Array:
+    """``x`` as a real array of doubles with last axis ``dim``."""
+    array = jnp.asarray(_as_numeric(x, what))
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise ComponentError(f"{what} must be real, not {array.dtype}: take its real part if that is meant")
+    if array.ndim == 0 or array.shape[-1] != dim:
+        raise ShapeError(f"{what} must have last axis {dim}, but its shape is {array.shape}")
+    return array.astype(jnp.float64)
+
+
+def square_matrices(x, size: int, what: str) -> jax.Array:
+    """``x`` as an array of doubles (or complex doubles) with last axes ``(size, size)``."""
+    array = jnp.asarray(_as_numeric(x, what))
+    if array.shape[-2:] != (size, size):
+        raise ShapeError(f"{what} must have last axes ({size}, {size}), but its shape is {array.shape}")
+    complex_input = jnp.issubdtype(array.dtype, jnp.complexfloating)
+    return array.astype(jnp.complex128 if complex_input else jnp.float64)
+
+
+def _as_numeric(x, what: str):
+    if isinstance(x, jax.Array):
+        return x
+    try:
+        array = np.asarray(x)
+        return array.astype(np.float64) if array.dtype == object else _numeric(array)
+    except (TypeError, ValueError) as error:
+        raise ComponentError(f"{what} is not a rectangular array of numbers: {error}") from None
+
+
+def _numeric(array: np.ndarray) -> np.ndarray:
+    if not np.issubdtype(array.dtype, np.number) and array.dtype != bool:
+        raise TypeError(f"dtype {array.dtype}")
+    return array

@@ -1,0 +1,295 @@
+"""Casimirs: how many independent ones an algebra has, and which polynomials they are.
+
+A Casimir is a function F on g* with ``ad*_{grad F(mu)} mu = 0`` for every mu. It is enough that F Poisson-commutes
+with elements that generate the algebra, by the Jacobi identity; on the coefficients of a homogeneous polynomial each
+of these conditions is linear. Where the structure constants are rational, perhaps after a scaling of the basis, the
+polynomials found are exact and proved to be all there are.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from fractions import Fraction
+from functools import lru_cache
+from itertools import combinations_with_replacement
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from ._null_space import (
+    numerical_null_space,
+    numerical_rank,
+    prime,
+    rational_null_space,
+    reduced,
+    row_echelon,
+)
+from .errors import JacobiError, LieAlgebraError, ParameterError
+from .lie_algebra import LieAlgebra
+from .polynomial import Polynomial
+
+LARGEST_MONOMIAL_COUNT = 20000
+LARGEST_BLOCK = 2000
+"""Most monomials, and most of them that the conditions may couple: up to a minute of linear algebra.
+
+In the bases of the catalogue the blocks are small (su(4), degree 4: 3060 monomials in blocks of 252 at most); in a
+random basis all monomials form one block.
+"""
+
+
+class NoPolynomialCasimirWarning(UserWarning):
+    """The algebra has Casimirs, but none found is a polynomial."""
+
+
+@lru_cache(maxsize=256)
+def casimir_count(g: LieAlgebra) -> int:
+    """Number of independent Casimir functions near a generic point of g*; they need not be polynomials.
+
+    It is dim minus the generic rank of the Lie-Poisson tensor ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, taken as the
+    largest rank at three random points. Where the constants can be made rational each of the three is the rank modulo
+    another prime: never too large, and too small with a probability of about ``dim / 2**31``.
+
+    Raises
+    ------
+    LieAlgebraError
+        If the constants cannot be made rational and the singular values show no clear gap.
+    """
+    random = np.random.default_rng(0)
+    exact = _rational_form(g)[0].rational_constants
+    ranks = []
+    for draw in range(3):
+        if exact is None:
+            tensor = g.structure_constants @ random.standard_normal(g.dim)
+            scale = float(np.abs(g.structure_constants).max())
+            ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), scale, g.name))
+        else:
+            p = prime(draw)
+            tensor = (exact.numerator * random.integers(1, p, g.dim) % p).sum(axis=2)
+            ranks.append(len(row_echelon(tensor, p)[1]))
+    return g.dim - max(ranks)
+
+
+def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
+    """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
+
+    The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
+    basis in the lexicographic order of monomials, less the elements whose leading monomial is that of a combination
+    of products.
+
+    Parameters
+    ----------
+    g : LieAlgebra
+    degree : int
+        At least 1.
+
+    Returns
+    -------
+    list of Polynomial
+        Coprime integer coefficients with a positive leading one, exact, where the structure constants are rational;
+        otherwise floats with leading coefficient 1, correct to the last digit where a scaling of the basis makes the
+        constants rational (su(n)).
+
+    Raises
+    ------
+    ParameterError
+        If the degree is not a positive integer.
+    LieAlgebraError
+        If there are more than 20000 monomials of this degree, or more than 2000 coupled ones; or if the constants
+        cannot be made rational and the singular values show no clear gap.
+
+    Warns
+    -----
+    NoPolynomialCasimirWarning
+        If the algebra has Casimirs but no polynomial one of this degree or below. A semisimple algebra gives no
+        warning: its Casimirs are polynomials, of degree 2 and more [Chevalley].
+    """
+    if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
+        raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
+    found = list(_new_casimirs(g, int(degree)))
+    number = casimir_count(g)
+    if number and not g.is_semisimple() and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
+        warnings.warn(
+            f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
+            f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
+            "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
+            "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
+            NoPolynomialCasimirWarning,
+            stacklevel=3,  # the caller of LieAlgebra.casimirs
+        )
+    return found
+
+
+@lru_cache(maxsize=256)
+def _new_casimirs(g: LieAlgebra, degree: int) -> tuple[Polynomial, ...]:
+    if casimir_count(g) == 0:
+        return ()
+    scaled, squares = _rational_form(g)
+    if g.rational_constants is None and scaled.rational_constants is not None:
+        return tuple(_rescaled(F, squares) for F in _new_casimirs(scaled, degree))
+    invariants = _invariants(g, degree)
+    lower = [F for d in range(1, degree) for F in _new_casimirs(g, d)]
+    products = [dict(F.terms) for F in _products(lower, degree)]
+    # The invariants are in reduced echelon form, so the coordinates of a product are its coefficients at their
+    # leading monomials, up to the scale of each; and an invariant vanishes at the leading monomials of the others.
+    leading = [F.terms[0][0] for F in invariants]
+    coordinates = np.array([[terms.get(m, Fraction(0)) for m in leading] for terms in products], dtype=object)
+    tolerance = 0 if g.rational_constants is not None else 1e-8
+    _, decomposable = row_echelon(coordinates.reshape(len(products), len(leading)), tolerance=tolerance)
+    return tuple(F for i, F in enumerate(invariants) if i not in decomposable)
+
+
+def _products(factors: list[Polynomial], degree: int) -> Iterator[Polynomial]:
+    """All products of total degree ``degree`` of one or more of the factors."""
+    for i, F in enumerate(factors):
+        if F.degree == degree:
+            yield F
+        elif F.degree < degree:
+            yield from (F * rest for rest in _products(factors[i:], degree - F.degree))
+
+
+def _invariants(g: LieAlgebra, degree: int) -> list[Polynomial]:
+    """The reduced row echelon basis of all homogeneous polynomial Casimirs of this degree, leading monomials first."""
+    size = math.comb(g.dim + degree - 1, degree)
+    _check_size(size, LARGEST_MONOMIAL_COUNT, f"{g.name} has {size} monomials of degree {degree}")
+    exact = g.rational_constants
+    if exact is None:
+        constants = g.structure_constants / np.abs(g.structure_constants).max()
+        generating = _generating_set(constants, tolerance=1e-8)
+    else:
+        constants = exact.numerator
+        generating = _generating_set(constants, prime(0))
+    factors, conditions = _conditions(constants[:, generating], degree)
+    exponents = (factors[:, :, None] == np.arange(g.dim)).sum(axis=1)
+    invariants = []
+    for columns in _blocks(conditions):
+        coupled = f"this basis of {g.name} couples {len(columns)} monomials of degree {degree}"
+        _check_size(len(columns), LARGEST_BLOCK, coupled)
+        block = conditions[:, columns].tocsr()
+        block = block[np.flatnonzero(np.diff(block.indptr))].toarray()
+        vectors = numerical_null_space(block, g.name) if exact is None else rational_null_space(block)
+        invariants += [Polynomial(exponents[columns], vector) for vector in vectors]
+    return sorted(invariants, key=lambda F: F.terms[0][0], reverse=True)
+
+
+def _check_size(size: int, limit: int, what: str) -> None:
+    if size > limit:
+        raise LieAlgebraError(
+            f"{what}, more than the {limit} that the search for Casimirs allows: ask for a lower degree"
+        )
+
+
+def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, sp.csc_array]:
+    """The maps ``F -> sum_{a,c} C[a, b, c] mu_c dF/dmu_a`` on polynomials of one degree, one below the other.
+
+    Returns the monomials as their sorted factors, shape (n, degree), in lexicographic order, and a sparse
+    (b * n, n) array.
+    """
+    dim, maps, _ = constants.shape
+    factors = np.array(list(combinations_with_replacement(range(dim), degree)))
+    # How many monomials agree with m before its k-th factor i and have a later one there, by k and i.
+    top = dim + degree - 2
+    later = np.array([[math.comb(top - k - i, degree - k) for i in range(dim)] for k in range(degree)])
+    a, b, c = np.nonzero(constants)
+    rows, columns, values = [], [], []
+    for k in range(degree):  # Leibniz: replace the k-th factor mu_a by sum_c C[a, b, c] mu_c
+        entry, column = np.nonzero(a[:, None] == factors[:, k])
+        image = factors[column]
+        image[:, k] = c[entry]
+        image.sort(axis=1)
+        index = len(factors) - 1 - later[np.arange(degree), image].sum(axis=1)
+        rows.append(b[entry] * len(factors) + index)
+        columns.append(column)
+        values.append(constants[a, b, c][entry])
+    coordinates = np.concatenate(rows), np.concatenate(columns)
+    shape = (maps * len(factors), len(factors))
+    conditions = sp.csc_array(sp.coo_array((np.concatenate(values), coordinates), shape=shape))
+    conditions.eliminate_zeros()
+    return factors, conditions
+
+
+def _blocks(conditions: sp.csc_array) -> list[np.ndarray]:
+    """The columns in groups that no condition couples to one another: weight spaces, parities and the like."""
+    pattern = conditions.astype(bool).astype(np.int64)
+    _, block_of = connected_components(pattern.T @ pattern, directed=False)
+    return np.split(np.argsort(block_of, kind="stable"), np.cumsum(np.bincount(block_of))[:-1])
+
+
+def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 0) -> list[int]:
+    """Basis elements that generate the algebra by brackets, first come first taken.
+
+    What the brackets span is never overestimated: modulo a prime a rank is at most what it is over Q.
+    """
+    dim = len(constants)
+    ad, units = reduced(constants, modulus), np.eye(dim, dtype=constants.dtype)
+    span, chosen = units[:0], []
+    for e in range(dim):
+        wider, _ = row_echelon(np.vstack([span, units[e]]), modulus, tolerance)
+        if len(wider) > len(span):
+            chosen.append(e)
+        while len(wider) > len(span):
+            span = wider
+            brackets = [reduced(span[:, :, None] * ad[x], modulus).sum(axis=1) for x in chosen]
+            wider, _ = row_echelon(np.vstack([span, *brackets]), modulus, tolerance)
+    return chosen
+
+
+# -- scaling ------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=256)
+def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
+    """The algebra in a basis ``sqrt(r_a) e_a`` with rational constants, and the integers r_a; else g itself.
+
+    The constants become ``C[a, b, c] sqrt(r_a r_b / r_c)``, hence ``C**2 r_a r_b r_c`` must be a square wherever C is
+    not zero: for each prime a linear system modulo 2. For su(n) there is such a basis.
+    """
+    unchanged = g, (1,) * g.dim
+    if g.rational_constants is not None:
+        return unchanged
+    entries = list(zip(*np.nonzero(g.structure_constants), strict=True))
+    values = [float(g.structure_constants[entry]) for entry in entries]
+    squares = [Fraction(v * v).limit_denominator(1000) for v in values]
+    recognised = all(abs(s - v * v) < 4e-15 * s for v, s in zip(values, squares, strict=True))
+    if not recognised or max(squares) > 10**6:
+        return unchanged
+    odd = {s: _odd_primes(s.numerator) ^ _odd_primes(s.denominator) for s in set(squares)}
+    primes = sorted(set().union(*odd.values()))
+    unknowns = np.eye(g.dim, dtype=np.int64)[np.array(entries)].sum(axis=1)
+    knowns = np.array([[p in odd[s] for p in primes] for s in squares], dtype=np.int64)
+    echelon, pivots = row_echelon(np.hstack([unknowns, knowns]), 2)
+    if pivots[-1] >= g.dim:
+        return unchanged
+    r = [1] * g.dim
+    for row, pivot in zip(echelon, pivots, strict=True):
+        r[pivot] = math.prod(p for p, exponent in zip(primes, row[g.dim :], strict=True) if exponent)
+    constants = np.full(g.structure_constants.shape, Fraction(0))
+    for (a, b, c), v, s in zip(entries, values, squares, strict=True):
+        square = s * r[a] * r[b] / r[c]
+        root = Fraction(math.isqrt(square.numerator), math.isqrt(square.denominator))
+        constants[a, b, c] = root if v > 0 else -root
+    try:
+        return LieAlgebra.from_structure_constants(constants, g.name), tuple(r)
+    except JacobiError:  # fractions that were close to the constants by chance
+        return unchanged
+
+
+def _odd_primes(n: int) -> set[int]:
+    """The primes of odd exponent in n."""
+    odd, p = set(), 2
+    while n > 1:
+        if p * p > n:
+            p = n
+        while n % p == 0:
+            n, odd = n // p, odd ^ {p}
+        p += 1
+    return odd
+
+
+def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
+    """F, given in the basis ``sqrt(r_a) e_a``, in the basis e_a, with leading coefficient 1."""
+    weights = [c * abs(c) * math.prod(r**e for r, e in zip(squares, power, strict=True)) for power, c in F.terms]
+    roots = [math.copysign(math.sqrt(abs(w / weights[0])), w) for w in weights]
+    return Polynomial(F.exponents, roots)

@@ -1,0 +1,240 @@
+"""Named Lie algebras, each with a conventional basis and, where there is one, a faithful matrix representation.
+
+Every entry registers the instances on which the shared property suite runs (:func:`registered`): add an algebra
+here, with ``@register(...)``, and it is tested.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from .errors import ParameterError
+from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum
+
+_registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
+
+BIANCHI_KINDS = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX")
+
+
+def register(*arguments: tuple, **named: list):
+    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+
+    def remember(constructor):
+        _registry.extend((constructor, a, {}) for a in arguments)
+        _registry.extend((constructor, (), {key: value}) for key, values in named.items() for value in values)
+        return constructor
+
+    return remember
+
+
+def registered() -> Iterator[LieAlgebra]:
+    """One instance after another of every registered algebra."""
+    for constructor, arguments, keywords in _registry:
+        yield constructor(*arguments, **keywords)
+
+
+@register((1,), (3,))
+def abelian(n: int) -> LieAlgebra:
+    """The abelian algebra R^n, as translations."""
+    n = _size(n, 1, "abelian(n)")
+    basis = np.zeros((n, n + 1, n + 1))
+    basis[np.arange(n), np.arange(n), n] = 1.0
+    return _named(basis, f"abelian({n})")
+
+
+@register((2,), (3,), (4,), (5,), (2, 1), (3, 1))
+def so(p: int, q: int = 0) -> LieAlgebra:
+    """Rotations so(p), or so(p, q) of the form diag(1, …, 1, -1, …, -1).
+
+    so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
+    ``E_ij g - E_ji g`` for i < j in lexicographic order, g the form.
+    """
+    p, q = _size(p, 0, "so(p, q)"), _size(q, 0, "so(p, q)")
+    n = _size(p + q, 2, "so(p, q)", "p + q")
+    if (p, q) == (3, 0):
+        i, j, k = np.eye(3)
+        return _named([_e(k, j) - _e(j, k), _e(i, k) - _e(k, i), _e(j, i) - _e(i, j)], "so(3)")
+    form = np.diag([1.0] * p + [-1.0] * q)
+    basis = [(_unit(n, i, j) - _unit(n, j, i)) @ form for i in range(n) for j in range(i + 1, n)]
+    return _named(basis, f"so({p},{q})" if q else f"so({n})")
+
+
+@register((2,), (3,), (4,))
+def su(n: int) -> LieAlgebra:
+    """Anti-Hermitian traceless matrices ``-i lambda_a / 2``, lambda the (generalised) Gell-Mann matrices.
+
+    su(2) has the structure constants of so(3); su(3) the usual f_abc.
+    """
+    n = _size(n, 2, "su(n)")
+    basis = []
+    for k in range(1, n):
+        for j in range(k):
+            basis.append(-0.5j * (_unit(n, j, k) + _unit(n, k, j)))
+            basis.append(-0.5 * (_unit(n, j, k) - _unit(n, k, j)))
+        diagonal = np.diag([1.0] * k + [-float(k)] + [0.0] * (n - k - 1))
+        basis.append(-0.5j * math.sqrt(2.0 / (k * (k + 1))) * diagonal)
+    return _named(basis, f"su({n})")
+
+
+@register((2,), (3,))
+def sl(n: int) -> LieAlgebra:
+    """Traceless real matrices: ``E_ii - E_(i+1)(i+1)`` first, then the E_ij of the upper and of the lower triangle.
+
+    sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
+    """
+    n = _size(n, 2, "sl(n)")
+    diagonal = [_unit(n, i, i) - _unit(n, i + 1, i + 1) for i in range(n - 1)]
+    upper = [_unit(n, i, j) for i in range(n) for j in range(i + 1, n)]
+    lower = [_unit(n, j, i) for i in range(n) for j in range(i + 1, n)]
+    return _named(diagonal + upper + lower, f"sl({n})")
+
+
+@register((1,), (2,))
+def sp(n: int) -> LieAlgebra:
+    """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
+    n = _size(n, 1, "sp(n)")
+    zero = np.zeros((n, n))
+    blocks = [np.block([[_unit(n, i, j), zero], [zero, -_unit(n, j, i)]]) for i in range(n) for j in range(n)]
+    symmetric = [_unit(n, i, j) + (i != j) * _unit(n, j, i) for i in range(n) for j in range(i, n)]
+    blocks += [np.block([[zero, s], [zero, zero]]) for s in symmetric]
+    blocks += [np.block([[zero, zero], [s, zero]]) for s in symmetric]
+    return _named(blocks, f"sp({n})")
+
+
+@register((1,), (2,))
+def gl(n: int) -> LieAlgebra:
+    """All real matrices, basis E_ij row by row."""
+    n = _size(n, 1, "gl(n)")
+    return _named([_unit(n, i, j) for i in range(n) for j in range(n)], f"gl({n})")
+
+
+@register((2,), (3,))
+def se(n: int) -> LieAlgebra:
+    """Rigid motions of R^n: the rotations so(n) first, then the translations."""
+    n = _size(n, 2, "se(n)")
+    rotations = so(n)
+    return semidirect_sum(rotations, rotations.basis, name=f"se({n})")
+
+
+@register((1,), (2,))
+def heisenberg(n: int = 1) -> LieAlgebra:
+    """Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, upper triangular matrices."""
+    n = _size(n, 1, "heisenberg(n)")
+    q = [_unit(n + 2, 0, i + 1) for i in range(n)]
+    p = [_unit(n + 2, i + 1, n + 1) for i in range(n)]
+    return _named([*q, *p, _unit(n + 2, 0, n + 1)], f"heisenberg({n})")
+
+
+@register((2,), (3,))
+def galilei(n: int) -> LieAlgebra:
+    """Galilei algebra of R^n: rotations J, boosts K, translations P, time translation H; ``[K_i, H] = P_i``."""
+    n = _size(n, 2, "galilei(n)")
+    rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
+    rotations[:, :n, :n] = so(n).basis
+    boosts = [_unit(n + 2, i, n) for i in range(n)]
+    translations = [_unit(n + 2, i, n + 1) for i in range(n)]
+    return _named([*rotations, *boosts, *translations, _unit(n + 2, n, n + 1)], f"galilei({n})")
+
+
+@register((1,), (2,))
+def aff(n: int = 1) -> LieAlgebra:
+    """Affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``."""
+    n = _size(n, 1, "aff(n)")
+    return semidirect_sum(gl(n), gl(n).basis, name=f"aff({n})")
+
+
+@register(kind=[k for k in BIANCHI_KINDS if k not in ("VI", "VII")])
+def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
+    """Bianchi's three-dimensional algebras, in the form of Ellis and MacCallum (1969).
+
+    ``[e2, e3] = n1 e1``, ``[e3, e1] = n2 e2 - a e3``, ``[e1, e2] = n3 e3 + a e2``, where (n1, n2, n3, a) is
+
+    ====  ==================   ====  ======================
+    I     (0, 0, 0, 0)         VI    (0, 1, -1, sqrt(-h))
+    II    (1, 0, 0, 0)         VII   (0, 1, 1, sqrt(h))
+    III   (0, 1, -1, 1)        VIII  (1, 1, -1, 0)
+    IV    (0, 0, 1, 1)         IX    (1, 1, 1, 0)
+    V     (0, 0, 0, 1)
+    ====  ==================   ====  ======================
+
+    Parameters
+    ----------
+    kind : "I" … "IX"
+    h : float
+        For VI (h <= 0; h = 0 is VI_0, h = -1 is III) and VII (h >= 0; h = 0 is VII_0) only, where it must be given.
+
+    Raises
+    ------
+    ParameterError
+        If the kind is unknown, h is missing, has the wrong sign, or is given where it has no meaning.
+    """
+    if kind not in BIANCHI_KINDS:
+        raise ParameterError(f"no Bianchi type {kind!r}; the types are {', '.join(BIANCHI_KINDS)}")
+    family = kind in ("VI", "VII")
+    if family and h is None:
+        raise ParameterError(f"Bianchi {kind} is a family: give h, for example bianchi({kind!r}, h=0)")
+    if not family and h is not None:
+        raise ParameterError(f"Bianchi {kind} has no parameter h")
+    if h is not None and (not math.isfinite(h) or h * (1 if kind == "VII" else -1) < 0):
+        raise ParameterError(f"Bianchi {kind} needs h {'>=' if kind == 'VII' else '<='} 0, not {h}")
+    a = math.sqrt(abs(h or 0.0))
+    n1, n2, n3, a = {
+        "I": (0, 0, 0, 0),
+        "II": (1, 0, 0, 0),
+        "III": (0, 1, -1, 1),
+        "IV": (0, 0, 1, 1),
+        "V": (0, 0, 0, 1),
+        "VI": (0, 1, -1, a),
+        "VII": (0, 1, 1, a),
+        "VIII": (1, 1, -1, 0),
+        "IX": (1, 1, 1, 0),
+    }[kind]
+    name = f"bianchi({kind!r})" if h is None else f"bianchi({kind!r}, h={h:g})"
+    constants = np.zeros((3, 3, 3))
+    constants[1, 2, 0] = n1
+    constants[2, 0, 1], constants[2, 0, 2] = n2, -a
+    constants[0, 1, 2], constants[0, 1, 1] = n3, a
+    constants -= constants.swapaxes(0, 1).copy()
+    if kind in ("VIII", "IX"):  # no centre, so the adjoint matrices are faithful
+        return LieAlgebra(constants, name=name, basis=constants.swapaxes(1, 2))
+    if kind == "II":  # [e2, e3] = e1
+        basis = np.array([_unit(3, 0, 2), _unit(3, 0, 1), _unit(3, 1, 2)])
+        return LieAlgebra(constants, name=name, basis=basis)
+    if kind == "I":
+        return LieAlgebra(constants, name=name, basis=abelian(3).basis)
+    # e1 acts on the abelian ideal (e2, e3): affine matrices of the plane
+    basis = np.zeros((3, 3, 3))
+    basis[0, :2, :2] = constants[0, 1:, 1:].T
+    basis[1, 0, 2] = basis[2, 1, 2] = 1.0
+    return LieAlgebra(constants, name=name, basis=basis)
+
+
+for _kind, _h in [("VI", 0.0), ("VI", -0.25), ("VI", -0.5), ("VII", 0.0), ("VII", 1.0), ("VII", 0.3)]:
+    _registry.append((bianchi, (_kind,), {"h": _h}))
+_registry.append((lambda: direct_sum(so(3), heisenberg(1)), (), {}))
+_registry.append((lambda: semidirect_sum(sl(2), sl(2).basis, name="sl(2) x R^2"), (), {}))
+
+
+def _size(value: int, least: int, name: str, what: str = "n") -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ParameterError(f"{name}: {what} must be an integer, not {value!r}")
+    if value < least:
+        raise ParameterError(f"{name}: {what} must be at least {least}, not {value}")
+    return int(value)
+
+
+def _e(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    return np.outer(row, column)
+
+
+def _unit(n: int, i: int, j: int) -> np.ndarray:
+    matrix = np.zeros((n, n))
+    matrix[i, j] = 1.0
+    return matrix
+
+
+def _named(basis, name: str) -> LieAlgebra:
+    return LieAlgebra.from_matrices(np.array(basis), name=name)

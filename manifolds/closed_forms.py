@@ -1,0 +1,135 @@
+"""Exponential and logarithm in closed form: SO(3), SE(3), SU(2) and the Heisenberg groups.
+
+Everything is a combination of the Stumpff functions of the squared angle, entire functions with no division at zero,
+so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from .lie_algebra import LieAlgebra
+
+HALF_TURN_MARGIN = 1e-8
+"""A logarithm is taken of eigenvalues at angles up to pi minus this; beyond, its sign is decided by noise."""
+
+
+def stumpff(order: int, z) -> jax.Array:
+    """Stumpff function ``c_p(z) = sum_k (-z)^k / (2k + p)!`` for p = 0, 1, 2, 3 and z >= 0, to rounding.
+
+    With ``z = t**2``: cos t, sin t / t, (1 - cos t) / t**2, (t - sin t) / t**3.
+    """
+    small = z < 1.0
+    t = jnp.sqrt(
+        jnp.where(small, 1.0, z)
+    )  # both branches see arguments where they are smooth, so no NaN gradient
+    far = (jnp.cos, _sinc, lambda t: 0.5 * _sinc(t / 2) ** 2, lambda t: (t - jnp.sin(t)) / t**3)[order](t)
+    near = jnp.zeros_like(t)
+    for k in reversed(range(10)):  # the first term left out is below 1/20! at z = 1
+        near = 1.0 / math.factorial(2 * k + order) - jnp.where(small, z, 0.0) * near
+    return jnp.where(small, near, far)
+
+
+def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """Rodrigues' formula ``I + c1 X + c2 X^2``."""
+    z, X = _square(x)[..., None], algebra.hat(x)
+    return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
+
+
+def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """Rotation vector by way of the unit quaternion, accurate at every angle below pi - HALF_TURN_MARGIN.
+
+    ``4 q q^T`` is linear in the rotation; its row with the largest diagonal entry gives q without cancellation
+    [Shepperd 1978].
+    """
+    trace = jnp.trace(g, axis1=-2, axis2=-1)[..., None, None]
+    outer = g + g.swapaxes(-1, -2) + (1.0 - trace) * jnp.eye(3)
+    skew = (g - g.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
+    outer = jnp.concatenate([skew[..., None, :], outer], axis=-2)
+    outer = jnp.concatenate([jnp.concatenate([1.0 + trace, skew[..., None]], axis=-2), outer], axis=-1)
+    largest = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = jnp.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
+    x = _rotation_vector(q[..., 0], q[..., 1:])
+    return jnp.where(_square(x) <= (math.pi - HALF_TURN_MARGIN) ** 2, x, jnp.nan)
+
+
+def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
+    X = algebra.hat(x)
+    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x)[..., None] / 4)
+
+
+def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """Rotation by Rodrigues' formula, translation ``(I + c2 W + c3 W^2) u``."""
+    z, u = _square(x[..., :3])[..., None], x[..., 3:, None]
+    W = algebra.hat(x)[..., :3, :3]
+    rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
+    return affine(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
+
+
+def se3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """Rotation vector of the rotation, and ``(I - W/2 + d W^2) t`` with ``d = (1 - (a/2) cot(a/2)) / a^2``.
+
+    In Stumpff functions of the half angle, d = (c2 - c3) / (4 c1): no cancellation.
+    """
+    w, t = so3_log(algebra, g[..., :3, :3]), g[..., :3, 3]
+    z = _square(w) / 4
+    d = (stumpff(2, z) - stumpff(3, z)) / (4 * stumpff(1, z))
+    turned = jnp.cross(w, t)
+    return jnp.concatenate([w, t - turned / 2 + d * jnp.cross(w, turned)], axis=-1)
+
+
+def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
+    z = _square(x)[..., None] / 4
+    return stumpff(0, z) * jnp.eye(2) + stumpff(1, z) * algebra.hat(x)
+
+
+def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
+    a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
+    w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
+    x = _rotation_vector(w, v)
+    return jnp.where(_square(x) <= (2 * (math.pi - HALF_TURN_MARGIN)) ** 2, x, jnp.nan)
+
+
+def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
+    X = algebra.hat(x)
+    return jnp.eye(X.shape[-1]) + X + X @ X / 2
+
+
+def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """``N - N^2/2`` with N = g - I."""
+    N = g - jnp.eye(g.shape[-1])
+    return algebra.vee(N - N @ N / 2)
+
+
+def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
+    """Homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
+    top = jnp.concatenate([linear, translation], axis=-1)
+    last = jnp.broadcast_to(jnp.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
+    return jnp.concatenate([top, last], axis=-2)
+
+
+# -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _sinc(t: jax.Array) -> jax.Array:
+    return jnp.sin(t) / t
+
+
+def _square(x: jax.Array) -> jax.Array:
+    """``|x|^2``, shape (..., 1)."""
+    return jnp.sum(x**2, axis=-1, keepdims=True)
+
+
+def _rotation_vector(w: jax.Array, v: jax.Array) -> jax.Array:
+    """Twice the angle of the quaternion (w, v), of any norm, times its axis."""
+    size = jnp.linalg.norm(v, axis=-1)
+    factor = jnp.where(size > 0, 2 * jnp.arctan2(size, w) / jnp.where(size > 0, size, 1.0), 2.0 / w)
+    return factor[..., None] * v

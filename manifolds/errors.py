@@ -1,0 +1,55 @@
+"""Errors of the geometry layer: each carries the value found, the tolerance and what to do."""
+
+from __future__ import annotations
+
+
+class ManifoldsError(Exception):
+    """Base class of every error raised on purpose by :mod:`manifolds`."""
+
+
+class ShapeError(ManifoldsError, ValueError):
+    """An array whose last axes do not fit the algebra, group or manifold."""
+
+
+class ComponentError(ManifoldsError, TypeError):
+    """Components of the wrong kind: complex, textual or ragged where real numbers are meant."""
+
+
+class ParameterError(ManifoldsError, ValueError):
+    """A catalogue entry asked for with a parameter outside its range."""
+
+
+class DomainError(ManifoldsError, ValueError):
+    """A map evaluated outside its domain, such as the logarithm of a rotation by pi."""
+
+
+class LieAlgebraError(ManifoldsError, ValueError):
+    """Data that do not define a Lie algebra, or an operation this algebra does not have.
+
+    Attributes
+    ----------
+    residual, tolerance : float or None
+        How far the axiom is from holding, and how far it may be.
+    indices : tuple of int
+        The offending basis elements, counted from 0.
+    """
+
+    def __init__(self, message: str, *, residual=None, tolerance=None, indices: tuple[int, ...] = ()):
+        super().__init__(message)
+        self.residual, self.tolerance, self.indices = residual, tolerance, indices
+
+
+class AntisymmetryError(LieAlgebraError):
+    """``C[a, b, :] != -C[b, a, :]``."""
+
+
+class JacobiError(LieAlgebraError):
+    """``[[a, b], c] + [[b, c], a] + [[c, a], b] != 0``."""
+
+
+class ClosureError(LieAlgebraError):
+    """Matrices that are dependent, or whose commutators leave their span."""
+
+
+class RepresentationError(LieAlgebraError):
+    """Matrices ``rho_a`` with ``[rho_a, rho_b] != rho([e_a, e_b])``."""

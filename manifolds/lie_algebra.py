@@ -1,0 +1,545 @@
+"""Finite-dimensional real Lie algebras, from structure constants or from matrices.
+
+Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is the dot product of components; and
+``<ad*_xi mu, eta> = <mu, [xi, eta]>`` with no minus sign, so that Lie-Poisson motion is ``mu' = ad*_{grad H} mu``
+[BFM 3.1]. Components stand on the last axis; leading axes are batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from ._arrays import is_traced, real_components, square_matrices
+from ._exact import RationalArray, jacobi_sums, rational_array
+from .errors import (
+    AntisymmetryError,
+    ClosureError,
+    ComponentError,
+    JacobiError,
+    LieAlgebraError,
+    RepresentationError,
+    ShapeError,
+)
+
+AXIOM_TOLERANCE = 1e-12
+"""Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
+
+
+@jax.tree_util.register_static
+class LieAlgebra:
+    """A real Lie algebra with a chosen basis.
+
+    Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
+    (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
+
+    Attributes
+    ----------
+    dim : int
+    name : str
+    structure_constants : ndarray, shape (dim, dim, dim), read-only
+        ``C[a, b, c]`` with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
+    rational_constants : RationalArray or None
+        The same constants as exact fractions, where they are recognised as such.
+    basis : ndarray, shape (dim, m, m), or None
+        The matrices ``e_a``, where known.
+    """
+
+    def __init__(self, structure_constants, *, name: str = "g", basis=None):
+        constants = _checked_constants(structure_constants)
+        self.rational_constants: RationalArray | None = rational_array(constants)
+        exact = self.rational_constants
+        self.structure_constants = _frozen(np.asarray(constants if exact is None else exact, dtype=np.float64))
+        self.dim: int = self.structure_constants.shape[0]
+        self.name = name
+        self.basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
+        _check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
+
+    # -- construction -------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_structure_constants(cls, structure_constants, name: str = "g") -> LieAlgebra:
+        """The algebra with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
+
+        Parameters
+        ----------
+        structure_constants : array of int, Fraction or float, shape (dim, dim, dim)
+        name : str
+
+        Raises
+        ------
+        ShapeError, ComponentError
+            If the array is not cubic, real and finite.
+        AntisymmetryError, JacobiError
+            If an axiom fails; the message names the basis elements and the residual. The check is exact when every
+            constant is an integer or a fraction, and to 1e-12 relative otherwise.
+        """
+        return cls(structure_constants, name=name)
+
+    @classmethod
+    def from_matrices(cls, basis, name: str = "g") -> LieAlgebra:
+        """The algebra spanned over the reals by ``basis``, with the commutator.
+
+        Parameters
+        ----------
+        basis : array, real or complex, shape (dim, m, m)
+        name : str
+
+        Raises
+        ------
+        ClosureError
+            If the matrices are linearly dependent over the reals or a commutator leaves their span.
+        """
+        try:
+            matrices = np.asarray(basis)
+            matrices = matrices.astype(np.complex128 if np.iscomplexobj(matrices) else np.float64)
+        except (TypeError, ValueError) as error:
+            raise ComponentError(f"the basis is not a rectangular array of numbers: {error}") from None
+        if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or 0 in matrices.shape:
+            raise ShapeError(f"a matrix basis has shape (dim, m, m), not {matrices.shape}")
+        if not np.isfinite(matrices).all():
+            raise ComponentError("the matrix basis has entries that are not finite")
+        dim = len(matrices)
+        columns = _real_columns(matrices)
+        singular = scipy.linalg.svdvals(columns)
+        if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
+            raise ClosureError(
+                f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
+                f"{singular[-1] / singular[0]:.1e}); remove the superfluous ones",
+                residual=float(singular[-1]),
+                tolerance=float(1e-10 * singular[0]),
+            )
+        products = np.einsum("aij,bjk->abik", matrices, matrices)
+        commutators = _real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
+        coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
+        residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
+        tolerance = 1e-10 * max(1.0, float(np.abs(commutators).max()))
+        if residuals.max() > tolerance:
+            a, b = divmod(int(residuals.argmax()), dim)
+            raise ClosureError(
+                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g}, "
+                f"tolerance {tolerance:.1g}); add the missing commutators to the basis",
+                residual=float(residuals.max()),
+                tolerance=tolerance,
+                indices=(a, b),
+            )
+        constants = coordinates.T.reshape(dim, dim, dim)
+        constants = (constants - constants.swapaxes(0, 1)) / 2
+        return cls(_without_rounding(constants, columns, commutators), name=name, basis=matrices)
+
+    # -- the operations -----------------------------------------------------------------------------------------
+
+    def bracket(self, x, y) -> jax.Array:
+        """Lie bracket ``[x, y]``; ``x``, ``y`` and the result have shape (..., dim)."""
+        return jnp.einsum("abc,...a,...b->...c", self.structure_constants, self._element(x, "x"), self._element(y, "y"))
+
+    def ad(self, x) -> jax.Array:
+        """Matrix of ``y -> [x, y]``, shape (..., dim, dim): ``ad(x) @ y == bracket(x, y)``."""
+        return jnp.einsum("abc,...a->...cb", self.structure_constants, self._element(x, "x"))
+
+    def ad_star(self, x, mu) -> jax.Array:
+        """Coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
+
+        Parameters
+        ----------
+        x : array, shape (..., dim)
+            Algebra element (1/time for a body).
+        mu : array, shape (..., dim)
+            Dual element (mass * length**2 / time for a body).
+
+        Returns
+        -------
+        array, shape (..., dim)
+
+        Raises
+        ------
+        ShapeError
+            If the last axes differ from ``dim``.
+        """
+        return jnp.einsum("abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu"))
+
+    def killing_form(self) -> np.ndarray:
+        """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
+        return self._killing_form
+
+    def hat(self, x) -> jax.Array:
+        """The matrix ``sum_a x_a e_a``, shape (..., m, m)."""
+        return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._known_basis())
+
+    def vee(self, X) -> jax.Array:
+        """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
+
+        Raises
+        ------
+        LieAlgebraError
+            If ``X`` is not in the span of the basis (residual above 1e-8 relative; not checked under tracing).
+        """
+        basis = self._known_basis()
+        matrix = square_matrices(X, basis.shape[-1], "X")
+        flat = matrix.reshape(*matrix.shape[:-2], -1)
+        flat = jnp.concatenate([flat.real, flat.imag], axis=-1)
+        components = jnp.einsum("ai,...i->...a", self._left_inverse, flat)
+        if not is_traced(flat):
+            residual = float(jnp.max(jnp.abs(components @ _real_columns(basis).T - flat), initial=0.0))
+            tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(flat), initial=0.0)))
+            if not residual <= tolerance:
+                raise LieAlgebraError(
+                    f"the matrix is not in {self.name}: it is {residual:.3g} away from its span "
+                    f"(tolerance {tolerance:.1g})",
+                    residual=residual,
+                    tolerance=tolerance,
+                )
+        return components
+
+    # -- structure ----------------------------------------------------------------------------------------------
+
+    def is_abelian(self) -> bool:
+        """Whether every bracket vanishes."""
+        return not self.structure_constants.any()
+
+    def is_semisimple(self) -> bool:
+        """Whether the Killing form is nondegenerate (Cartan's criterion)."""
+        eigenvalues = np.abs(self._killing_eigenvalues)
+        return bool(eigenvalues.min() > 1e-10 * max(eigenvalues.max(), 1e-300))
+
+    def is_compact_type(self) -> bool:
+        """Whether the Killing form is negative definite: the algebra of a compact semisimple group."""
+        return self.is_semisimple() and bool(self._killing_eigenvalues.max() < 0)
+
+    def is_solvable(self) -> bool:
+        """Whether the derived series ends at zero."""
+        return self.derived_series()[-1] == 0
+
+    def is_nilpotent(self) -> bool:
+        """Whether the lower central series ends at zero."""
+        return self.lower_central_series()[-1] == 0
+
+    def is_unimodular(self) -> bool:
+        """Whether ``tr ad_x = 0`` for every x."""
+        traces = np.einsum("abb->a", self.structure_constants)
+        return bool(np.abs(traces).max() <= AXIOM_TOLERANCE * max(1.0, np.abs(self.structure_constants).max()))
+
+    def derived_series(self) -> list[int]:
+        """Dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
+        return self._series(lambda ideal: (ideal, ideal))
+
+    def lower_central_series(self) -> list[int]:
+        """Dimensions of g, [g, g], [g, [g, g]], … until they no longer fall."""
+        return self._series(lambda ideal: (np.eye(self.dim), ideal))
+
+    def cartan_involution(self) -> np.ndarray:
+        """A Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
+
+        The identity on compact type. Otherwise found without matrices: among all inner products of unit volume, the
+        one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the norm is
+        convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp`` in
+        their usual bases theta is ``X -> -X^T``.
+
+        Raises
+        ------
+        LieAlgebraError
+            If the algebra is not semisimple.
+        """
+        return self._cartan_involution
+
+    # -- Casimirs -----------------------------------------------------------------------------------------------
+
+    def casimir_count(self) -> int:
+        """Number of independent Casimir functions near a generic point of g*.
+
+        That is dim minus the generic rank of the Lie-Poisson tensor; they need not be polynomials.
+        """
+        from .casimirs import casimir_count
+
+        return casimir_count(self)
+
+    def casimirs(self, degree: int):
+        """All homogeneous polynomial Casimirs of this degree, modulo products of those of lower degree.
+
+        Returns a list of :class:`manifolds.casimirs.Polynomial`, callable on ``mu`` and printing as
+        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational.
+        """
+        from .casimirs import casimirs
+
+        return casimirs(self, degree)
+
+    # -- Python ---------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"LieAlgebra({self.name!r}, dim={self.dim})"
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, LieAlgebra) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @cached_property
+    def _key(self):
+        basis = () if self.basis is None else (self.basis.shape, self.basis.tobytes())
+        return self.dim, self.structure_constants.tobytes(), basis
+
+    def _element(self, x, what: str) -> jax.Array:
+        return real_components(x, self.dim, what)
+
+    def _known_basis(self) -> np.ndarray:
+        if self.basis is None:
+            raise LieAlgebraError(
+                f"{self.name} was defined by structure constants, so its matrices are not known; build it with "
+                "LieAlgebra.from_matrices to use hat and vee"
+            )
+        return self.basis
+
+    @cached_property
+    def _left_inverse(self) -> np.ndarray:
+        return np.linalg.pinv(_real_columns(self._known_basis()))
+
+    @cached_property
+    def _killing_form(self) -> np.ndarray:
+        return _frozen(np.einsum("acd,bdc->ab", self.structure_constants, self.structure_constants, optimize=True))
+
+    @cached_property
+    def _killing_eigenvalues(self) -> np.ndarray:
+        return np.linalg.eigvalsh(self._killing_form)
+
+    @cached_property
+    def _cartan_involution(self) -> np.ndarray:
+        if not self.is_semisimple():
+            raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
+        if self.is_compact_type():
+            return _frozen(np.eye(self.dim))
+        return _frozen(_cartan_involution(self.structure_constants, self.name))
+
+    def _series(self, factors: Callable) -> list[int]:
+        ideal, dims = np.eye(self.dim), [self.dim]
+        while True:
+            left, right = factors(ideal)
+            products = np.einsum("ia,jb,abc->ijc", left, right, self.structure_constants, optimize=True)
+            ideal = _row_space(products.reshape(-1, self.dim), scale=float(np.abs(self.structure_constants).max()))
+            if len(ideal) == dims[-1]:
+                return dims
+            dims.append(len(ideal))
+            if not len(ideal):
+                return dims
+
+
+def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
+    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute."""
+    if not algebras:
+        raise ShapeError("direct_sum needs at least one algebra")
+    dim = sum(g.dim for g in algebras)
+    constants = np.zeros((dim, dim, dim))
+    start = 0
+    for g in algebras:
+        block = slice(start, start + g.dim)
+        constants[block, block, block] = g.structure_constants
+        start += g.dim
+    bases = [g.basis for g in algebras]
+    known = [basis for basis in bases if basis is not None]
+    basis = None
+    if len(known) == len(bases):
+        basis = np.array(
+            [
+                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
+                for i, own in enumerate(known)
+                for e in own
+            ]
+        )
+    return LieAlgebra(constants, name=" + ".join(g.name for g in algebras), basis=basis)
+
+
+def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> LieAlgebra:
+    """Semidirect sum of g with the vector space V it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u)``.
+
+    Parameters
+    ----------
+    g : LieAlgebra
+    representation : array, shape (g.dim, m, m), or callable
+        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``.
+
+    Returns
+    -------
+    LieAlgebra
+        Dimension ``g.dim + m``: the elements of g first, then those of V. Its matrices are the affine ones
+        ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful.
+
+    Raises
+    ------
+    RepresentationError
+        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, which is named.
+    """
+    if callable(representation):
+        representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
+    rho = np.asarray(representation, dtype=np.float64)
+    if rho.ndim != 3 or rho.shape[0] != g.dim or rho.shape[1] != rho.shape[2]:
+        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, m, m), not {rho.shape}")
+    products = np.einsum("aij,bjk->abik", rho, rho)
+    defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
+    residuals = np.abs(defect).max(axis=(2, 3))
+    tolerance = AXIOM_TOLERANCE * max(1.0, float(np.abs(products).max()))
+    if residuals.max() > tolerance:
+        a, b = np.unravel_index(residuals.argmax(), residuals.shape)
+        raise RepresentationError(
+            f"not a representation of {g.name}: [rho(e{a + 1}), rho(e{b + 1})] differs from rho([e{a + 1}, e{b + 1}]) "
+            f"by {residuals.max():.3g} (tolerance {tolerance:.1g})",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(int(a), int(b)),
+        )
+    m, dim = rho.shape[1], g.dim + rho.shape[1]
+    constants = np.zeros((dim, dim, dim))
+    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
+    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
+    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
+    affine = np.zeros((dim, m + 1, m + 1))
+    affine[: g.dim, :m, :m] = rho
+    affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
+    basis: np.ndarray | None = affine
+    if len(_row_space(rho.reshape(g.dim, -1))) < g.dim:
+        basis = None
+        if g.basis is not None:
+            upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
+            basis = np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
+    return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=basis)
+
+
+# -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _checked_constants(values) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+        numeric = array.astype(np.complex128 if np.iscomplexobj(array) else np.float64)
+    except (TypeError, ValueError) as error:
+        raise ComponentError(f"the structure constants are not a rectangular array of numbers: {error}") from None
+    if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
+        raise ShapeError(f"structure constants have shape (dim, dim, dim), not {array.shape}")
+    if np.iscomplexobj(numeric):
+        raise ComponentError("structure constants must be real: use a real basis of the algebra")
+    if not np.isfinite(numeric).all():
+        a, b, c = np.argwhere(~np.isfinite(numeric))[0]
+        raise ComponentError(f"the structure constant C[{a}, {b}, {c}] is {numeric[a, b, c]}")
+    return array
+
+
+def _check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
+    """Antisymmetry and Jacobi; ``constants`` are the integer numerators where ``exact`` is given."""
+    unit = 1.0 if exact is None else 1.0 / exact.denominator
+    how = "checked exactly" if exact is not None else "tolerance {:.1g}"
+    scale = float(np.abs(constants).max())
+    symmetric = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
+    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale
+    if symmetric.max() > tolerance:
+        a, b = (int(i) for i in np.unravel_index(symmetric.argmax(), symmetric.shape))
+        raise AntisymmetryError(
+            f"{name}: [e{a + 1}, e{b + 1}] + [e{b + 1}, e{a + 1}] has a component of size "
+            f"{symmetric.max() * unit:.3g} ({how.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
+            residual=float(symmetric.max() * unit),
+            tolerance=tolerance,
+            indices=(a, b),
+        )
+    sums = jacobi_sums(constants)
+    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
+    worst = int(np.abs(sums.data).argmax()) if sums.nnz else -1
+    if worst >= 0 and abs(sums.data[worst]) > tolerance:
+        residual = abs(float(sums.data[worst])) * unit**2
+        a, b, c = sorted(int(i) for i in np.unravel_index(sums.coords[0][worst], constants.shape))
+        raise JacobiError(
+            f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
+            f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
+            f"({how.format(tolerance)})",
+            residual=residual,
+            tolerance=tolerance,
+            indices=(a, b, c),
+        )
+
+
+def _without_rounding(constants: np.ndarray, columns: np.ndarray, commutators: np.ndarray) -> np.ndarray:
+    """The constants snapped to nearby fractions, if the commutators then hold at least as well."""
+    snapped = np.array([_nearest_fraction(c) for c in constants.ravel()]).reshape(constants.shape)
+    defect = np.abs(columns @ snapped.reshape(len(constants) ** 2, -1).T - commutators).max()
+    scale = max(1.0, float(np.abs(commutators).max()))
+    return snapped if defect <= 4 * np.finfo(float).eps * scale else constants
+
+
+def _nearest_fraction(value: float) -> float:
+    from fractions import Fraction
+
+    nearest = float(Fraction(float(value)).limit_denominator(64))
+    return nearest if abs(nearest - value) < 1e-12 * max(1.0, abs(value)) else float(value)
+
+
+def _real_columns(matrices: np.ndarray) -> np.ndarray:
+    """Each matrix as a column of its real and imaginary parts: linear algebra over the reals."""
+    flat = matrices.reshape(len(matrices), -1)
+    return np.concatenate([flat.real, flat.imag], axis=1).T
+
+
+def _row_space(rows: np.ndarray, scale: float | None = None) -> np.ndarray:
+    """An orthonormal basis of the span of the rows; singular values below 1e-10 of ``scale`` count as zero."""
+    _, singular, basis = np.linalg.svd(rows, full_matrices=False)
+    scale = float(singular.max(initial=0.0)) if scale is None else scale
+    return basis[singular > 1e-10 * max(scale, 1e-300)]
+
+
+def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
+    """Newton's method for the inner product of least bracket norm (see LieAlgebra.cartan_involution)."""
+    dim = len(constants)
+    upper = np.triu_indices(dim)
+    directions = np.zeros((len(upper[0]), dim, dim))
+    directions[np.arange(len(upper[0])), upper[0], upper[1]] = 1.0
+    directions = (directions + directions.swapaxes(1, 2)) / 2
+    directions -= np.einsum("kaa->k", directions)[:, None, None] * np.eye(dim) / dim  # volume is kept
+    change = np.eye(dim)  # columns: the current basis in terms of the given one
+
+    def transported(basis: np.ndarray) -> np.ndarray:
+        return np.einsum("ai,bj,abc,kc->ijk", basis, basis, constants, np.linalg.inv(basis), optimize=True)
+
+    current = transported(change)
+    for _ in range(100):
+        # d/dt of the constants when the basis moves by exp(t S), for each symmetric direction S
+        moved = (
+            np.einsum("kai,abc->kibc", directions, current, optimize=True)
+            + np.einsum("kbj,abc->kajc", directions, current, optimize=True)
+            - np.einsum("kdc,abc->kabd", directions, current, optimize=True)
+        )
+        # |exp(tS) C|^2 = |C|^2 + 2t <C, SC> + 2 t^2 |SC|^2 + …, minimised by -1/2 of a least-squares solution.
+        # Near the minimum the derivations in p move nothing (S C -> 0); the cut-off keeps such directions out.
+        weights, *_ = np.linalg.lstsq(moved.reshape(len(moved), -1).T, current.ravel(), rcond=1e-3)
+        newton = -np.einsum("k,kij->ij", weights, directions) / 2
+        size = np.abs(newton).max()
+        if size < 1e-15 * dim:
+            break
+        change = change @ scipy.linalg.expm(newton * min(1.0, 0.5 / size))
+        current = transported(change)
+        if size < 1e-13:
+            break
+    # In the adapted basis ad_x^T = -ad_{theta x}: solve for theta, then return to the given basis.
+    ad = current.swapaxes(1, 2)  # ad[a] is the matrix of e_a
+    theta, *_ = np.linalg.lstsq(ad.reshape(dim, -1).T, -ad.swapaxes(1, 2).reshape(dim, -1).T, rcond=None)
+    theta = change @ theta @ np.linalg.inv(change)
+    automorphism = np.einsum("abd,cd->abc", constants, theta) - np.einsum(
+        "da,eb,dec->abc", theta, theta, constants, optimize=True
+    )
+    residual = max(np.abs(automorphism).max(), np.abs(theta @ theta - np.eye(dim)).max())
+    tolerance = 1e-9 * max(1.0, float(np.abs(constants).max()), float(np.abs(theta).max()) ** 2)
+    if not residual <= tolerance:
+        raise LieAlgebraError(
+            f"no Cartan involution of {name} was found (residual {residual:.2g}, tolerance {tolerance:.1g}); "
+            "rescale the basis so that the structure constants are of order one",
+            residual=float(residual),
+            tolerance=tolerance,
+        )
+    snapped = np.round(theta)
+    return snapped if np.abs(snapped - theta).max() < 1e-10 else theta
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array = np.array(array)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,419 @@
+"""Matrix Lie groups: exponential, logarithm, Cayley map, adjoint and coadjoint action.
+
+Conventions: an element of the group is a matrix, shape (..., m, m), an element of its algebra its components, shape
+(..., dim), in the basis of the :mod:`manifolds.catalogue`; leading axes are batches. ``Ad_star(g, mu)`` is the
+transpose of ``Ad(g)``, with no inverse, so that its derivative at the identity is ``ad_star``. Derivatives of paths are
+left-trivialised: ``g' = g hat(x)``.
+
+All maps can be jitted, vmapped and differentiated. Where a map is not defined they raise :class:`DomainError`; under
+tracing, where values cannot be looked at, they return NaN instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import catalogue
+from . import closed_forms as closed
+from ._arrays import is_traced, real_components, square_matrices
+from .errors import ComponentError, DomainError, LieAlgebraError
+from .lie_algebra import LieAlgebra
+from .matrix_functions import CAYLEY_CONDITION_LIMIT, dexp, general_cayley, general_exp, general_log, largest
+
+MEMBERSHIP_TOLERANCE = 1e-8
+"""How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
+
+_registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
+
+
+def register(*arguments: tuple):
+    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+
+    def remember(constructor):
+        _registry.extend((constructor, a) for a in arguments)
+        return constructor
+
+    return remember
+
+
+def registered_groups() -> Iterator[MatrixGroup]:
+    """One instance after another of every registered group."""
+    for constructor, arguments in _registry:
+        yield constructor(*arguments)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class MatrixGroup:
+    """A group of matrices: its algebra, a measure of distance from it, and the maps that have a special form.
+
+    Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the
+    rest defaults to general matrix functions.
+
+    Attributes
+    ----------
+    name : str
+    algebra : LieAlgebra
+    defect : callable
+        ``g -> array``, shape (...): how far g is from the group relative to its size, of the order of the smallest
+        relative change of g that brings it there.
+    inverse_map, exp_map, log_map, cayley_map : callable or None
+        ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
+        or None where the Cayley map leaves the group.
+    """
+
+    name: str
+    algebra: LieAlgebra
+    defect: Callable
+    inverse_map: Callable = jnp.linalg.inv
+    exp_map: Callable = general_exp
+    log_map: Callable = general_log
+    cayley_map: Callable | None = general_cayley
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the group."""
+        return self.algebra.dim
+
+    @property
+    def matrix_size(self) -> int:
+        """Number m of rows of its matrices."""
+        return self.algebra._known_basis().shape[-1]
+
+    @property
+    def identity(self) -> jax.Array:
+        """The identity matrix, shape (m, m)."""
+        return jnp.eye(self.matrix_size, dtype=self.algebra._known_basis().dtype)
+
+    def compose(self, g, h) -> jax.Array:
+        """Product ``g h`` of group elements, shape (..., m, m)."""
+        return self._element(g, "g") @ self._element(h, "h")
+
+    def inverse(self, g) -> jax.Array:
+        """Inverse of a group element, by the group's own formula (a transpose for SO(n)), shape (..., m, m)."""
+        return self.inverse_map(self._element(g, "g"))
+
+    def belongs(self, g, tolerance: float = 1e-10) -> jax.Array:
+        """Whether each matrix is in the group, up to a relative change of the matrix by about ``tolerance``.
+
+        Returns
+        -------
+        array of bool, shape (...)
+        """
+        return self.defect(self._element(g, "g")) <= tolerance
+
+    def random(self, key_or_seed, size: tuple[int, ...] = (), scale: float = 0.5) -> jax.Array:
+        """Random elements ``exp(x)``, the components of x normal with standard deviation ``scale``; not Haar measure.
+
+        Parameters
+        ----------
+        key_or_seed : JAX random key, or int
+        size : tuple of int
+            Shape of the batch.
+        scale : float
+
+        Returns
+        -------
+        array, shape (*size, m, m)
+        """
+        key = jax.random.key(key_or_seed) if isinstance(key_or_seed, int | np.integer) else key_or_seed
+        return self.exp(scale * jax.random.normal(key, (*size, self.dim)))
+
+    def exp(self, x) -> jax.Array:
+        """Exponential map, from components of the algebra to the group.
+
+        Parameters
+        ----------
+        x : array, shape (..., dim)
+
+        Returns
+        -------
+        array, shape (..., m, m)
+        """
+        return _exp(self, self._components(x, "x"))
+
+    def log(self, g) -> jax.Array:
+        """Principal logarithm: the x with ``exp(x) = g`` and eigenvalues of ``hat(x)`` at heights below pi.
+
+        Parameters
+        ----------
+        g : array, shape (..., m, m)
+            Within 1e-8 of the group, and with every eigenvalue off the negative real axis by an angle of 1e-8: a
+            rotation by less than pi.
+
+        Returns
+        -------
+        array, shape (..., dim)
+            Its derivative is that of x along the group: changes of g that leave the group are projected out.
+
+        Raises
+        ------
+        DomainError
+            If g is not in the group, or has no principal logarithm. Under tracing the result is NaN instead.
+        """
+        g = self._element(g, "g")
+        x = _log(self, g)
+        if not is_traced(g, x) and bool(jnp.isnan(x).any()):
+            raise DomainError(self._why_no_log(np.asarray(g), np.asarray(x)))
+        return x
+
+    def cayley(self, x) -> jax.Array:
+        """Cayley map ``(I - X/2)^-1 (I + X/2)``, X = hat(x): agrees with ``exp`` to second order.
+
+        Parameters
+        ----------
+        x : array, shape (..., dim)
+
+        Returns
+        -------
+        array, shape (..., m, m)
+
+        Raises
+        ------
+        LieAlgebraError
+            For SL(n) and SU(n) with n > 2, where the determinant of the result is not 1.
+        DomainError
+            If X has an eigenvalue 2, or for GL(n) also -2. Under tracing the result is NaN instead.
+        """
+        if self.cayley_map is None:
+            raise LieAlgebraError(
+                f"the Cayley map does not take {self.algebra.name} into {self.name}: det (I - X/2)^-1 (I + X/2) is "
+                "not 1 when X^3 has a trace; use exp"
+            )
+        x = self._components(x, "x")
+        g = _cayley(self, x)
+        if not is_traced(x, g) and bool(jnp.isnan(g).any()):
+            index = _first(np.isnan(np.asarray(g)).any(axis=(-2, -1)))
+            eigenvalues = np.linalg.eigvals(np.asarray(self.algebra.hat(x))[index])
+            nearest = eigenvalues[np.argmin(np.abs(np.abs(eigenvalues.real) - 2) + np.abs(eigenvalues.imag))]
+            raise DomainError(
+                f"{self.name}: the Cayley map has a pole at X{_at(index)}, whose eigenvalue {nearest:.6g} is at 2 or "
+                f"-2 (condition number of I - X/2 above {CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
+            )
+        return g
+
+    def Ad(self, g) -> jax.Array:
+        """Adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
+
+        Raises
+        ------
+        LieAlgebraError
+            If ``g hat(x) g^-1`` leaves the algebra, so that g is not in the group (not checked under tracing).
+        """
+        g = self._element(g, "g")[..., None, :, :]
+        return self.algebra.vee(g @ self.algebra.basis @ self.inverse_map(g)).swapaxes(-1, -2)
+
+    def Ad_star(self, g, mu) -> jax.Array:
+        """Coadjoint action, defined by ``<Ad_star(g, mu), x> = <mu, Ad(g) x>``.
+
+        A right action: ``Ad_star(g h, mu) = Ad_star(h, Ad_star(g, mu))``. Its derivative along ``g = exp(t x)`` at
+        t = 0 is ``ad_star(x, mu)``; the spatial momentum of a body is ``Ad_star(inverse(g), mu)``.
+
+        Parameters
+        ----------
+        g : array, shape (..., m, m)
+        mu : array, shape (..., dim)
+
+        Returns
+        -------
+        array, shape (..., dim)
+        """
+        return jnp.einsum("...ab,...a->...b", self.Ad(g), self._components(mu, "mu"))
+
+    def __repr__(self) -> str:
+        return f"MatrixGroup({self.name!r}, dim={self.dim})"
+
+    def _components(self, x, what: str) -> jax.Array:
+        return real_components(x, self.dim, what)
+
+    def _element(self, g, what: str) -> jax.Array:
+        matrix = square_matrices(g, self.matrix_size, what)
+        if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra.basis):
+            raise ComponentError(
+                f"{what} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
+            )
+        return matrix.astype(self.identity.dtype)
+
+    def _why_no_log(self, g: np.ndarray, x: np.ndarray) -> str:
+        index = _first(np.isnan(x).any(axis=-1))
+        where, g = f"log on {self.name}: g{_at(index)}", g[index]
+        if not np.isfinite(g).all():
+            return f"{where} has entries that are not finite"
+        defect = float(self.defect(g))
+        if not defect <= MEMBERSHIP_TOLERANCE:
+            return (
+                f"{where} is not in the group: relative distance {defect:.3g}, tolerance {MEMBERSHIP_TOLERANCE:.0e}; "
+                "bring it back to the group first"
+            )
+        eigenvalues = np.linalg.eigvals(g)
+        worst = eigenvalues[np.argmax(np.abs(np.angle(eigenvalues)))]
+        return (
+            f"{where} has the eigenvalue {worst:.6g} at angle {abs(np.angle(worst)):.10f} from the positive axis, and "
+            f"det g = {np.linalg.det(g):.3g}; the principal logarithm needs angles below pi - "
+            f"{closed.HALF_TURN_MARGIN:.0e}; take the logarithm of g relative to a nearer element h, "
+            "log(compose(inverse(h), g))"
+        )
+
+
+# -- the groups -----------------------------------------------------------------------------------------------------
+
+
+@register((2,), (3,), (4,), (5,))
+def SO(n: int) -> MatrixGroup:
+    """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
+    algebra, name = catalogue.so(n), f"SO({n})"
+    if n == 3:
+        return MatrixGroup(
+            name, algebra, _unitary_defect, _adjoint, closed.so3_exp, closed.so3_log, closed.so3_cayley
+        )
+    return MatrixGroup(name, algebra, _unitary_defect, _adjoint)
+
+
+@register((2,), (3,), (4,))
+def SE(n: int) -> MatrixGroup:
+    """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
+    algebra, name = catalogue.se(n), f"SE({n})"
+    if n == 3:
+        return MatrixGroup(name, algebra, _rigid_defect, _rigid_inverse, closed.se3_exp, closed.se3_log)
+    return MatrixGroup(name, algebra, _rigid_defect, _rigid_inverse)
+
+
+@register((2,), (3,))
+def SU(n: int) -> MatrixGroup:
+    """Unitary complex matrices of determinant 1."""
+    algebra, name = catalogue.su(n), f"SU({n})"
+    if n == 2:
+        return MatrixGroup(name, algebra, _unitary_defect, _adjoint, closed.su2_exp, closed.su2_log)
+    return MatrixGroup(name, algebra, _unitary_defect, _adjoint, cayley_map=None)
+
+
+@register((2,), (3,))
+def SL(n: int) -> MatrixGroup:
+    """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
+    group = MatrixGroup(f"SL({n})", catalogue.sl(n), _unimodular_defect)
+    return group if n == 2 else replace(group, cayley_map=None)
+
+
+@register((1,), (2,))
+def Sp(n: int) -> MatrixGroup:
+    """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
+    return MatrixGroup(f"Sp({n})", catalogue.sp(n), _symplectic_defect, _symplectic_inverse)
+
+
+@register((1,), (2,), (3,))
+def GL(n: int) -> MatrixGroup:
+    """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
+    return MatrixGroup(f"GL({n})", catalogue.gl(n), _invertible_defect)
+
+
+@register((1,), (2,))
+def Heisenberg(n: int = 1) -> MatrixGroup:
+    """Upper triangular matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``. Here the Cayley map is the exponential."""
+    return MatrixGroup(
+        f"Heisenberg({n})",
+        catalogue.heisenberg(n),
+        _heisenberg_defect,
+        _heisenberg_inverse,
+        closed.heisenberg_exp,
+        closed.heisenberg_log,
+        closed.heisenberg_exp,
+    )
+
+
+def _unitary_defect(g):
+    return jnp.maximum(largest(_adjoint(g) @ g - jnp.eye(g.shape[-1])), jnp.abs(jnp.linalg.det(g) - 1.0))
+
+
+def _rigid_defect(g):
+    last = jnp.abs(g[..., -1, :] - jnp.eye(g.shape[-1])[-1]).max(axis=-1)
+    return jnp.maximum(_unitary_defect(g[..., :-1, :-1]), last)
+
+
+def _unimodular_defect(g):
+    """|det g - 1| over the product of the norms of the rows, to which a relative change of g changes it."""
+    rows = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
+    return jnp.abs(jnp.linalg.det(g) - 1.0) / jnp.maximum(rows, 1.0)
+
+
+def _symplectic_defect(g):
+    size = jnp.maximum(largest(g) ** 2, 1.0)
+    return largest(_symplectic_inverse(g) @ g - jnp.eye(g.shape[-1])) / size
+
+
+def _invertible_defect(g):
+    singular = jnp.linalg.svd(g, compute_uv=False)
+    invertible = singular[..., -1] > g.shape[-1] * np.finfo(float).eps * singular[..., 0]
+    return jnp.where(invertible, 0.0, jnp.inf)
+
+
+def _heisenberg_defect(g):
+    free = np.zeros(g.shape[-2:], dtype=bool)
+    free[0, 1:] = free[:-1, -1] = True
+    return largest(jnp.where(free, 0.0, g - jnp.eye(g.shape[-1])))
+
+
+def _adjoint(g):
+    return g.conj().swapaxes(-1, -2)
+
+
+def _rigid_inverse(g):
+    transposed = g[..., :-1, :-1].swapaxes(-1, -2)
+    return closed.affine(transposed, -transposed @ g[..., :-1, -1:])
+
+
+def _symplectic_inverse(g):
+    """``-J g^T J``."""
+    n = g.shape[-1] // 2
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    return -J @ g.swapaxes(-1, -2) @ J
+
+
+def _heisenberg_inverse(g):
+    N = g - jnp.eye(g.shape[-1])
+    return jnp.eye(g.shape[-1]) - N + N @ N
+
+
+# -- compiled maps --------------------------------------------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnums=0)
+def _exp(group: MatrixGroup, x):
+    return group.exp_map(group.algebra, x)
+
+
+@partial(jax.jit, static_argnums=0)
+def _cayley(group: MatrixGroup, x):
+    g = group.cayley_map(group.algebra, x)
+    return jnp.where((group.defect(g) <= MEMBERSHIP_TOLERANCE)[..., None, None], g, jnp.nan)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _principal_log(group: MatrixGroup, g):
+    member = group.defect(g) <= MEMBERSHIP_TOLERANCE
+    return jnp.where(member[..., None], group.log_map(group.algebra, g), jnp.nan)
+
+
+@_principal_log.defjvp
+def _log_derivative(group: MatrixGroup, primals, tangents):
+    """From ``exp(x) = g``: ``dexp(x) x' = vee(g^-1 g')``."""
+    (g,), (dg,) = primals, tangents
+    x = _principal_log(group, g)
+    velocity = group.algebra.vee(group.inverse_map(g) @ dg)
+    return x, jnp.linalg.solve(dexp(group.algebra, x), velocity[..., None])[..., 0]
+
+
+_log = jax.jit(_principal_log, static_argnums=0)
+
+
+def _first(failed: np.ndarray) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.argwhere(failed)[0])
+
+
+def _at(index: tuple[int, ...]) -> str:
+    return f"[{', '.join(map(str, index))}]" if index else ""

@@ -1,0 +1,125 @@
+"""Poisson structures: a skew tensor Pi(x) with ``{f, g} = grad f . Pi grad g`` and ``x' = Pi grad H`` [BFM 2.1]."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._arrays import real_components
+from .errors import ParameterError, ShapeError
+from .lie_algebra import LieAlgebra
+
+
+class PoissonStructure(eqx.Module):
+    """A Poisson structure on R^n; subclasses give :meth:`tensor`, and :meth:`sharp` where it is cheaper.
+
+    Attributes
+    ----------
+    dim : int or None
+        Number of coordinates; None where a user's function did not say.
+    """
+
+    @property
+    @abstractmethod
+    def dim(self) -> int | None: ...
+
+    @abstractmethod
+    def tensor(self, x) -> jax.Array:
+        """The matrix Pi(x), shape (n, n), at one point x, shape (n,)."""
+
+    def sharp(self, x, alpha) -> jax.Array:
+        """``Pi(x) alpha``, shape (n,), for a covector alpha, shape (n,)."""
+        return self.tensor(x) @ alpha
+
+    def bracket(self, f: Callable, g: Callable) -> Callable:
+        """The function ``{f, g}``: ``x -> grad f . Pi(x) grad g``."""
+        return lambda x: jnp.dot(jax.grad(f)(x), self.sharp(x, jax.grad(g)(x)))
+
+    def hamiltonian_vector_field(self, H: Callable) -> Callable:
+        """The vector field ``X_H = Pi grad H``, for which ``X_H(f) = {f, H}``."""
+        return lambda x: self.sharp(x, jax.grad(H)(x))
+
+    def jacobi_residual(self, x) -> jax.Array:
+        """Largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""
+        x = real_components(x, self._dimension(x), "x")
+        tensor, derivative = self.tensor(x), jax.jacfwd(self.tensor)(x)
+        term = jnp.einsum("il,jkl->ijk", tensor, derivative)
+        return jnp.max(jnp.abs(term + term.transpose(1, 2, 0) + term.transpose(2, 0, 1)))
+
+    def rank(self, x) -> int:
+        """Rank of Pi(x): the dimension of the symplectic leaf through x."""
+        return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension(x), "x")))))
+
+    def _dimension(self, x) -> int:
+        return jnp.shape(x)[-1] if self.dim is None else self.dim
+
+
+class LiePoisson(PoissonStructure):
+    """Lie-Poisson structure on g*: ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, so ``Pi(mu) xi = ad*_xi mu`` [BFM 3.1]."""
+
+    algebra: LieAlgebra = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        return self.algebra.dim
+
+    def tensor(self, x) -> jax.Array:
+        return jnp.einsum("abc,c->ba", self.algebra.structure_constants, x)
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return self.algebra.ad_star(alpha, x)
+
+
+class Canonical(PoissonStructure):
+    """Canonical structure on T*R^n, coordinates (q_1 … q_n, p_1 … p_n): ``q' = H_p``, ``p' = -H_q``."""
+
+    degrees_of_freedom: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
+            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+
+    @property
+    def dim(self) -> int:
+        return 2 * self.degrees_of_freedom
+
+    def tensor(self, x) -> jax.Array:
+        del x  # the tensor is constant
+        identity, zero = np.eye(self.degrees_of_freedom), np.zeros((self.degrees_of_freedom,) * 2)
+        return jnp.asarray(np.block([[zero, identity], [-identity, zero]]))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        del x
+        position, momentum = jnp.split(alpha, 2)
+        return jnp.concatenate([momentum, -position])
+
+
+class PoissonTensor(PoissonStructure):
+    """A structure given by its tensor: a constant (n, n) matrix, or a function from x, shape (n,), to one.
+
+    Nothing is checked here: ``jacobi_residual`` measures the Jacobi identity at a point, and a dynamical system
+    built on the structure checks skewness and Jacobi at random ones.
+    """
+
+    matrix: Callable | jax.Array
+    size: int | None = eqx.field(static=True)
+
+    def __init__(self, matrix, dim: int | None = None):
+        if not callable(matrix):
+            matrix = jnp.asarray(matrix, dtype=jnp.float64)
+            if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+                raise ShapeError(f"a Poisson tensor is a square matrix, not an array of shape {matrix.shape}")
+            dim = matrix.shape[0]
+        self.matrix, self.size = matrix, dim
+
+    @property
+    def dim(self) -> int | None:
+        return self.size
+
+    def tensor(self, x) -> jax.Array:
+        return jnp.asarray(self.matrix(x)) if callable(self.matrix) else self.matrix

@@ -1,0 +1,167 @@
+"""Polynomials on the dual of a Lie algebra: exact where they can be, printable, and callable under JAX."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from numbers import Rational, Real
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._arrays import real_components
+from .errors import ComponentError, ShapeError
+
+Coefficient = Fraction | float
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, init=False, repr=False)
+class Polynomial:
+    """A polynomial in the components ``mu1, mu2, …`` of ``mu``.
+
+    Immutable and hashable, hence a static leaf of a pytree. Sums, differences and products with polynomials and
+    numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a fraction.
+
+    Parameters
+    ----------
+    exponents : array of int, shape (terms, dim)
+        One row for each monomial; equal rows are added up.
+    coefficients : sequence of int, Fraction or float, length terms
+
+    Attributes
+    ----------
+    dim : int
+    terms : tuple of (exponents, coefficient)
+        The nonzero terms, in lexicographic order: ``mu1**2`` before ``mu1*mu2`` before ``mu2**3``.
+    """
+
+    dim: int
+    terms: tuple[tuple[tuple[int, ...], Coefficient], ...]
+
+    __array_ufunc__ = None  # lets np.float64(2) * polynomial reach __rmul__
+
+    def __init__(self, exponents, coefficients):
+        powers = np.asarray(exponents)
+        if powers.ndim != 2 or len(powers) != len(coefficients):
+            raise ShapeError(
+                f"{len(coefficients)} coefficients need exponents of shape ({len(coefficients)}, dim), "
+                f"not {powers.shape}"
+            )
+        if powers.size and (not np.issubdtype(powers.dtype, np.integer) or powers.min() < 0):
+            raise ComponentError("the exponents of a polynomial are integers >= 0")
+        terms: dict[tuple[int, ...], Coefficient] = {}
+        for power, coefficient in zip(map(tuple, powers.tolist()), coefficients, strict=True):
+            terms[power] = terms.get(power, Fraction(0)) + _coefficient(coefficient)
+        nonzero = ((power, terms[power]) for power in sorted(terms, reverse=True) if terms[power])
+        object.__setattr__(self, "dim", powers.shape[1])
+        object.__setattr__(self, "terms", tuple(nonzero))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """The coefficients of :attr:`terms`."""
+        return tuple(coefficient for _, coefficient in self.terms)
+
+    @cached_property
+    def exponents(self) -> np.ndarray:
+        """The exponents of :attr:`terms`, shape (terms, dim), read-only."""
+        array = np.array([power for power, _ in self.terms], dtype=np.int64).reshape(len(self.terms), self.dim)
+        array.setflags(write=False)
+        return array
+
+    @property
+    def degree(self) -> int:
+        """The largest total degree of a term; 0 for a constant, zero included."""
+        return max((sum(power) for power, _ in self.terms), default=0)
+
+    def __call__(self, mu) -> jax.Array:
+        """The value at ``mu``, shape (..., dim) -> (...)."""
+        mu = real_components(mu, self.dim, "mu")
+        # Products of gathered components: mu**0 would have the derivative 0 * mu**-1, which is NaN at zero.
+        padded = jnp.concatenate([mu, jnp.ones((*mu.shape[:-1], 1))], axis=-1)
+        values = jnp.ones((*mu.shape[:-1], len(self.terms)))
+        for factor in self._factors:
+            values = values * padded[..., factor]
+        return values @ np.array([float(c) for c in self.coefficients])
+
+    @cached_property
+    def _factors(self) -> np.ndarray:
+        """Shape (degree, terms): the components to multiply; the index ``dim`` stands for the number 1."""
+        factors = np.full((self.degree, len(self.terms)), self.dim)
+        for term, (power, _) in enumerate(self.terms):
+            factors[: sum(power), term] = np.repeat(np.arange(self.dim), power)
+        return factors
+
+    def gradient(self) -> tuple[Polynomial, ...]:
+        """The partial derivatives by mu1, mu2, …"""
+        return tuple(self._derivative(a) for a in range(self.dim))
+
+    def _derivative(self, a: int) -> Polynomial:
+        terms = [((*p[:a], p[a] - 1, *p[a + 1 :]), p[a] * c) for p, c in self.terms if p[a]]
+        return self._from(terms)
+
+    # -- arithmetic -------------------------------------------------------------------------------------------------
+
+    def __add__(self, other) -> Polynomial:
+        other = self._operand(other)
+        return NotImplemented if other is None else self._from(self.terms + other.terms)
+
+    def __mul__(self, other) -> Polynomial:
+        other = self._operand(other)
+        if other is None:
+            return NotImplemented
+        return self._from(
+            [(tuple(i + j for i, j in zip(p, q, strict=True)), c * d) for p, c in self.terms for q, d in other.terms]
+        )
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def __neg__(self) -> Polynomial:
+        return self * -1
+
+    def __sub__(self, other) -> Polynomial:
+        other = self._operand(other)
+        return NotImplemented if other is None else self + -other
+
+    def __rsub__(self, other) -> Polynomial:
+        return -self + other
+
+    def _operand(self, other) -> Polynomial | None:
+        if isinstance(other, Real):
+            return self._from([((0,) * self.dim, other)])
+        if isinstance(other, Polynomial) and other.dim != self.dim:
+            raise ShapeError(f"polynomials in {self.dim} and in {other.dim} variables do not combine")
+        return other if isinstance(other, Polynomial) else None
+
+    def _from(self, terms) -> Polynomial:
+        powers = np.array([power for power, _ in terms], dtype=np.int64).reshape(len(terms), self.dim)
+        return Polynomial(powers, [coefficient for _, coefficient in terms])
+
+    # -- printing ---------------------------------------------------------------------------------------------------
+
+    def __str__(self) -> str:
+        text = " + ".join(_term(power, coefficient) for power, coefficient in self.terms)
+        return text.replace("+ -", "- ") or "0"
+
+    def __repr__(self) -> str:
+        return f"<Polynomial {self}>"
+
+
+def _coefficient(value) -> Coefficient:
+    if isinstance(value, Rational):
+        return Fraction(int(value.numerator), int(value.denominator))
+    if not isinstance(value, Real) or not math.isfinite(value):
+        raise ComponentError(f"a coefficient must be a finite real number, not {value!r}")
+    return float(value)
+
+
+def _term(power: tuple[int, ...], coefficient: Coefficient) -> str:
+    number = str(coefficient) if isinstance(coefficient, Fraction) else f"{coefficient:.15g}"
+    factors = [f"mu{i + 1}" + (f"**{e}" if e > 1 else "") for i, e in enumerate(power) if e]
+    if factors and number in ("1", "-1"):
+        return number[:-1] + "*".join(factors)
+    return "*".join([number, *factors])

@@ -1,0 +1,199 @@
+"""The cases on which the shared property suite runs, and its tolerances.
+
+An algebra, a dissipation or a method enters by being registered (algebras and methods in the library, dissipations in
+``DISSIPATIONS`` below); every property then runs on it. Exemptions carry a reason.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numpy as np
+
+EPS = float(np.finfo(float).eps)
+
+TOLERANCES = {
+    # name: (bound, what was measured and why)
+    "axiom": (1e-12, "at most 2e-13 seen: sums of dim^2 products of numbers of order one"),
+    "energy": (2e-14, "relative drift over 40 steps; at most 5e-15 seen, up to ten roundings of H"),
+    "entropy": (4 * EPS, "relative to max |S|: roundings of S itself at its maximum"),
+    "casimir": (2e-14, "relative drift of quadratic Casimirs over 40 steps; at most 5e-15 seen"),
+    "kernel": (1e-14, "|K_d dgrad H| relative to |K_d| |dgrad H|; at most 2e-15 seen"),
+}
+
+
+def tolerance(name: str) -> float:
+    return TOLERANCES[name][0]
+
+
+ALGEBRAS = list(mf.registered())
+
+
+def algebra_id(g: mf.LieAlgebra) -> str:
+    return g.name
+
+
+# -- entropies --------------------------------------------------------------------------------------------------------
+
+
+def _bianchi_iv(mu):  # e1 moves (mu2, mu3) by (mu2 + mu3, mu3)
+    return mu[1] / mu[2] - jnp.log(mu[2])
+
+
+def _bianchi_v(mu):  # by (mu2, mu3)
+    return mu[1] / mu[2]
+
+
+def _bianchi_vi(a: float) -> Callable:  # mu2 + mu3 grows at rate a - 1, mu2 - mu3 at rate a + 1
+    return lambda mu: (a + 1) * jnp.log(mu[1] + mu[2]) - (a - 1) * jnp.log(mu[1] - mu[2])
+
+
+def _bianchi_vii(a: float) -> Callable:  # a spiral: the radius grows at rate a, the angle falls at rate 1
+    return lambda mu: 0.5 * jnp.log(mu[1] ** 2 + mu[2] ** 2) + a * jnp.arctan2(mu[2], mu[1])
+
+
+TRANSCENDENTAL = {
+    "bianchi('IV')": (_bianchi_iv, [0.3, 0.4, 1.5]),
+    "bianchi('V')": (_bianchi_v, [0.3, 0.4, 1.5]),
+    "bianchi('VI', h=-0.25)": (_bianchi_vi(0.5), [0.3, 1.5, 0.2]),
+    "bianchi('VI', h=-0.5)": (_bianchi_vi(0.5**0.5), [0.3, 1.5, 0.2]),
+    "bianchi('VII', h=1)": (_bianchi_vii(1.0), [0.3, 1.5, 0.2]),
+    "bianchi('VII', h=0.3)": (_bianchi_vii(0.3**0.5), [0.3, 1.5, 0.2]),
+}
+"""Casimirs that are not polynomials, and a state inside their domain."""
+
+
+def entropy_of(g: mf.LieAlgebra):
+    """A Casimir of lowest degree, or None for an algebra without any."""
+    if g.casimir_count() == 0:
+        return None
+    if g.name in TRANSCENDENTAL:
+        return TRANSCENDENTAL[g.name][0]
+    for degree in (1, 2, 3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
+            found = g.casimirs(degree)
+        if found:
+            # of several quadratic ones the sum: se(3) has |p|^2 and l.p
+            return lt.energy.as_energy(found[0], "S")
+    raise AssertionError(f"no Casimir known for {g.name}: add one to TRANSCENDENTAL")
+
+
+def state_of(g: mf.LieAlgebra, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    if g.name in TRANSCENDENTAL:
+        return np.array(TRANSCENDENTAL[g.name][1]) + 0.05 * rng.standard_normal(g.dim)
+    return rng.standard_normal(g.dim)
+
+
+def energy_of(dim: int, seed: int):
+    """A nonlinear energy: a positive quadratic part, a quartic and a cosine."""
+    rng = np.random.default_rng(1000 + seed)
+    root = rng.standard_normal((dim, dim)) / np.sqrt(dim)
+    A, b, c = root @ root.T + np.eye(dim), rng.standard_normal(dim), rng.standard_normal(dim)
+    return lt.Quadratic(A) + lt.Function(
+        lambda mu: 0.05 * jnp.dot(b, mu) ** 4 / dim + 0.3 * jnp.cos(jnp.dot(c, mu) / jnp.sqrt(1.0 * dim))
+    )
+
+
+# -- dissipations -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A dissipation as the suite runs it: how to build it for an algebra and an energy."""
+
+    name: str
+    build: Callable  # (algebra, energy, rng) -> Dissipation
+    exempt: Callable = lambda g: None  # a reason, where it does not apply to an algebra
+
+
+def _spd(rng, n):
+    root = rng.standard_normal((n, n)) / np.sqrt(n)
+    return root @ root.T + 0.5 * np.eye(n)
+
+
+def _friction_operator(g, energy, rng):
+    """A K(x) of its own: two squared vectors orthogonal to grad H."""
+    vectors = rng.standard_normal((2, g.dim))
+
+    def K(x):
+        dH = energy.gradient(x)
+        rows = vectors - (vectors @ dH)[:, None] * dH / jnp.dot(dH, dH)
+        return rows.T @ rows
+
+    return lt.FrictionOperator(K, rate=0.2)
+
+
+def _curvature_tensor(g, energy, rng):
+    """A curvature-like tensor: R = sum of A (x) A over antisymmetric A, so that (F, F) >= 0."""
+    A = rng.standard_normal((3, g.dim, g.dim)) / g.dim
+    A = A - A.swapaxes(1, 2)
+    return lt.FourBracket(np.einsum("aij,akl->ijkl", A, A))
+
+
+def _no_killing(g: mf.LieAlgebra) -> str | None:
+    if g.is_nilpotent():
+        return "the Killing form of a nilpotent algebra vanishes"
+    if g.is_semisimple():
+        return None
+    lowest = np.linalg.eigvalsh(-g.killing_form())[0]
+    return "minus the Killing form is indefinite" if lowest < -1e-10 else None
+
+
+def _abelian(g: mf.LieAlgebra) -> str | None:
+    return "nothing brackets to anything in an abelian algebra" if g.is_abelian() else None
+
+
+DISSIPATIONS = [
+    Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _no_killing),
+    Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian),
+    Case("projected", lambda g, H, rng: lt.ProjectedMetric(rate=0.1)),
+    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim))),
+    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3)),
+    Case(
+        "projected_preserve",
+        lambda g, H, rng: lt.ProjectedMetric(preserve=(lt.Quadratic(_spd(rng, g.dim)),), normalized=True, rate=0.3),
+        lambda g: "one dimension leaves no room beside H and another function" if g.dim < 3 else None,
+    ),
+    Case("friction_operator", _friction_operator, lambda g: "a line has no covector beside dH" if g.dim < 2 else None),
+    Case("kulkarni_nomizu", lambda g, H, rng: lt.FourBracket.kulkarni_nomizu(0.1 * _spd(rng, g.dim), _spd(rng, g.dim))),
+    Case("four_bracket", _curvature_tensor),
+    Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian),
+    Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian),
+    Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian),
+    Case(
+        "sum",
+        lambda g, H, rng: lt.ProjectedMetric(rate=0.1) + lt.FourBracket.kulkarni_nomizu(0.1 * np.eye(g.dim), np.eye(g.dim)),
+    ),
+]
+
+
+def build(g: mf.LieAlgebra, case: Case, seed: int = 0) -> lt.LiePoissonSystem:
+    """The system of a case; the axioms at random points are the tests' business where S has a domain."""
+    energy, rng = energy_of(g.dim, seed), np.random.default_rng(seed)
+    return lt.LiePoissonSystem(
+        g, energy, entropy_of(g), case.build(g, energy, rng), validate=g.name not in TRANSCENDENTAL
+    )
+
+
+REPRESENTATIVE = [mf.so(3), mf.se(3), mf.sl(2), mf.su(3)]
+"""Compact, semidirect, noncompact and irrational: enough for what does not depend on the algebra."""
+
+
+def combinations(algebras) -> list:
+    """All (algebra, dissipation) pairs that apply: those without a Casimir have no entropy to produce."""
+    import pytest
+
+    return [
+        pytest.param(g, case, id=f"{g.name}-{case.name}")
+        for g in algebras
+        if g.casimir_count() > 0
+        for case in DISSIPATIONS
+        if case.exempt(g) is None
+    ]

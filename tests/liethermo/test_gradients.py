@@ -1,0 +1,148 @@
+"""Discrete gradients: the two defining properties (BFM 4.1), stability as d -> 0, and symmetry."""
+
+import jax
+import jax.numpy as jnp
+import liethermo as lt
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from liethermo.gradients import GRADIENTS
+
+from tests.cases import EPS, energy_of
+
+NAMES = list(GRADIENTS)
+seeds = st.integers(0, 10**6)
+
+
+each_gradient = pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=NAMES)
+
+
+@each_gradient
+@pytest.mark.parametrize("distance", [3.0, 1.0, 0.3, 0.03, 1e-3, 1e-6, 1e-9, 1e-13])
+@given(seed=seeds)
+def test_identity_at_every_distance(gradient, distance, seed):
+    """dgrad . d = H(x + d) - H(x), to the rounding error of the right-hand side."""
+    rng = np.random.default_rng(seed)
+    energy, x = energy_of(4, seed), rng.standard_normal(4)
+    d = distance * rng.standard_normal(4) / 2
+    before, after = float(energy.value(x)), float(energy.value(x + d))
+    found = float(jnp.dot(gradient(energy, x, d), d))
+    # x + d is rounded, which moves H by |grad H| eps |x|
+    allowed = 40 * EPS * (abs(before) + abs(after) + float(jnp.linalg.norm(energy.gradient(x + d))))
+    assert abs(found - (after - before)) <= allowed
+
+
+@each_gradient
+@given(seed=seeds)
+def test_tends_to_the_gradient(gradient, seed):
+    """dgrad -> grad H: to rounding once d is tiny, with no noise of size eps / |d|."""
+    rng = np.random.default_rng(seed)
+    energy, x = energy_of(4, seed), rng.standard_normal(4)
+    direction = rng.standard_normal(4)
+    exact = np.asarray(energy.gradient(x))
+    for distance in (1e-9, 1e-12, 1e-15, 1e-18, 1e-100, 1e-160, 0.0):
+        found = np.asarray(gradient(energy, x, distance * direction))
+        assert np.abs(found - exact).max() <= 20 * distance * np.abs(direction).max() + 40 * EPS * np.abs(exact).max()
+
+
+def test_the_printed_quotient_is_noise_near_zero():
+    """Control: BFM (4.3) as printed loses the gradient where the library's version keeps it."""
+    energy, rng = energy_of(4, 0), np.random.default_rng(0)
+    x, direction = rng.standard_normal(4), rng.standard_normal(4)
+    errors = {"printed": 0.0, "ours": 0.0}
+    for distance in np.geomspace(1e-14, 1e-9, 30):
+        d = distance * direction
+        middle = energy.gradient(x + d / 2)
+        quotient = (energy.value(x + d) - energy.value(x) - middle @ d) / (d @ d)
+        exact = np.asarray(energy.gradient(x + d / 2))
+        errors["printed"] = max(errors["printed"], np.abs(np.asarray(middle + quotient * d) - exact).max())
+        errors["ours"] = max(errors["ours"], np.abs(np.asarray(lt.Gonzalez()(energy, x, d)) - exact).max())
+    assert errors["printed"] > 1e-4
+    assert errors["ours"] < 1e-14
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_continuous_across_the_gate(name):
+    """Along a ray in d the gradient moves by no more than its own variation: no jump where the defect is let in."""
+    energy, rng = energy_of(4, 3), np.random.default_rng(3)
+    x, direction = rng.standard_normal(4), rng.standard_normal(4)
+    distances = np.geomspace(1e-8, 1.0, 4001)
+    found = np.asarray(jax.vmap(lambda r: GRADIENTS[name](energy, x, r * direction))(distances))
+    jumps = np.abs(np.diff(found, axis=0)).max(axis=1)
+    assert (jumps <= 20 * np.diff(distances) + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", ["gonzalez", "mean_value", "symmetric_coordinate_increment"])
+@given(seed=seeds)
+def test_symmetric_in_its_end_points(name, seed):
+    rng = np.random.default_rng(seed)
+    energy, x, d = energy_of(3, seed), rng.standard_normal(3), 0.5 * rng.standard_normal(3)
+    there = np.asarray(GRADIENTS[name](energy, x, d))
+    back = np.asarray(GRADIENTS[name](energy, x + d, -d))
+    assert np.abs(there - back).max() <= 1e-12 * np.abs(there).max()
+
+
+def test_the_printed_coordinate_increment_is_not_symmetric():
+    """Control for the test above, and the reason why its scheme has order 1."""
+    energy, x, d = energy_of(3, 1), np.ones(3), np.array([0.3, -0.2, 0.5])
+    gradient = GRADIENTS["coordinate_increment"]
+    assert np.abs(np.asarray(gradient(energy, x, d) - gradient(energy, x + d, -d))).max() > 1e-3
+
+
+@each_gradient
+def test_coordinate_increment_where_one_coordinate_rests(gradient):
+    energy, x = energy_of(3, 1), np.array([0.4, -0.3, 1.0])
+    found = np.asarray(gradient(energy, x, np.array([0.3, 0.0, 0.0])))
+    assert np.isfinite(found).all()
+    middle = jax.grad(energy.value)(x + np.array([0.3, 0.0, 0.0]))
+    if "increment" in type(gradient).__name__.lower():
+        assert found[2] == pytest.approx(float(middle[2]), rel=0.2)
+
+
+@each_gradient
+@given(seed=seeds)
+def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
+    """The closed form for a Quadratic equals what the general formula makes of the same function."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 4))
+    term = lt.Quadratic(A + A.T, rng.standard_normal(4), 0.7)
+    general = lt.Function(term.value)
+    x, d = rng.standard_normal(4), rng.standard_normal(4)
+    assert np.allclose(gradient(term, x, d), gradient(general, x, d), rtol=0, atol=1e-12)
+
+
+@each_gradient
+@pytest.mark.parametrize("function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])])
+def test_short_length_scales(gradient, function):
+    """The gate is scale free: a function that varies on lengths of 1e-3 keeps the identity at every distance."""
+    energy, x, direction = lt.Function(function), np.array([0.7, 0.4]), np.array([1.0, 0.5])
+    for distance in np.geomspace(1e-9, 1.0, 19):
+        d = distance * direction
+        difference = float(energy.value(x + d) - energy.value(x))
+        noise = 40 * EPS * (1.0 + 1000.0 + abs(difference))
+        assert abs(float(gradient(energy, x, d) @ d) - difference) <= noise
+
+
+def test_mean_value_is_exact_on_polynomials_of_its_degree():
+    """Quadrature with m nodes integrates the gradient of a polynomial of degree 2m exactly: no defect is left."""
+    for nodes in (1, 2, 3):
+        energy = lt.Function(lambda x, degree=2 * nodes: x[0] ** degree + x[0] * x[1] ** (degree - 1))
+        x, d = np.array([0.7, -0.4]), np.array([0.9, 1.3])
+        points, weights = np.polynomial.legendre.leggauss(12)
+        exact = sum(w / 2 * energy.gradient(x + (c + 1) / 2 * d) for c, w in zip(points, weights, strict=True))
+        assert np.allclose(lt.MeanValue(nodes=nodes)(energy, x, d), exact, rtol=0, atol=1e-13)
+
+
+@each_gradient
+def test_nan_is_not_hidden(gradient):
+    """A function outside its domain must show: a closed gate does not swallow NaN."""
+    energy = lt.Function(lambda x: jnp.sqrt(x[0]))
+    assert not np.isfinite(np.asarray(gradient(energy, np.array([0.5]), np.array([-0.6])))).all()
+
+
+def test_unknown_names_and_bad_nodes_are_refused():
+    with pytest.raises(lt.InputError, match="'gonzalez', 'mean_value'"):
+        lt.MetriplecticMidpoint(gradient="gonzales")
+    with pytest.raises(lt.InputError, match="positive integer"):
+        lt.MeanValue(nodes=0)

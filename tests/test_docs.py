@@ -1,0 +1,53 @@
+"""What a user is shown runs: the Python blocks of the README and of the documentation, and the gallery's examples."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import pytest
+
+import liethermo
+import manifolds
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [*ROOT.glob("README.md"), *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
+BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def _name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.fixture
+def scratch(tmp_path, monkeypatch):
+    """An empty working directory and a backend without a screen; figures are closed afterwards."""
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    yield tmp_path
+    plt.close("all")
+
+
+@pytest.mark.filterwarnings("ignore::manifolds.NoPolynomialCasimirWarning")  # a page shows it
+@pytest.mark.parametrize("page", [page for page in PAGES if BLOCK.search(page.read_text())], ids=_name)
+def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
+    text, namespace = page.read_text(), {"__name__": "__main__"}
+    for block in BLOCK.finditer(text):
+        above = text.count("\n", 0, block.start(1))  # a traceback then names the line of the page
+        exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=_name)
+def test_an_example_runs_and_draws(example, scratch):
+    runpy.run_path(str(example), run_name="__main__")
+    assert plt.get_fignums(), "a gallery example shows at least one figure"
+
+
+@pytest.mark.parametrize("package", [liethermo, manifolds], ids=lambda package: package.__name__)
+def test_the_reference_lists_every_public_name(package):
+    listed = set(re.findall(r"^ {3}(?:\w+\.)*(\w+)$", (ROOT / "docs" / "api.rst").read_text(), re.MULTILINE))
+    assert sorted(set(package.__all__) - listed) == []
