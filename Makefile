@@ -73,6 +73,6 @@ lock:
 	cp "$$folder/lock" requirements.lock
 
 clean:
-	rm -rf .venv build *.egg-info demo_output docs/_build docs/auto_examples docs/generated docs/sg_execution_times.rst
+	rm -rf .venv build *.egg-info demo_output docs/_build docs/gallery docs/generated docs/sg_execution_times.rst
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -33,9 +33,10 @@ from .errors import (
     IntegrationError,
     LiethermoError,
     NonFiniteError,
+    SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrate import integrate
+from .timeloop import integrate
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
@@ -74,6 +75,7 @@ __all__ = [
     "Quadratic",
     "Reference",
     "Solution",
+    "SpecError",
     "Stats",
     "Status",
     "System",

@@ -94,20 +94,21 @@ class Audit:
 def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     """See :meth:`liethermo.Solution.audit`."""
     stats, laws, rows = solution.stats, solution.laws, []
-    lowest = min(stats.energy_range[0], float(solution.energy.min()))
-    highest = max(stats.energy_range[1], float(solution.energy.max()))
+    low, high = stats.energy_range or (np.inf, -np.inf)
+    lowest, highest = min(low, float(solution.energy.min())), max(high, float(solution.energy.max()))
     first = float(solution.energy[0])
     scale = abs(first) or 1.0
     drift = max(highest - first, first - lowest) / scale
     if laws.energy == "conserved":
         rows.append(_verdict("energy drift", drift, tolerances.energy))
     else:
-        risen = max(stats.largest_energy_increment, _extreme(np.diff(solution.energy), np.max)) / scale
+        increments = [*np.diff(solution.energy), _or(stats.largest_energy_increment, -np.inf)]
+        risen = float(max(increments)) / scale
         rows.append(_verdict("largest energy increment", risen, tolerances.energy))
 
     least = np.nan
     if solution.entropy is not None:
-        least = min(stats.least_entropy_increment, _extreme(np.diff(solution.entropy), np.min))
+        least = float(min([*np.diff(solution.entropy), _or(stats.least_entropy_increment, np.inf)]))
         allowed = tolerances.entropy * float(np.abs(solution.entropy).max())
         if laws.entropy == "nondecreasing":
             rows.append(AuditRow("least entropy increment", least, -allowed, bool(least >= -allowed)))
@@ -127,9 +128,9 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
             else AuditRow(f"change of {name}", value, None, None, "not a constant of this system")
         )
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
-    finished = solution.status.ok
-    note = "" if finished else solution.status.code
-    rows.append(AuditRow("steps taken", float(stats.steps), None, None if finished else False, note))
+    status = solution.status  # a run stopped by its user is short, but breaks no law
+    failed = not status.ok and status.code != "interrupted"
+    rows.append(AuditRow("steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else status.code))
     return Audit(drift, least, casimir_drift, stats.worst_residual, tuple(rows))
 
 
@@ -143,7 +144,5 @@ def _drift(series: np.ndarray) -> float:
     return float(np.abs(series - series[0]).max()) / scale
 
 
-def _extreme(values: np.ndarray, which) -> float:
-    if not len(values):
-        return -np.inf if which is np.max else np.inf
-    return float(which(values))
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

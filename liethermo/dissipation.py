@@ -164,7 +164,7 @@ class KillingDissipation(Dissipation):
     form: jax.Array | None
 
     def __init__(self, rate=1.0, form=None):
-        self.rate = _rate(rate)
+        self.rate = checked_rate(rate)
         self.form = form  # filled in by prepared(), once the algebra is known
 
     @staticmethod
@@ -229,7 +229,7 @@ class ProjectedMetric(Dissipation):
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(L, "a preserved function") for L in functions)
         self.normalized = bool(normalized)
-        self.rate = _rate(rate)
+        self.rate = checked_rate(rate)
 
     @property
     def preserve(self):
@@ -285,7 +285,7 @@ class FrictionOperator(Dissipation):
 
     def __init__(self, K, rate=1.0):
         self.K = K if callable(K) else _semidefinite(K, "the friction operator K")
-        self.rate = _rate(rate)
+        self.rate = checked_rate(rate)
 
     def prepared(self, system):
         _check_matrix(self.K, system.dim, "the friction operator K")
@@ -395,7 +395,7 @@ class DoubleBracket(Dissipation):
     metric: jax.Array | None
 
     def __init__(self, rate=1.0, metric=None):
-        self.rate = _rate(rate)
+        self.rate = checked_rate(rate)
         self.metric = None if metric is None else _semidefinite(metric, "the metric")
 
     @property
@@ -468,7 +468,8 @@ def _state(dim: int):
     return jax.ShapeDtypeStruct((dim,), jnp.float64)
 
 
-def _rate(rate) -> jax.Array:
+def checked_rate(rate) -> jax.Array:
+    """A rate as one non-negative number (or a traced one)."""
     array = jnp.asarray(rate, dtype=jnp.float64)
     if array.shape != ():
         raise InputError(f"a rate is one number, not an array of shape {array.shape}")

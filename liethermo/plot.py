@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from contourpy import contour_generator
-from matplotlib.colors import LightSource
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
-from .audit import EPS, Tolerances
-from .energy import Energy, Quadratic
+from .audit import EPS, Audit, Tolerances
 from .errors import FileError, InputError
 from .solution import Solution
 from .systems import System
 
-SUFFIXES = (".png", ".svg", ".pdf")
+SUFFIXES = (".pdf", ".png", ".svg")
 DPI = 150
 MOST_SEGMENTS = 20_000
-"""Longer trajectories are thinned for the 3D picture, which draws every segment by itself."""
+"""A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""
 
-# Okabe and Ito's colours, told apart by colour-blind readers, and a map that stays dark enough on white paper.
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.45"
+# Colours that colour-blind readers tell apart [Okabe & Ito 2008], and a map that is even in lightness.
+BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.55"
 TIME_MAP = plt.get_cmap("viridis")
+
+Function = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
 
 
 # -- the path on the energy surface -------------------------------------------------------------------------------
@@ -40,179 +46,413 @@ def momentum_sphere(
     path: str | os.PathLike | None = None,
     ax: Axes3D | None = None,
 ) -> Figure:
-    """The trajectory on its energy surface, between the surfaces of constant entropy where it starts and ends.
+    """The trajectory on its energy surface, and the surfaces of constant entropy on which it starts and ends.
+
+    The energy surface is solid, with lines of constant entropy on it; the entropy surfaces are drawn by their sections
+    with the coordinate planes and the plane of the paper. The trajectory is coloured by time. What the solid hides
+    from the viewpoint of ``ax`` is pale or left out, so turn the axes before drawing, not after. A system without
+    entropy shows its first Casimir or momentum map instead; where the energy falls (double bracket) the two change
+    places.
+
+    Surfaces are found along rays from the origin. One that a ray meets twice is left out; one that does not close
+    around the origin, such as a cylinder, is drawn by sections that end a little beyond the trajectory.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of a system with three components, such as one on so(3)*.
+    system : System, optional
+        What was integrated. Without it, as for a solution read from a file, the energy surface is the quadric through
+        all states if there is exactly one, and the entropy surfaces are spheres if the algebra is so(3) or su(2),
+        where every Casimir is a function of ``|mu|``; what remains unknown is left out.
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+    ax : Axes3D, optional
+        Draw here; by default in a new figure, seen from the side on which the trajectory ends.
+
+    Raises
+    ------
+    InputError
+        If the states do not have three components, ``ax`` is flat, or the suffix of ``path`` is another.
+    FileError
+        If the file cannot be written.
     """
-    path = _checked(path)
-    x = solution.x
-    if x.shape[-1] != 3:
-        raise InputError(f"momentum_sphere draws states of three components, not {x.shape[-1]}; plot.laws draws any")
+    path = _writable(path)
+    if solution.x.shape[1] != 3:
+        raise InputError(
+            f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any"
+        )
     if system is not None and system.dim != 3:
-        raise InputError(f"this solution has three components, but the system {system.dim}")
+        raise InputError(f"the states have 3 components, but those of this system have {system.dim}")
     if ax is not None and not isinstance(ax, Axes3D):
-        raise InputError("ax must be three-dimensional: make it with projection='3d'")
+        raise InputError("ax must be three-dimensional: make it with subplot_kw={'projection': '3d'}")
     if ax is None:
         ax = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot(projection="3d")
-        ax.view_init(elev=22.0, azim=float(np.degrees(np.arctan2(x[-1, 1], x[-1, 0]))) + 50.0)
+        _look_at(solution.x[-1], ax)
     ax.set_proj_type("ortho")
-    ax.computed_zorder = False  # far side of the path, surface, nets, near side: in the order of their zorder
-    size = float(np.linalg.norm(x, axis=1).max())
+    ax.computed_zorder = False  # what is behind what is settled here, by the zorder of each piece
 
-    energy, entropy = _energy_surface(solution, system), _entropy_function(solution, system)
-    surface = None if energy is None else _level_surface(energy, x[0], _sphere(90, 180), size)
-    view = _viewpoint(ax)
-    if surface is None:
-        hidden = lambda points: np.zeros(points.shape[:-1], dtype=bool)
-    else:
-        hidden = lambda points: _hidden(energy, x[0], points, view, size)
-        right, up = _screen(view)
-        # light from upper left front
-        ax.plot_surface(*surface.T, color="0.93", alpha=0.85, linewidth=0, rcount=90, ccount=180, zorder=2, lightsource=LightSource(azdeg=90-ax.azim+40, altdeg=50))
-        ax.plot([], [], [], "s", color="0.8", label=f"energy $H = {solution.energy[0]:.4g}$")
-    if entropy is not None:
-        if surface is not None:
-          values = np.asarray(entropy(surface))
-          gen = contour_generator(z=np.ma.masked_invalid(values))
-          for level in np.linspace(np.nanmin(values), np.nanmax(values), 12)[1:-1]:
-            for line in gen.lines(level):
-                pts = np.stack([map_coordinates(surface[..., k], line.T[::-1], order=1) for k in range(3)], -1)
-                _curve(ax, pts, hidden(pts), color="0.6", lw=0.5, z=2.5, faint=0)
-        levels = [(0, ORANGE, "initial"), (-1, BLUE, "final")]
-        for index, color, label in levels:
-            if surface is not None:
-              for line in gen.lines(float(entropy(x[index]))):
-                pts = np.stack([map_coordinates(surface[..., k], line.T[::-1], order=1) for k in range(3)], -1)
-                _curve(ax, pts, hidden(pts), color=color, lw=1., z=2.5, faint=0.3)
-            for normal in (*np.eye(3), view):
-                pts = _level_surface(entropy, x[index], _circle(normal), size)
-                _curve(ax, pts, hidden(pts), color=color, lw=0.6, z=3, faint=0.25)
-            ax.plot([], [], [], color=color, label=f"{label} entropy $S={solution.entropy[index]:.4g}$")
-    _path(ax, solution, hidden(x))
+    scene = _Scene(ax, solution.x)
+    kept, changing = _quantities(solution, system)
+    if kept is not None:
+        scene.draw_solid(kept.function, kept.label(0))
+    if changing is not None:
+        scene.draw_contours(changing.function, 12)
+        scene.draw_sections(changing.function, 0, ORANGE, changing.label(0))
+        if not changing.is_constant:
+            scene.draw_sections(changing.function, -1, BLUE, changing.label(-1))
+    _draw_path(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
     ax.set(xlabel=f"${name}_1$", ylabel=f"${name}_2$", zlabel=f"${name}_3$")
-    ax.set_aspect("equal")
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_pane_color("white")
+        axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
     ax.locator_params(nbins=4)
-    for a in (ax.xaxis, ax.yaxis, ax.zaxis):
-        a.set_pane_color("1.0")
-        a._axinfo["grid"].update(color="0.9", linewidth=0.5)
+    ax.set_box_aspect((1, 1, 1), zoom=0.95)
+    ax.set_aspect("equal", adjustable="datalim")
     ax.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
     return _finished(ax.figure, path)
 
-def _curve(ax, pts, hidden, color, lw, z, faint):
-    for mask, alpha, zorder in ((~hidden, faint, 1), (hidden, 1.0, z)):
-        if alpha:
-            ax.plot(*np.where(mask[:, None], np.nan, pts).T, color=color, alpha=alpha, lw=lw, zorder=zorder)
 
-def _screen(view):
-    right = np.cross([0, 0, 1.0], view)
-    right /= np.linalg.norm(right)
-    return right, np.cross(view, right)
+@dataclass(frozen=True)
+class _Quantity:
+    """A function of the state and its values along a run."""
 
-def _path(ax: Axes3D, solution: Solution, hidden: np.ndarray) -> None:
-    """The trajectory, coloured by time and pale where it is not ``near``; its start and its end."""
-    stride = 1 + (len(solution.t) - 1) // MOST_SEGMENTS
-    kept = np.unique(np.append(np.arange(0, len(solution.t), stride), len(solution.t) - 1))
-    t, x, hidden = solution.t[kept], solution.x[kept], hidden[kept]
-    segments, middles = np.stack([x[:-1], x[1:]], axis=1), (t[:-1] + t[1:]) / 2
-    scale = plt.Normalize(t[0], t[-1])
-    seen = ~(hidden[:-1] & hidden[1:])
-    for side, alpha, zorder in ((~seen, 0.35, 1), (seen, 1.0, 4)):
-        if not side.any():
-            continue
-        lines = Line3DCollection(segments[side], colors=TIME_MAP(scale(middles[side])), alpha=alpha, linewidths=1.6)
-        lines.set(zorder=zorder, capstyle="round")
-        ax.add_collection3d(lines)
-    ends = ((0, "o", "white", "start"), (-1, "o", "black", "end"))
-    for index, marker, face, label in ends:
-        ax.plot(
-            *x[[index]].T, marker, mfc=face, mec="black", ms=5, zorder=1.5 if hidden[index] else 5, label=label, ls="none"
-        )
-    bar = plt.cm.ScalarMappable(scale, TIME_MAP)
-    ax.figure.colorbar(bar, ax=ax, label="time $t$", shrink=0.6, pad=0.08, aspect=30)
+    name: str
+    function: Function
+    values: np.ndarray
+
+    @property
+    def is_constant(self) -> bool:
+        return float(np.ptp(self.values)) <= 1e-9 * float(np.abs(self.values).max())
+
+    def label(self, index: int) -> str:
+        when = "" if self.is_constant else (" at end", " at start")[index + 1]
+        return f"{self.name}{when} ${self.values[index]:.4g}$"
 
 
-def _energy_surface(solution: Solution, system: System | None) -> Energy | None:
-    """The system's energy; without a system, the one quadric that passes through every state, if it is one."""
+def _quantities(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
+    """Energy and entropy, or whatever stands for them, as far as they are known; the conserved one first."""
+    energy: Function | None
+    entropy: Function | None
     if system is not None:
-        return system.energy
+        energy = _vectorized(system.energy)
+        second = system.entropy or next((J for J, kept in system.invariants().values() if kept), None)
+        entropy = None if second is None else _vectorized(second)
+    else:
+        energy = _quadric_through(solution.x) if solution.laws.energy == "conserved" else None
+        spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")
+        entropy = (lambda x: (x * x).sum(axis=-1) / 2) if spheres else None
+    found = [None if energy is None else _Quantity("energy", energy, solution.energy), None]
+    if entropy is not None and solution.entropy is not None:
+        found[1] = _Quantity("entropy", entropy, solution.entropy)
+    elif entropy is not None:
+        found[1] = _Quantity("invariant", entropy, entropy(solution.x))
+    return (found[0], found[1]) if solution.laws.energy == "conserved" else (found[1], found[0])
+
+
+def _vectorized(function: Callable, block: int = 8192) -> Function:
+    """The function on arrays of points of any shape, in blocks of one size so that it is compiled once."""
+    compiled = jax.jit(lambda x: function(x))
+
+    def values(points: np.ndarray) -> np.ndarray:
+        flat = points.reshape(-1, 3)
+        padded = np.concatenate([flat, np.zeros((-len(flat) % block, 3))]).reshape(-1, block, 3)
+        return np.concatenate([compiled(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
+
+    return values
+
+
+def _quadric_through(states: np.ndarray) -> Function | None:
+    """The polynomial of degree two that vanishes at all states, where there is one and only one up to a factor."""
+    scale = float(np.abs(states).max()) or 1.0
     i, j = np.triu_indices(3)
-    scale = float(np.abs(solution.x).max())
-    x = solution.x / scale
-    monomials = np.column_stack([x[:, i] * x[:, j], x, np.ones(len(x))])
-    if len(x) < monomials.shape[1]:
+
+    def monomials(points: np.ndarray) -> np.ndarray:
+        x = points / scale
+        return np.concatenate([x[..., i] * x[..., j], x, np.ones((*x.shape[:-1], 1))], axis=-1)
+
+    if len(states) < 10:
         return None
-    _, singular, rows = np.linalg.svd(monomials, full_matrices=False)
-    if singular[-1] > 1e-13 * singular[0] or singular[-2] < 1e-7 * singular[0]:
-        return None  # no quadric, or a choice of several
-    square = np.zeros((3, 3))
-    square[i, j] = rows[-1, :6]
-    return Quadratic((square + square.T) / scale**2, rows[-1, 6:9] / scale, rows[-1, 9])
+    _, singular, rows = np.linalg.svd(monomials(states), full_matrices=False)
+    unique = singular[-1] < 1e-13 * singular[0] and singular[-2] > 1e-7 * singular[0]
+    return (lambda points: monomials(points) @ rows[-1]) if unique else None
 
 
-def _entropy_function(solution: Solution, system: System | None) -> Energy | None:
-    if system is not None:
-        return system.entropy
-    spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")
-    return Quadratic(np.ones(3)) if spheres else None
+class _LevelSurface:
+    """The surface on which a function has the value it has at a point, seen along rays from the origin.
+
+    Attributes
+    ----------
+    is_simple, is_closed : bool
+        Whether some ray meets it and none meets it twice; whether every ray meets it.
+    """
+
+    def __init__(self, function: Function, point: np.ndarray, size: float):
+        self.function, self.level, self.size = function, float(function(point)), size
+        self.radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
+        meetings = self._crossed(_sphere(16, 32)).sum(axis=0)
+        self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Where rays from the origin along unit vectors (..., 3) meet it, NaN where they do not, shape (..., 3)."""
+        crossed = self._crossed(directions)
+        first = crossed.argmax(axis=0)
+        low, high = self.radii[first], self.radii[first + 1]
+        above = self._above(low[..., None] * directions)
+        for _ in range(40):
+            middle = (low + high) / 2
+            before = self._above(middle[..., None] * directions) == above
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        met = crossed.any(axis=0) & (self.is_closed | (high <= 1.5 * self.size))
+        return np.where(met[..., None], high[..., None] * directions, np.nan)
+
+    def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """Whether it stands between points (..., 3) and an eye far away in the direction ``view``, shape (...)."""
+        depths = np.geomspace(0.01, 20.0, 80) * self.size
+        above = self._above(points + depths.reshape(-1, *[1] * points.ndim) * view)
+        return (above[1:] != above[:-1]).any(axis=0)
+
+    def _above(self, points: np.ndarray) -> np.ndarray:
+        return self.function(points) > self.level
+
+    def _crossed(self, directions: np.ndarray) -> np.ndarray:
+        """In which intervals of ``radii`` rays meet it, shape (intervals, ...)."""
+        above = self._above(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
+        return above[1:] != above[:-1]
 
 
-def _hidden(function, point, points, view, size):
-    level = float(function(point))
-    depths = np.geomspace(0.01, 3.0, 60)[:, None, None]*size
-    above = np.asarray(function(points + depths * view)) > level
-    return (above[1:] != above[:-1]).any(axis=0)
+class _Scene:
+    """One solid and curves around it, those parts left out that the solid hides."""
+
+    def __init__(self, ax: Axes3D, states: np.ndarray):
+        self.ax, self.states, self.view = ax, states, _viewpoint(ax)
+        self.size = float(np.linalg.norm(states, axis=1).max()) or 1.0
+        self.solid: _LevelSurface | None = None
+
+    def draw_solid(self, function: Function, label: str) -> None:
+        """The level surface of the function through the first state, with its outline; sections if it is open."""
+        surface = _LevelSurface(function, self.states[0], self.size)
+        if not surface.is_closed:
+            self.draw_sections(function, 0, GREY, label)
+            return
+        self.solid, self.mesh = surface, surface.along(_sphere(96, 192))
+        normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
+        normals[[0, -1]] = normals[[1, -2]]  # at the poles of the mesh all longitudes meet
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        grey = 0.80 + 0.18 * normals @ (0.6 * self.view + [0.0, 0.0, 0.8])  # lit from in front and above
+        shades = np.repeat(np.clip(grey, 0.0, 1.0)[..., None], 3, axis=-1)
+        style = {"rstride": 1, "cstride": 1, "shade": False, "antialiased": False, "linewidth": 0, "zorder": 1}
+        self.ax.plot_surface(*np.moveaxis(self.mesh, -1, 0), facecolors=shades, **style)
+        self.ax.plot([], [], [], "s", color="0.85", label=label)
+        for line in _contours(self.mesh, normals @ self.view, 0.0):
+            self._draw_line(line, color=GREY, linewidth=0.8)
+
+    def draw_contours(self, function: Function, count: int) -> None:
+        """Curves on the solid along which the function is constant."""
+        if self.solid is not None:
+            values = function(self.mesh)
+            for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
+                self._draw_contour(values, level, color=GREY, linewidth=0.4)
+
+    def draw_sections(self, function: Function, index: int, color: str, label: str) -> None:
+        """The level surface of the function through a state: plane sections, and where it cuts the solid."""
+        surface = _LevelSurface(function, self.states[index], self.size)
+        if not surface.is_simple:
+            return
+        for normal in (*np.eye(3), self.view):
+            section = surface.along(_circle(normal))
+            seen, far = ~self.hidden(section), surface.hides(section, self.view)
+            self._draw_line(section, seen & ~far, color=color, linewidth=0.7)
+            self._draw_line(section, seen & far, color=color, linewidth=0.7, alpha=0.3)
+        if self.solid is not None:
+            self._draw_contour(function(self.mesh), surface.level, color=color, linewidth=1.2)
+        self.ax.plot([], [], [], color=color, label=label)
+
+    def hidden(self, points: np.ndarray) -> np.ndarray:
+        """Whether the solid hides the points, shape (m, 3)."""
+        return np.zeros(len(points), dtype=bool) if self.solid is None else self.solid.hides(points, self.view)
+
+    def _draw_line(self, points: np.ndarray, seen: np.ndarray | bool = True, **style) -> None:
+        self.ax.plot(*np.where(np.reshape(seen, (-1, 1)), points, np.nan).T, zorder=2, **style)
+
+    def _draw_contour(self, values: np.ndarray, level: float, **style) -> None:
+        for line in _contours(self.mesh, values, level):
+            self._draw_line(line, ~self.hidden(line), **style)
 
 
-def _level_surface(function: Energy, point: np.ndarray, directions: np.ndarray, size) -> np.ndarray | None:
-    level = float(function(point))
-    inside = float(function(np.zeros(3))) > level
-    radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
-    above = np.asarray(function(radii.reshape(-1, *[1]*directions.ndim) * directions)) > level
-    crossings = above[1:] != above[:-1]
-    if (crossings.sum(axis=0) > 1).any() or not crossings.any():
-        return None
-    first = crossings.argmax(axis=0)
-    low, high = radii[first], radii[first + 1]
-    for _ in range(40):
-        middle = (low + high) / 2
-        beyond = (np.asarray(function(middle[..., None] * directions)) > level) != inside
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    hit = crossings.any(axis=0)
-    if not hit.all():
-        hit &= high <= 1.5 * size
-    return np.where(hit[..., None], high[..., None] * directions, np.nan)
+def _contours(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np.ndarray]:
+    """The curves, shape (m, 3), in a mesh (rows, columns, 3) along which values (rows, columns) equal the level."""
+    contours: Any = contour_generator(z=values)
+    for line in contours.lines(level):
+        column, row = line.T
+        yield np.stack([map_coordinates(mesh[..., k], [row, column], order=1) for k in range(3)], axis=-1)
+
+
+def _draw_path(solution: Solution, scene: _Scene) -> None:
+    """The trajectory, coloured by time and pale where it is hidden; its start and its end."""
+    last = len(solution.t) - 1
+    kept = np.linspace(0, last, min(last, MOST_SEGMENTS) + 1).round().astype(int)
+    t, x = solution.t[kept], solution.x[kept]
+    hidden = scene.hidden(x)
+    scale = Normalize(solution.t[0], solution.t[-1])
+    segments, colors = np.stack([x[:-1], x[1:]], axis=1), TIME_MAP(scale((t[:-1] + t[1:]) / 2))
+    behind = hidden[:-1] & hidden[1:]
+    for part, alpha, zorder in ((behind, 0.25, 3), (~behind, 1.0, 4)):
+        if part.any():
+            lines = Line3DCollection(segments[part], colors=colors[part], alpha=alpha, linewidths=1.7, zorder=zorder)
+            lines.set_capstyle("round")  # segments would show gaps at their joints
+            scene.ax.add_collection3d(lines)
+    for i, face, label in ((0, "white", "start"), (-1, "black", "end")):
+        style = {"color": "black", "markerfacecolor": face, "markersize": 5, "zorder": 5}
+        scene.ax.plot(*x[[i]].T, "o", alpha=0.25 if hidden[i] else 1.0, **style)
+        scene.ax.plot([], [], [], "o", label=label, **style)
+    bar = {"label": "time", "shrink": 0.6, "pad": 0.05, "aspect": 30}
+    scene.ax.figure.colorbar(ScalarMappable(scale, TIME_MAP), ax=scene.ax, **bar)
 
 
 def _sphere(rows: int, columns: int) -> np.ndarray:
-    """Unit vectors on circles of latitude, shape (rows + 1, columns + 1, 3)."""
+    """Unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
-def _circle(normal):
-    _,_,rows=np.linalg.svd(normal[None])
-    phi=np.linspace(0,2*np.pi,361)
-    return np.cos(phi)[:,None]*rows[1]+np.sin(phi)[:,None]*rows[2]
+
+def _circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
+    """Unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
+    phi = np.linspace(0, 2 * np.pi, points + 1)[:, None]
+    _, _, (_, first, second) = np.linalg.svd(normal[None])
+    return np.cos(phi) * first + np.sin(phi) * second
+
 
 def _viewpoint(ax: Axes3D) -> np.ndarray:
-    elev, azim = np.radians([ax.elev, ax.azim])
-    return np.array([np.cos(elev) * np.cos(azim), np.cos(elev) * np.sin(azim), np.sin(elev)])
+    """The unit vector towards the eye."""
+    elevation, azimuth = np.radians([ax.elev, ax.azim])
+    return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
 
-def _checked(path):
-    if path is None:
-        return None
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)}")
-    return path
+def _look_at(state: np.ndarray, ax: Axes3D) -> None:
+    """Turn the axes so that the state is on the near side, from above if that is possible."""
+    azimuth = float(np.degrees(np.arctan2(state[1], state[0]))) + 40.0
+    ax.view_init(elev=22.0, azim=azimuth)
+    if _viewpoint(ax) @ state < 0.0:
+        ax.view_init(elev=-22.0, azim=azimuth)
 
 
-def _finished(figure, path):
+# -- the laws along time ------------------------------------------------------------------------------------------
+
+
+def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
+    """Energy error, entropy and entropy production along a run, with the verdict of the audit above them.
+
+    The production is the difference quotient of the saved entropies, on a logarithmic axis. Increments below the
+    rounding of the entropy itself (the tolerance of the audit) are marked at that level in grey, falls beyond it in red
+    at their size. A solution without entropy has the first panel only.
+
+    Parameters
+    ----------
+    solution : Solution
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+
+    Raises
+    ------
+    InputError
+        If the suffix of ``path`` is another.
+    FileError
+        If the file cannot be written.
+    """
+    path = _writable(path)
+    panels = 1 if solution.entropy is None else 3
+    figure, axes = plt.subplots(
+        panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
+    )
+    _draw_energy(axes[0, 0], solution.t, solution.energy)
+    if solution.entropy is not None:
+        _draw_entropy(axes[1, 0], solution.t, solution.entropy)
+        _draw_production(axes[2, 0], solution.t, solution.entropy)
+    for ax in axes[:, 0]:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.margins(x=0.0)
+    axes[-1, 0].set_xlabel("time")
+    figure.align_ylabels()
+    audit = solution.audit()
+    figure.suptitle(_verdict(audit), color="black" if audit.passed else RED, fontsize="medium")
+    return _finished(figure, path)
+
+
+def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray) -> None:
+    first = float(H[0])
+    error = (H - first) / (abs(first) or 1.0)
+    largest = float(np.abs(error).max())
+    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    if largest < 20 * EPS:  # beside one unit of rounding
+        ax.axhspan(-EPS, EPS, color="0.93", linewidth=0)
+        ax.set_ylim(-1.4 * max(largest, EPS), 1.4 * max(largest, EPS))
+    ax.plot(t, error, color=BLUE, linewidth=0.8)
+    ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
+    ax.set_ylabel(r"$(H - H_0)\,/\,|H_0|$" if first else "$H - H_0$")
+
+
+def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
+    ax.plot(t, S, color=BLUE, linewidth=1.5)
+    ax.set_ylabel("entropy $S$")
+    change = float(np.ptp(S))
+    if change <= 1e-9 * float(np.abs(S).max()):  # constant: do not magnify its rounding
+        width = 0.01 * abs(float(S[0])) or 1.0
+        ax.set_ylim(S[0] - width, S[0] + width)
+    tail = S[t >= t[-1] - 0.1 * (t[-1] - t[0])]
+    if len(tail) > 2 and float(np.ptp(tail)) <= 1e-4 * change:
+        ax.axhline(S[-1], color=GREY, linewidth=0.8, linestyle="--", zorder=1)
+        across = ax.get_yaxis_transform()  # x in units of the axes, y of the data
+        style: dict[str, Any] = {"ha": "right", "va": "top", "color": "0.3", "fontsize": "small"}
+        ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), across, "offset points", **style)
+
+
+def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
+    dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
+    rounding = Tolerances().entropy * float(np.abs(S).max())
+    risen, fallen = dS > rounding, dS < -rounding
+    still = ~(risen | fallen)
+    ax.set_yscale("log")
+    ax.plot(t, np.where(risen, dS / dt, np.nan), color=GREEN, linewidth=1.5, marker="." if len(t) < 50 else "")
+    if still.any():
+        level = rounding / float(dt.max())
+        ax.plot(t[still], np.full(still.sum(), level), ".", color=GREY, markersize=2, label="at or below rounding")
+        if still.all():
+            ax.set_ylim(level / 10, level * 10)
+    if fallen.any():
+        ax.plot(t[fallen], -dS[fallen] / dt[fallen], "v", color=RED, markersize=4, label="falling: $-dS/dt$")
+    if still.any() or fallen.any():
+        ax.legend(frameon=False, fontsize="small", markerscale=2)
+    ax.set_ylabel("production $dS/dt$")
+
+
+def _verdict(audit: Audit) -> str:
+    failing = [row for row in audit.rows if row.passed is False]
+    if failing:
+        return "A law fails: " + "; ".join(row.note or f"{row.law} {row.value:.2g}" for row in failing)
+    shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
+    return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in shown)
+
+
+# -- files --------------------------------------------------------------------------------------------------------
+
+
+def _writable(path: str | os.PathLike | None) -> Path | None:
+    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"a figure is written as {', '.join(SUFFIXES)}, and {Path(path).name!r} ends in none of them")
+    return None if path is None else Path(path)
+
+
+def _finished(figure: Figure, path: Path | None) -> Figure:
+    """The figure, written to the path and closed if there is one."""
     if path is not None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=DPI)
+            figure.savefig(path)
         except OSError as error:
             raise FileError(f"cannot write {path}: {error}") from error
-        plt.close(figure)
+        finally:
+            plt.close(figure)
     return figure

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +63,7 @@ class Stats:
     energy_range : (float, float)
         Smallest and largest energy met.
     least_entropy_increment, largest_energy_increment : float
-        Of one step.
+        Of one step. These three are None where no step was followed (no step taken, or ``Reference``).
     wall_time : float
         Seconds, compilation included.
     """
@@ -74,9 +73,9 @@ class Stats:
     newton_iterations: int = 0
     most_iterations: int = 0
     worst_residual: float = 0.0
-    energy_range: tuple[float, float] = (np.inf, -np.inf)
-    least_entropy_increment: float = np.inf
-    largest_energy_increment: float = -np.inf
+    energy_range: tuple[float, float] | None = None
+    least_entropy_increment: float | None = None
+    largest_energy_increment: float | None = None
     wall_time: float = 0.0
 
     @property
@@ -156,18 +155,15 @@ class Solution:
     def save(self, path: str | os.PathLike) -> Path:
         """Write a NetCDF file; it appears whole or not at all."""
         path = Path(path)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".part")
-            os.close(handle)
-        except OSError as error:
-            raise FileError(f"cannot write {path}: {error}") from error
-        try:
             self.to_xarray().to_netcdf(temporary, engine="h5netcdf")
             os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        except OSError as error:
+            raise FileError(f"cannot write {path}: {error}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
         return path
 
     def __repr__(self) -> str:
@@ -202,7 +198,8 @@ def load(path: str | os.PathLike) -> Solution:
         if len(t) != int(dataset.attrs["times"]):
             raise ValueError(f"{len(t)} times of {dataset.attrs['times']}")
         names = [str(name) for name in dataset["invariant_name"].values]
-        stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
+        if stored["stats"]["energy_range"] is not None:
+            stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
         stored["laws"]["conserved"] = tuple(stored["laws"]["conserved"])
         return Solution(
             t=t,

@@ -1,4 +1,4 @@
-"""Spec files: a run described in TOML, checked as a whole before anything is computed. Only the command line imports this."""
+"""Spec files: a run described in TOML, checked as a whole before anything is computed. Only the CLI imports this."""
 
 from __future__ import annotations
 
@@ -15,11 +15,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NotRequired, Required, Union, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    TypeAdapter,
+    ValidationError,
+    with_config,
+)
 from pydantic_core import PydanticCustomError
-from typing_extensions import NotRequired, Required, TypedDict
+from typing_extensions import TypedDict
 
 from . import models
 from .errors import AxiomError, FileError, InputError, SpecError
@@ -33,19 +43,27 @@ FORMATS = ("png", "pdf", "svg")
 # -- what a spec file may say ---------------------------------------------------------------------------------------
 
 
-def _one_of(options: Iterable[str]) -> AfterValidator:
-    def check(value: str) -> str:
-        if value not in options:
-            raise _refusal(f"must be one of {', '.join(map(_shown, options))}{_suggestion(value, options)}")
+def _one_of(options: Iterable[str]) -> BeforeValidator:
+    allowed = list(options)
+
+    def check(value):
+        if value not in allowed:
+            raise _refusal(f"must be one of {', '.join(map(_shown, allowed))}{_suggestion(str(value), allowed)}")
         return value
 
-    return AfterValidator(check)
+    return BeforeValidator(check)
 
 
 def _increasing(span: tuple[float, float]) -> tuple[float, float]:
     if span[1] <= span[0]:
         raise _refusal("must increase: time runs forwards, since entropy grows")
     return span
+
+
+def _netcdf_name(name: str) -> str:
+    if not re.fullmatch(r"[^/\\]+\.nc", name):
+        raise _refusal('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
+    return name
 
 
 class _Section(BaseModel):
@@ -84,15 +102,9 @@ class _Method(BaseModel):
 class Outputs(_Section):
     """The section ``[outputs]``."""
 
-    netcdf: Annotated[str, AfterValidator(lambda name: _netcdf_name(name))] = "solution.nc"
+    netcdf: Annotated[str, AfterValidator(_netcdf_name)] = "solution.nc"
     figures: list[Annotated[str, _one_of(FIGURES)]] = ["laws"]
     figure_format: Annotated[str, _one_of(FORMATS)] = "png"
-
-
-def _netcdf_name(name: str) -> str:
-    if not re.fullmatch(r"[^/\\]+\.nc", name):
-        raise _refusal('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
-    return name
 
 
 # -- reading --------------------------------------------------------------------------------------------------------
@@ -145,12 +157,18 @@ class Spec:
             system.state(self.run.initial)
         except InputError as error:
             raise SpecError(self.path, [f"run.initial = {_shown(self.run.initial)}: {error}"]) from error
+        if "momentum_sphere" in self.outputs.figures and system.dim != 3:
+            problem = f"momentum_sphere needs states of 3 components, and these have {system.dim}"
+            raise SpecError(self.path, [f"outputs.figures = {_shown(self.outputs.figures)}: {problem}"])
         return system
 
+    @property
+    def model(self) -> str:
+        """The name of the model, or ``module:function``."""
+        return self.table["model"].get("name") or self.table["model"]["function"]
+
     def _refused(self, why: str) -> SpecError:
-        model = dict(self.table["model"])
-        parameters = model.pop("parameters", {})
-        return SpecError(self.path, [", ".join(_given("model", model) + _given("model.parameters", parameters)) + f": {why}"])
+        return SpecError(self.path, [f"{_given('model', self.table['model'])}: {why}"])
 
 
 def read(path: str | os.PathLike) -> Spec:
@@ -165,15 +183,16 @@ def read(path: str | os.PathLike) -> Spec:
     SpecError
         With all that is wrong in it.
     """
-    path, problems = Path(path), []
+    path = Path(path)
     table = _parse(path)
+    problems: list[str] = []
     _checked("", _File, table, problems, "a spec file")
     model, run, method, outputs = (
         _checked(key, section, table.get(key, {}), problems, f"[{key}]")
         for key, section in {"model": _Model, "run": Run, "method": _Method, "outputs": Outputs}.items()
     )
-    build = model and _builder(model, path.resolve().parent, problems)
-    parameters = build and _arguments("model.parameters", build, model.parameters, problems)
+    build: Any = model and _builder(model, path.resolve().parent, problems)
+    parameters: Any = build and _arguments("model.parameters", build, model.parameters, problems)
     integrator = method and _integrator(method, problems)
     if problems:
         raise SpecError(path, problems)
@@ -192,17 +211,17 @@ def _parse(path: Path) -> dict[str, Any]:
 
 def _builder(model: _Model, folder: Path, problems: list[str]) -> Callable[..., System] | None:
     """The function that the section ``[model]`` names."""
-    if (model.name is None) == (model.function is None):
-        known = ", ".join(map(_shown, models.__all__))
-        problems.append(f'model: give either name (one of {known}) or function = "module:function", not both')
-        return None
-    if model.name is not None:
+    if model.name is not None and model.function is None:
         return getattr(models, model.name)
-    try:
-        return _imported(model.function, folder)
-    except InputError as error:
-        problems.append(f"model.function = {_shown(model.function)}: {error}")
-        return None
+    if model.function is not None and model.name is None:
+        try:
+            return _imported(model.function, folder)
+        except InputError as error:
+            problems.append(f"model.function = {_shown(model.function)}: {error}")
+            return None
+    names = ", ".join(map(_shown, models.__all__))
+    problems.append(f'model: give either name (one of {names}) or function = "module:function", not both')
+    return None
 
 
 def _imported(target: str, folder: Path) -> Callable[..., System]:
@@ -216,7 +235,7 @@ def _imported(target: str, folder: Path) -> Callable[..., System]:
         module = importlib.import_module(module_name)
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name and f"{module_name}.".startswith(f"{error.name}."):
-            raise InputError(f"no module {error.name!r} in {folder}, in {Path.cwd()} or installed") from error
+            raise InputError(f"no module {error.name!r} in {folder}, in the current folder or installed") from error
         raise InputError(f"importing {module_name!r} failed with {type(error).__name__}: {error}") from error
     function = getattr(module, name, None)
     if not callable(function):
@@ -226,15 +245,16 @@ def _imported(target: str, folder: Path) -> Callable[..., System]:
 
 
 def _integrator(method: _Method, problems: list[str]):
-    options = _arguments("method", METHODS[method.name], method.model_extra, problems)
+    options = _arguments("method", METHODS[method.name], method.model_extra or {}, problems)
     if options is None:
         return None
     try:
         return METHODS[method.name](**options)
     except (TypeError, ValueError) as error:
-        words = set(re.findall(r"\w+", str(error))) - set(map(str, options.values()))  # the message lists what is allowed
-        hints = [_suggestion(value, words) for value in options.values() if isinstance(value, str)]
-        problems.append(f"{', '.join(_given('method', options))}: {error}{''.join(hints)}")
+        listed = set(re.findall(r"\w+", str(error))).difference(map(str, options.values()))  # what the message allows
+        hints = [_suggestion(value, listed) for value in options.values() if isinstance(value, str)]
+        problems.append(f"{_given('method', options)}: {error}{''.join(hints)}")
+        return None
 
 
 # -- checking a table against the fields of a section or the signature of a function -----------------------------------
@@ -271,7 +291,8 @@ def _arguments(key: str, function: Callable, table: dict, problems: list[str]) -
         hints = get_type_hints(function.__init__ if inspect.isclass(function) else function)
     except Exception:  # annotations with names that exist only for type checkers
         hints = {}
-    fields, extra = {}, "forbid"
+    fields: dict[str, Any] = {}
+    extra: Literal["allow", "forbid"] = "forbid"
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
             needed = Required if parameter.default is parameter.empty else NotRequired
@@ -279,8 +300,7 @@ def _arguments(key: str, function: Callable, table: dict, problems: list[str]) -
         elif parameter.kind is parameter.VAR_KEYWORD:
             extra = "allow"
     name = getattr(function, "__name__", "the function")
-    schema = TypedDict(name, fields)  # type: ignore[operator]
-    schema.__pydantic_config__ = ConfigDict(extra=extra)
+    schema = with_config(ConfigDict(extra=extra))(TypedDict(name, fields))  # type: ignore[operator]
     return _checked(key, schema, table, problems, name)
 
 
@@ -311,8 +331,12 @@ def _shown(value) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _given(key: str, table: Mapping[str, Any]) -> list[str]:
-    return [f"{key}.{name} = {_shown(value)}" for name, value in table.items()]
+def _given(key: str, table: Mapping[str, Any]) -> str:
+    """All that a table says, with the full keys."""
+    return ", ".join(
+        _given(f"{key}.{name}", value) if isinstance(value, dict) and value else f"{key}.{name} = {_shown(value)}"
+        for name, value in table.items()
+    )
 
 
 def _suggestion(word: str, options: Iterable[str]) -> str:

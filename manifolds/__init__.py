@@ -36,24 +36,43 @@ from .errors import (  # noqa: E402
     ShapeError,
 )
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
+from .lie_group import (  # noqa: E402
+    GL,
+    SE,
+    SL,
+    SO,
+    SU,
+    Heisenberg,
+    MatrixGroup,
+    Sp,
+    registered_groups,
+)
 from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
 from .polynomial import Polynomial  # noqa: E402
 
 __all__ = [
+    "GL",
+    "SE",
+    "SL",
+    "SO",
+    "SU",
     "AntisymmetryError",
     "Canonical",
     "ClosureError",
     "ComponentError",
     "DomainError",
+    "Heisenberg",
     "JacobiError",
     "LieAlgebra",
     "LieAlgebraError",
     "ManifoldsError",
+    "MatrixGroup",
     "NoPolynomialCasimirWarning",
     "ParameterError",
     "Polynomial",
     "RepresentationError",
     "ShapeError",
+    "Sp",
     "abelian",
     "aff",
     "bianchi",
@@ -62,6 +81,7 @@ __all__ = [
     "gl",
     "heisenberg",
     "registered",
+    "registered_groups",
     "se",
     "semidirect_sum",
     "sl",

@@ -12,10 +12,13 @@ import scipy.sparse as sp
 
 LARGEST_DENOMINATOR = 1000
 
+MACHINE_INTEGERS = 2**28
+"""Numerators below this are kept as int64: sums of a hundred products of two are then exact. Larger ones are Python's."""
+
 
 @dataclass(frozen=True)
 class RationalArray:
-    """The array ``numerator / denominator``, integers throughout."""
+    """The array ``numerator / denominator``, integers throughout: int64, or Python's own where those are too small."""
 
     numerator: np.ndarray
     denominator: int
@@ -41,9 +44,8 @@ def rational_array(values) -> RationalArray | None:
         fractions.append(fraction)
     denominator = math.lcm(*(f.denominator for f in fractions)) if fractions else 1
     integers = [int(f * denominator) for f in fractions]
-    if max(map(abs, integers), default=0) >= 2**31:
-        return None
-    numerators = np.array(integers, dtype=np.int64)
+    small = max(map(abs, integers), default=0) < MACHINE_INTEGERS
+    numerators = np.array(integers, dtype=np.int64 if small else object)
     numerators = numerators if inverse is None else numerators[inverse]
     return RationalArray(numerators.reshape(array.shape), denominator)
 
@@ -61,11 +63,13 @@ def _fraction(value) -> Fraction | None:
 
 
 def jacobi_sums(constants: np.ndarray) -> sp.coo_array:
-    """``[[a,b],c] + [[b,c],a] + [[c,a],b]`` for all triples, as a sparse (dim^3, dim) array.
-
-    Exact for integer constants below about 1e9 / sqrt(dim), since the products are then summed in 64-bit integers.
-    """
+    """``[[a,b],c] + [[b,c],a] + [[c,a],b]`` for all triples, as a sparse (dim^3, dim) array; exact for integers."""
     dim = constants.shape[0]
+    if constants.dtype == object:
+        nested = np.tensordot(constants, constants, axes=(2, 0))
+        total = nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)
+        at = np.nonzero(total.reshape(dim**3, dim))
+        return sp.coo_array((total.reshape(dim**3, dim)[at].astype(float), at), shape=(dim**3, dim))
     rows = sp.csr_array(constants.reshape(dim * dim, dim))
     columns = sp.csr_array(constants.reshape(dim, dim * dim))
     nested = (rows @ columns).tocoo()  # entry ((a, b), (c, f)) is the component f of [[e_a, e_b], e_c]

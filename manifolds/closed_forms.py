@@ -1,7 +1,7 @@
-"""Exponential and logarithm in closed form: SO(3), SE(3), SU(2) and the Heisenberg groups.
+"""Formulas of particular groups: exp, log and Cayley of SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
 
-Everything is a combination of the Stumpff functions of the squared angle, entire functions with no division at zero,
-so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there.
+The exponentials are combinations of the Stumpff functions of the squared angle, entire functions with no division at
+zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .lie_algebra import LieAlgebra
+from .matrix_functions import determinant, inverse, largest
 
 HALF_TURN_MARGIN = 1e-8
 """A logarithm is taken of eigenvalues at angles up to pi minus this; beyond, its sign is decided by noise."""
@@ -23,9 +25,7 @@ def stumpff(order: int, z) -> jax.Array:
     With ``z = t**2``: cos t, sin t / t, (1 - cos t) / t**2, (t - sin t) / t**3.
     """
     small = z < 1.0
-    t = jnp.sqrt(
-        jnp.where(small, 1.0, z)
-    )  # both branches see arguments where they are smooth, so no NaN gradient
+    t = jnp.sqrt(jnp.where(small, 1.0, z))  # both branches see arguments where they are smooth, so no NaN gradient
     far = (jnp.cos, _sinc, lambda t: 0.5 * _sinc(t / 2) ** 2, lambda t: (t - jnp.sin(t)) / t**3)[order](t)
     near = jnp.zeros_like(t)
     for k in reversed(range(10)):  # the first term left out is below 1/20! at z = 1
@@ -107,6 +107,72 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """``N - N^2/2`` with N = g - I."""
     N = g - jnp.eye(g.shape[-1])
     return algebra.vee(N - N @ N / 2)
+
+
+# -- distance from the group, relative to the size of g ---------------------------------------------------------
+
+
+def unitary_defect(g) -> jax.Array:
+    """Of ``g^H g`` from I, or of ``det g`` from 1."""
+    return jnp.maximum(largest(unitary_inverse(g) @ g - jnp.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
+
+
+def rigid_defect(g) -> jax.Array:
+    """Of the linear part from the rotations, or of the last row from (0, …, 0, 1)."""
+    last = jnp.abs(g[..., -1, :] - jnp.eye(g.shape[-1])[-1]).max(axis=-1)
+    return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last)
+
+
+def unimodular_defect(g) -> jax.Array:
+    """Of ``det g`` from 1, over the product of the norms of the rows: so far a relative change of g moves it."""
+    rows = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
+    return jnp.abs(determinant(g) - 1.0) / jnp.maximum(rows, 1.0)
+
+
+def symplectic_defect(g) -> jax.Array:
+    """Of ``-J g^T J g`` from I."""
+    size = jnp.maximum(largest(g) ** 2, 1.0)
+    return largest(symplectic_inverse(g) @ g - jnp.eye(g.shape[-1])) / size
+
+
+def invertible_defect(g) -> jax.Array:
+    """0 on the group, which is open; infinite where the condition number shows g to be singular to rounding."""
+    condition = g.shape[-1] * largest(g) * largest(inverse(g))
+    return jnp.where(condition * np.finfo(float).eps < 1.0, 0.0, jnp.inf)
+
+
+def heisenberg_defect(g) -> jax.Array:
+    """Of the entries outside the first row and the last column from those of I."""
+    free = np.zeros(g.shape[-2:], dtype=bool)
+    free[0, 1:] = free[:-1, -1] = True
+    return largest(jnp.where(free, 0.0, g - jnp.eye(g.shape[-1])))
+
+
+# -- inverses -----------------------------------------------------------------------------------------------------
+
+
+def unitary_inverse(g) -> jax.Array:
+    """Conjugate transpose."""
+    return g.conj().swapaxes(-1, -2)
+
+
+def rigid_inverse(g) -> jax.Array:
+    """``[[R^T, -R^T t], [0, 1]]``."""
+    transposed = g[..., :-1, :-1].swapaxes(-1, -2)
+    return affine(transposed, -transposed @ g[..., :-1, -1:])
+
+
+def symplectic_inverse(g) -> jax.Array:
+    """``-J g^T J``."""
+    n = g.shape[-1] // 2
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    return -J @ g.swapaxes(-1, -2) @ J
+
+
+def heisenberg_inverse(g) -> jax.Array:
+    """``I - N + N^2`` with N = g - I."""
+    N = g - jnp.eye(g.shape[-1])
+    return jnp.eye(g.shape[-1]) - N + N @ N
 
 
 def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:

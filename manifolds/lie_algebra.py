@@ -45,15 +45,16 @@ class LieAlgebra:
     structure_constants : ndarray, shape (dim, dim, dim), read-only
         ``C[a, b, c]`` with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
     rational_constants : RationalArray or None
-        The same constants as exact fractions, where they are recognised as such.
+        The same constants as exact fractions, where they are recognised as such and are not too large.
     basis : ndarray, shape (dim, m, m), or None
         The matrices ``e_a``, where known.
     """
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None):
         constants = _checked_constants(structure_constants)
-        self.rational_constants: RationalArray | None = rational_array(constants)
-        exact = self.rational_constants
+        exact = rational_array(constants)
+        machine_size = exact is not None and exact.numerator.dtype != object
+        self.rational_constants: RationalArray | None = exact if machine_size else None
         self.structure_constants = _frozen(np.asarray(constants if exact is None else exact, dtype=np.float64))
         self.dim: int = self.structure_constants.shape[0]
         self.name = name

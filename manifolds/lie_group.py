@@ -21,10 +21,10 @@ import numpy as np
 
 from . import catalogue
 from . import closed_forms as closed
+from . import matrix_functions as general
 from ._arrays import is_traced, real_components, square_matrices
 from .errors import ComponentError, DomainError, LieAlgebraError
 from .lie_algebra import LieAlgebra
-from .matrix_functions import CAYLEY_CONDITION_LIMIT, dexp, general_cayley, general_exp, general_log, largest
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
@@ -71,10 +71,10 @@ class MatrixGroup:
     name: str
     algebra: LieAlgebra
     defect: Callable
-    inverse_map: Callable = jnp.linalg.inv
-    exp_map: Callable = general_exp
-    log_map: Callable = general_log
-    cayley_map: Callable | None = general_cayley
+    inverse_map: Callable = general.inverse
+    exp_map: Callable = general.exp
+    log_map: Callable = general.log
+    cayley_map: Callable | None = general.cayley
 
     @property
     def dim(self) -> int:
@@ -96,11 +96,23 @@ class MatrixGroup:
         return self._element(g, "g") @ self._element(h, "h")
 
     def inverse(self, g) -> jax.Array:
-        """Inverse of a group element, by the group's own formula (a transpose for SO(n)), shape (..., m, m)."""
-        return self.inverse_map(self._element(g, "g"))
+        """Inverse of a group element, by the group's own formula (a transpose for SO(n)), shape (..., m, m).
+
+        Raises
+        ------
+        DomainError
+            If g is singular. That g is in the group is taken for granted: see :meth:`belongs`.
+        """
+        g = self._element(g, "g")
+        inverse = self.inverse_map(g)
+        if (index := _first_failure(inverse, 2)) is not None:
+            raise DomainError(f"{self.name}: g{_at(index)} has no inverse: it is singular or not finite")
+        return inverse
 
     def belongs(self, g, tolerance: float = 1e-10) -> jax.Array:
         """Whether each matrix is in the group, up to a relative change of the matrix by about ``tolerance``.
+
+        GL(n) is open: there the tolerance plays no part, and a matrix belongs if rounding cannot make it singular.
 
         Returns
         -------
@@ -144,13 +156,15 @@ class MatrixGroup:
         Parameters
         ----------
         g : array, shape (..., m, m)
-            Within 1e-8 of the group, and with every eigenvalue off the negative real axis by an angle of 1e-8: a
+            Within 1e-8 of the group, and with every eigenvalue at an angle below pi - 1e-8 from the positive axis: a
             rotation by less than pi.
 
         Returns
         -------
         array, shape (..., dim)
-            Its derivative is that of x along the group: changes of g that leave the group are projected out.
+            Accurate to rounding; where the logarithm itself is ill-conditioned, as for a pair of eigenvalues at the
+            angles +-(pi - d) in a noncompact group, to about 1e-15/d. Its derivative is that of x along the group:
+            changes of g that leave the group are projected out.
 
         Raises
         ------
@@ -159,8 +173,8 @@ class MatrixGroup:
         """
         g = self._element(g, "g")
         x = _log(self, g)
-        if not is_traced(g, x) and bool(jnp.isnan(x).any()):
-            raise DomainError(self._why_no_log(np.asarray(g), np.asarray(x)))
+        if (index := _first_failure(x, 1)) is not None:
+            raise DomainError(f"log on {self.name}: g{_at(index)} {self._why_no_log(np.asarray(g[index]))}")
         return x
 
     def cayley(self, x) -> jax.Array:
@@ -188,14 +202,8 @@ class MatrixGroup:
             )
         x = self._components(x, "x")
         g = _cayley(self, x)
-        if not is_traced(x, g) and bool(jnp.isnan(g).any()):
-            index = _first(np.isnan(np.asarray(g)).any(axis=(-2, -1)))
-            eigenvalues = np.linalg.eigvals(np.asarray(self.algebra.hat(x))[index])
-            nearest = eigenvalues[np.argmin(np.abs(np.abs(eigenvalues.real) - 2) + np.abs(eigenvalues.imag))]
-            raise DomainError(
-                f"{self.name}: the Cayley map has a pole at X{_at(index)}, whose eigenvalue {nearest:.6g} is at 2 or "
-                f"-2 (condition number of I - X/2 above {CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
-            )
+        if (index := _first_failure(g, 2)) is not None:
+            raise DomainError(f"cayley on {self.name}: x{_at(index)} {self._why_no_cayley(np.asarray(x[index]))}")
         return g
 
     def Ad(self, g) -> jax.Array:
@@ -207,7 +215,7 @@ class MatrixGroup:
             If ``g hat(x) g^-1`` leaves the algebra, so that g is not in the group (not checked under tracing).
         """
         g = self._element(g, "g")[..., None, :, :]
-        return self.algebra.vee(g @ self.algebra.basis @ self.inverse_map(g)).swapaxes(-1, -2)
+        return self.algebra.vee(g @ self.algebra._known_basis() @ self.inverse_map(g)).swapaxes(-1, -2)
 
     def Ad_star(self, g, mu) -> jax.Array:
         """Coadjoint action, defined by ``<Ad_star(g, mu), x> = <mu, Ad(g) x>``.
@@ -234,54 +242,67 @@ class MatrixGroup:
 
     def _element(self, g, what: str) -> jax.Array:
         matrix = square_matrices(g, self.matrix_size, what)
-        if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra.basis):
+        if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._known_basis()):
             raise ComponentError(
                 f"{what} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
             )
-        return matrix.astype(self.identity.dtype)
+        return matrix.astype(self.algebra._known_basis().dtype)
 
-    def _why_no_log(self, g: np.ndarray, x: np.ndarray) -> str:
-        index = _first(np.isnan(x).any(axis=-1))
-        where, g = f"log on {self.name}: g{_at(index)}", g[index]
+    def _why_no_log(self, g: np.ndarray) -> str:
         if not np.isfinite(g).all():
-            return f"{where} has entries that are not finite"
+            return "has entries that are not finite"
         defect = float(self.defect(g))
         if not defect <= MEMBERSHIP_TOLERANCE:
             return (
-                f"{where} is not in the group: relative distance {defect:.3g}, tolerance {MEMBERSHIP_TOLERANCE:.0e}; "
-                "bring it back to the group first"
+                f"is not in the group: relative distance {defect:.3g}, tolerance {MEMBERSHIP_TOLERANCE:.0e}; bring "
+                "it back to the group first"
             )
         eigenvalues = np.linalg.eigvals(g)
-        worst = eigenvalues[np.argmax(np.abs(np.angle(eigenvalues)))]
+        worst = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
-            f"{where} has the eigenvalue {worst:.6g} at angle {abs(np.angle(worst)):.10f} from the positive axis, and "
-            f"det g = {np.linalg.det(g):.3g}; the principal logarithm needs angles below pi - "
-            f"{closed.HALF_TURN_MARGIN:.0e}; take the logarithm of g relative to a nearer element h, "
-            "log(compose(inverse(h), g))"
+            f"has the eigenvalue {worst:.6g} at the angle {abs(np.angle(worst)):.10f}, and det g = "
+            f"{np.linalg.det(g):.3g}; the principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}: "
+            "take the logarithm of g relative to a nearer element h, log(compose(inverse(h), g))"
+        )
+
+    def _why_no_cayley(self, x: np.ndarray) -> str:
+        if not np.isfinite(x).all():
+            return "has entries that are not finite"
+        eigenvalues = np.linalg.eigvals(self.algebra.hat(x))
+        nearest = eigenvalues[np.abs(eigenvalues**2 - 4).argmin()]
+        return (
+            f"has the eigenvalue {nearest:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
+            f"number {general.CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
         )
 
 
 # -- the groups -----------------------------------------------------------------------------------------------------
 
 
-@register((2,), (3,), (4,), (5,))
+@register((2,), (3,), (4,))
 def SO(n: int) -> MatrixGroup:
     """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
     algebra, name = catalogue.so(n), f"SO({n})"
     if n == 3:
         return MatrixGroup(
-            name, algebra, _unitary_defect, _adjoint, closed.so3_exp, closed.so3_log, closed.so3_cayley
+            name,
+            algebra,
+            closed.unitary_defect,
+            closed.unitary_inverse,
+            closed.so3_exp,
+            closed.so3_log,
+            closed.so3_cayley,
         )
-    return MatrixGroup(name, algebra, _unitary_defect, _adjoint)
+    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse)
 
 
-@register((2,), (3,), (4,))
+@register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
     """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
     algebra, name = catalogue.se(n), f"SE({n})"
     if n == 3:
-        return MatrixGroup(name, algebra, _rigid_defect, _rigid_inverse, closed.se3_exp, closed.se3_log)
-    return MatrixGroup(name, algebra, _rigid_defect, _rigid_inverse)
+        return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse, closed.se3_exp, closed.se3_log)
+    return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse)
 
 
 @register((2,), (3,))
@@ -289,27 +310,27 @@ def SU(n: int) -> MatrixGroup:
     """Unitary complex matrices of determinant 1."""
     algebra, name = catalogue.su(n), f"SU({n})"
     if n == 2:
-        return MatrixGroup(name, algebra, _unitary_defect, _adjoint, closed.su2_exp, closed.su2_log)
-    return MatrixGroup(name, algebra, _unitary_defect, _adjoint, cayley_map=None)
+        return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, closed.su2_exp, closed.su2_log)
+    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, cayley_map=None)
 
 
 @register((2,), (3,))
 def SL(n: int) -> MatrixGroup:
     """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
-    group = MatrixGroup(f"SL({n})", catalogue.sl(n), _unimodular_defect)
+    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect)
     return group if n == 2 else replace(group, cayley_map=None)
 
 
 @register((1,), (2,))
 def Sp(n: int) -> MatrixGroup:
     """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
-    return MatrixGroup(f"Sp({n})", catalogue.sp(n), _symplectic_defect, _symplectic_inverse)
+    return MatrixGroup(f"Sp({n})", catalogue.sp(n), closed.symplectic_defect, closed.symplectic_inverse)
 
 
-@register((1,), (2,), (3,))
+@register((1,), (2,))
 def GL(n: int) -> MatrixGroup:
     """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
-    return MatrixGroup(f"GL({n})", catalogue.gl(n), _invertible_defect)
+    return MatrixGroup(f"GL({n})", catalogue.gl(n), closed.invertible_defect)
 
 
 @register((1,), (2,))
@@ -318,65 +339,12 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
     return MatrixGroup(
         f"Heisenberg({n})",
         catalogue.heisenberg(n),
-        _heisenberg_defect,
-        _heisenberg_inverse,
+        closed.heisenberg_defect,
+        closed.heisenberg_inverse,
         closed.heisenberg_exp,
         closed.heisenberg_log,
         closed.heisenberg_exp,
     )
-
-
-def _unitary_defect(g):
-    return jnp.maximum(largest(_adjoint(g) @ g - jnp.eye(g.shape[-1])), jnp.abs(jnp.linalg.det(g) - 1.0))
-
-
-def _rigid_defect(g):
-    last = jnp.abs(g[..., -1, :] - jnp.eye(g.shape[-1])[-1]).max(axis=-1)
-    return jnp.maximum(_unitary_defect(g[..., :-1, :-1]), last)
-
-
-def _unimodular_defect(g):
-    """|det g - 1| over the product of the norms of the rows, to which a relative change of g changes it."""
-    rows = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
-    return jnp.abs(jnp.linalg.det(g) - 1.0) / jnp.maximum(rows, 1.0)
-
-
-def _symplectic_defect(g):
-    size = jnp.maximum(largest(g) ** 2, 1.0)
-    return largest(_symplectic_inverse(g) @ g - jnp.eye(g.shape[-1])) / size
-
-
-def _invertible_defect(g):
-    singular = jnp.linalg.svd(g, compute_uv=False)
-    invertible = singular[..., -1] > g.shape[-1] * np.finfo(float).eps * singular[..., 0]
-    return jnp.where(invertible, 0.0, jnp.inf)
-
-
-def _heisenberg_defect(g):
-    free = np.zeros(g.shape[-2:], dtype=bool)
-    free[0, 1:] = free[:-1, -1] = True
-    return largest(jnp.where(free, 0.0, g - jnp.eye(g.shape[-1])))
-
-
-def _adjoint(g):
-    return g.conj().swapaxes(-1, -2)
-
-
-def _rigid_inverse(g):
-    transposed = g[..., :-1, :-1].swapaxes(-1, -2)
-    return closed.affine(transposed, -transposed @ g[..., :-1, -1:])
-
-
-def _symplectic_inverse(g):
-    """``-J g^T J``."""
-    n = g.shape[-1] // 2
-    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
-    return -J @ g.swapaxes(-1, -2) @ J
-
-
-def _heisenberg_inverse(g):
-    N = g - jnp.eye(g.shape[-1])
-    return jnp.eye(g.shape[-1]) - N + N @ N
 
 
 # -- compiled maps --------------------------------------------------------------------------------------------------
@@ -389,6 +357,7 @@ def _exp(group: MatrixGroup, x):
 
 @partial(jax.jit, static_argnums=0)
 def _cayley(group: MatrixGroup, x):
+    assert group.cayley_map is not None
     g = group.cayley_map(group.algebra, x)
     return jnp.where((group.defect(g) <= MEMBERSHIP_TOLERANCE)[..., None, None], g, jnp.nan)
 
@@ -405,13 +374,17 @@ def _log_derivative(group: MatrixGroup, primals, tangents):
     (g,), (dg,) = primals, tangents
     x = _principal_log(group, g)
     velocity = group.algebra.vee(group.inverse_map(g) @ dg)
-    return x, jnp.linalg.solve(dexp(group.algebra, x), velocity[..., None])[..., 0]
+    return x, general.solve(general.dexp(group.algebra, x), velocity[..., None])[..., 0]
 
 
 _log = jax.jit(_principal_log, static_argnums=0)
 
 
-def _first(failed: np.ndarray) -> tuple[int, ...]:
+def _first_failure(result, core: int) -> tuple[int, ...] | None:
+    """Batch index of the first result that is not finite, its last ``core`` axes one element; None while tracing."""
+    if is_traced(result) or bool(jnp.isfinite(result).all()):
+        return None
+    failed = ~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0)))
     return tuple(int(i) for i in np.argwhere(failed)[0])
 
 

@@ -1,4 +1,4 @@
-"""Exponential, logarithm and Cayley map of any square matrix; batches on leading axes."""
+"""Exponential, logarithm, Cayley map and linear solves for small square matrices; leading axes are batches."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ CAYLEY_CONDITION_LIMIT = 1e12
 """Condition number of I - X/2 above which X counts as a pole of the Cayley map."""
 
 
-def matrix_exp(X) -> jax.Array:
-    """Matrix exponential, shape (..., m, m), by the [13/13] Padé approximant with scaling and squaring [Higham 2005].
+def exp(algebra: LieAlgebra, x) -> jax.Array:
+    """``expm(hat(x))``."""
+    return expm(algebra.hat(x))
 
-    ``jax.scipy.linalg.expm`` (0.10) rounds the number of squarings down and so loses up to eight digits at norms
-    from 5.4 to 11. Norms above 2**19 give NaN.
+
+def expm(X) -> jax.Array:
+    """Matrix exponential: [13/13] Padé approximant with scaling and squaring [Higham 2005].
+
+    ``jax.scipy.linalg.expm`` (0.10) rounds the number of squarings down, not up, and so loses up to eight digits at
+    norms above 5.4. Here norms up to 3e5 are exponentiated and larger ones give NaN.
     """
     identity = jnp.eye(X.shape[-1])
-    squarings = jnp.ceil(jnp.log2(jnp.maximum(_norm(jax.lax.stop_gradient(X)) / _PADE_RADIUS, 1.0)))[
-        ..., None, None
-    ]
-    Y = X / 2.0**squarings
-    b = _PADE
+    squarings = jnp.ceil(jnp.log2(jnp.maximum(_norm(jax.lax.stop_gradient(X)) / _PADE_RADIUS, 1.0)))[..., None, None]
+    Y, b = X / 2.0**squarings, _PADE
     Y2 = Y @ Y
     Y4 = Y2 @ Y2
     Y6 = Y4 @ Y2
-    odd = Y @ (
-        Y6 @ (b[13] * Y6 + b[11] * Y4 + b[9] * Y2) + b[7] * Y6 + b[5] * Y4 + b[3] * Y2 + b[1] * identity
-    )
+    odd = Y @ (Y6 @ (b[13] * Y6 + b[11] * Y4 + b[9] * Y2) + b[7] * Y6 + b[5] * Y4 + b[3] * Y2 + b[1] * identity)
     even = Y6 @ (b[12] * Y6 + b[10] * Y4 + b[8] * Y2) + b[6] * Y6 + b[4] * Y4 + b[2] * Y2 + b[0] * identity
-    g = identity + 2 * jnp.linalg.solve(even - odd, odd)
+    g = identity + 2 * solve(even - odd, odd)  # not (even + odd): keeps the digits of a small X
 
     def square(g, k):
         return jnp.where(k < squarings, g @ g, g), None
@@ -42,88 +42,109 @@ def matrix_exp(X) -> jax.Array:
 
 
 _PADE_RADIUS = 5.371920351148152
+_PADE = [math.comb(13, k) * math.factorial(26 - k) / math.factorial(26) for k in range(14)]
 _MOST_SQUARINGS = 16
-_PADE = [math.factorial(26 - k) / (math.factorial(13 - k) * math.factorial(k)) / 1e9 for k in range(14)]
 
 
-def general_exp(algebra: LieAlgebra, x) -> jax.Array:
-    """``matrix_exp(hat(x))``."""
-    return matrix_exp(algebra.hat(x))
+def dexp(algebra: LieAlgebra, x) -> jax.Array:
+    """Left-trivialised derivative of exp, ``int_0^1 exp(-s ad x) ds``: a block of a larger exponential [Van Loan 1978].
+
+    ``d exp(x) = exp(x) hat(dexp(x) dx)``; shape (..., dim, dim).
+    """
+    ad, one = algebra.ad(x), jnp.broadcast_to(jnp.eye(algebra.dim), (*x.shape, algebra.dim))
+    top = jnp.concatenate([-ad, one], axis=-1)
+    return expm(jnp.concatenate([top, jnp.zeros_like(top)], axis=-2))[..., : algebra.dim, algebra.dim :]
 
 
-def general_cayley(algebra: LieAlgebra, x) -> jax.Array:
-    """``I + (I - X/2)^-1 X``, NaN where I - X/2 is singular."""
+def cayley(algebra: LieAlgebra, x) -> jax.Array:
+    """``I + (I - X/2)^-1 X`` with X = hat(x), NaN where I - X/2 is singular."""
     X = algebra.hat(x)
     identity = jnp.eye(X.shape[-1])
     denominator = identity - X / 2
-    g = identity + jnp.linalg.solve(denominator, X)
+    g = identity + solve(denominator, X)
     condition = largest(denominator) * largest(identity + g) / 2  # I + g = 2 (I - X/2)^-1
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None, None], g, jnp.nan)
 
 
-def general_log(algebra: LieAlgebra, g) -> jax.Array:
-    """Square roots until g is near I, ``log s = 2 artanh (s - I)(s + I)^-1``, and one Newton step on ``exp(x) = g``.
+def log(algebra: LieAlgebra, g) -> jax.Array:
+    """Principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
 
-    The artanh keeps to the algebra of a group defined by a quadratic form. The Newton step, taken in components,
-    removes the rounding that the square roots amplify.
+    Square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which keeps to the algebra of a group
+    with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes the rounding that the
+    roots amplify.
     """
-    identity = jnp.eye(g.shape[-1], dtype=g.dtype)
+    identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 
     def far(state):
-        root, _, converged = state
-        return converged & (_norm(root - identity) > 0.25)
+        s, _, converged = state
+        return converged & (_norm(s - identity) > 0.25)
 
     def halve(state):
-        root, halvings, converged = state
-        new, success = _square_root(root)
+        s, halvings, converged = state
+        root, success = _square_root(s)
         act = far(state)
-        return (jnp.where(act[..., None, None], new, root), halvings + act, converged & (success | ~act))
+        return jnp.where(act[..., None, None], root, s), halvings + act, converged & (success | ~act)
 
-    batch = g.shape[:-2]
-    size = jnp.linalg.slogdet(g).logabsdet[..., None, None] / g.shape[-1]
-    start = (g / jnp.exp(size), jnp.zeros(batch, dtype=jnp.int32), jnp.ones(batch, dtype=bool))
-    root, halvings, converged = jax.lax.while_loop(lambda state: far(state).any(), halve, start)
-    Z = jnp.linalg.solve(root + identity, root - identity)
+    size = jnp.log(jnp.abs(determinant(g)))[..., None, None] / g.shape[-1]
+    start = (g / jnp.exp(size), jnp.zeros(batch), jnp.ones(batch, dtype=bool))
+    s, halvings, converged = jax.lax.while_loop(lambda state: far(state).any(), halve, start)
+    Z = solve(s + identity, s - identity)
     Z2, series = Z @ Z, jnp.zeros_like(g)
-    for k in reversed(range(9)):  # |Z| < 1/7: the first term left out is below 1e-16 |Z|
+    for k in reversed(range(9)):  # |Z| < 1/7, so the first term left out is below rounding
         series = identity / (2 * k + 1) + Z2 @ series
     x = algebra.vee(size * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series)
-    remainder = algebra.vee(matrix_exp(algebra.hat(-x)) @ g - identity)
-    x = x + jnp.linalg.solve(dexp(algebra, x), remainder[..., None])[..., 0]
+    remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
+    x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
     return jnp.where(converged[..., None], x, jnp.nan)
 
 
 def _square_root(a):
-    """Principal square root and whether it converged: the iteration of Denman and Beavers [Higham 2008, eq. 6.15].
+    """Principal square root, and whether it converged: Denman and Beavers' iteration [Higham 2008, eq. 6.15].
 
-    Next to the negative axis each step doubles the angle that is left and the rounding error is divided by it.
+    The iterates (y, z) tend to (a^1/2, a^-1/2). An eigenvalue at the angle pi - d costs log2(1/d) steps more and
+    loses as many bits.
     """
 
     def unfinished(state):
-        _, _, change, steps = state
+        _, change, steps = state
         return ((change > 1e-8) & (steps < _MOST_ROOT_STEPS)).any()
 
     def newton(state):
-        root, inverse_root, _, steps = state
-        new = (root + jnp.linalg.inv(inverse_root)) / 2
-        change = largest(new - root) / largest(new)  # quadratic: a step of 1e-8 ends at rounding
-        return new, (inverse_root + jnp.linalg.inv(root)) / 2, change, steps + 1
+        roots, _, steps = state
+        new = (roots + inverse(roots[::-1])) / 2
+        return new, largest(new[0] - roots[0]) / largest(new[0]), steps + 1
 
-    identity = jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)
-    start = (a, identity, jnp.full(a.shape[:-2], jnp.inf), 0)
-    root, _, change, _ = jax.lax.while_loop(unfinished, newton, start)
-    return root, change <= 1e-8
+    roots = jnp.stack([a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)])
+    roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
+    return roots[0], change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
 _MOST_ROOT_STEPS = 33
-"""So many steps reach the angle pi - HALF_TURN_MARGIN; nearer pi the square root counts as not converged."""
+"""Enough for every angle up to pi - HALF_TURN_MARGIN, and little more."""
 
 
-def dexp(algebra: LieAlgebra, x):
-    """Left-trivialised derivative of exp, ``int_0^1 exp(-s ad x) ds``: a corner of a larger exponential."""
-    ad, one = algebra.ad(x), jnp.broadcast_to(jnp.eye(algebra.dim), (*x.shape, algebra.dim))
-    top = jnp.concatenate([-ad, one], axis=-1)
-    return matrix_exp(jnp.concatenate([top, jnp.zeros_like(top)], axis=-2))[..., : algebra.dim, algebra.dim :]
+def solve(a, b) -> jax.Array:
+    """Solution x of ``a x = b``, shapes (..., m, m) and (..., m, k): Gauss-Jordan elimination with partial pivoting.
+
+    Plain array operations, on purpose. ``jnp.linalg.solve`` calls LAPACK, and on a CPU two calls that do not depend on
+    each other, in one compiled program, can wait for each other forever (jax 0.10.2, batches from about 1000).
+    """
+    return jax.lax.custom_linear_solve(
+        lambda x: a @ x,
+        b,
+        solve=lambda _, b: _eliminate(a, b)[0],
+        transpose_solve=lambda _, b: _eliminate(a.swapaxes(-1, -2), b)[0],
+    )
+
+
+def inverse(a) -> jax.Array:
+    """Inverse matrix, with entries that are not finite where a is singular."""
+    return solve(a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape))
+
+
+def determinant(a) -> jax.Array:
+    """Determinant, the signed product of the pivots."""
+    return _eliminate(a, a[..., :0])[1]
 
 
 def largest(matrix) -> jax.Array:
@@ -133,3 +154,23 @@ def largest(matrix) -> jax.Array:
 
 def _norm(matrix) -> jax.Array:
     return jnp.abs(matrix).sum(axis=-2).max(axis=-1)
+
+
+def _eliminate(a, b):
+    """Solution of ``a x = b`` and determinant of a."""
+    m = a.shape[-1]
+    row = jnp.arange(m)
+
+    def step(k, state):
+        table, det = state
+        best = jnp.argmax(jnp.where(row >= k, jnp.abs(table[..., k]), -1.0), axis=-1)[..., None]
+        exchanged = jnp.where(row == k, best, jnp.where(row == best, k, row))
+        table = jnp.take_along_axis(table, exchanged[..., None], axis=-2)
+        pivot = table[..., k, k]
+        pivot_row = (table[..., k, :] / pivot[..., None])[..., None, :]
+        table = jnp.where((row == k)[:, None], pivot_row, table - table[..., k][..., None] * pivot_row)
+        return table, det * jnp.where(best[..., 0] == k, pivot, -pivot)
+
+    start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
+    table, det = jax.lax.fori_loop(0, m, step, start)
+    return table[..., m:], det

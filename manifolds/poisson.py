@@ -38,11 +38,21 @@ class PoissonStructure(eqx.Module):
 
     def bracket(self, f: Callable, g: Callable) -> Callable:
         """The function ``{f, g}``: ``x -> grad f . Pi(x) grad g``."""
-        return lambda x: jnp.dot(jax.grad(f)(x), self.sharp(x, jax.grad(g)(x)))
+
+        def value(x):
+            x = jnp.asarray(x, dtype=jnp.float64)
+            return jnp.dot(jax.grad(f)(x), self.sharp(x, jax.grad(g)(x)))
+
+        return value
 
     def hamiltonian_vector_field(self, H: Callable) -> Callable:
         """The vector field ``X_H = Pi grad H``, for which ``X_H(f) = {f, H}``."""
-        return lambda x: self.sharp(x, jax.grad(H)(x))
+
+        def field(x):
+            x = jnp.asarray(x, dtype=jnp.float64)
+            return self.sharp(x, jax.grad(H)(x))
+
+        return field
 
     def jacobi_residual(self, x) -> jax.Array:
         """Largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""

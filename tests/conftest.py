@@ -1,8 +1,19 @@
 """Shared settings: property tests are deterministic, so that a failure here is a failure everywhere."""
 
 import hypothesis
+import jax
+import pytest
 
 hypothesis.settings.register_profile(
     "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=10
 )
 hypothesis.settings.load_profile("liethermo")
+
+
+@pytest.fixture(autouse=True)
+def _bounded_compilation_cache(request):
+    """Every compiled program holds memory maps, of which a process has 65,530: drop them now and then."""
+    yield
+    request.session.liethermo_count = count = getattr(request.session, "liethermo_count", 0) + 1
+    if count % 40 == 0:
+        jax.clear_caches()

@@ -48,7 +48,7 @@ Rounding in the vector field leaves a few eps; a conditioning of 100 is allowed 
 class Solved(NamedTuple):
     """Outcome of the stage equations.
 
-    ``converged``; whether the equations could be evaluated at all (``defined``); the last update; iterations of both kinds.
+    ``converged``; whether the last evaluation was finite (``defined``); the last update; iterations of both kinds.
     """
 
     k: jax.Array
@@ -66,23 +66,21 @@ class _Iteration(NamedTuple):
     stalled: jax.Array  # iterations in a row that did not shrink the update
     rate: jax.Array
     count: jax.Array
-    defined: jax.Array  # whether the very first update was finite
 
     @classmethod
     def begin(cls, k) -> _Iteration:
         infinite, zero, none = jnp.asarray(jnp.inf), jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
-        return cls(k, infinite, infinite, none, zero, none, jnp.asarray(True))
+        return cls(k, infinite, infinite, none, zero, none)
 
     def after(self, k) -> _Iteration:
         update = jnp.max(jnp.abs(k - self.k))
         rate = jnp.where(self.count > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
         stalled = jnp.where(update < SHRINKING * self.best, 0, self.stalled + 1)
-        defined = jnp.where(self.count == 0, jnp.isfinite(update), self.defined)
-        return _Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.count + 1, defined)
+        return _Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.count + 1)
 
     def settled(self, scale) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk."""
-        return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.best <= PLATEAU * scale))
+        return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
 
 
 def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
@@ -94,6 +92,12 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     first = jax.lax.while_loop(fixed_point_goes_on, lambda s: s.after(slopes(s.k)), _Iteration.begin(guess))
     done = first.settled(scale(first.k)) & jnp.isfinite(first.update)
+
+    def better_start():
+        """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
+        nothing = jnp.zeros_like(guess)
+        misfit = [jnp.linalg.norm(slopes(k) - k) for k in (guess, nothing)]
+        return jnp.where(misfit[0] <= misfit[1], guess, nothing)
 
     def newton_goes_on(s: _Iteration):
         return ~done & ~s.settled(scale(s.k)) & (s.count < NEWTON_LIMIT) & jnp.isfinite(jnp.sum(s.k))
@@ -114,11 +118,12 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
         return jax.lax.while_loop(goes_on, reuse, (s, jnp.zeros_like(s.count)))[0]
 
-    second = jax.lax.while_loop(newton_goes_on, newton, _Iteration.begin(guess))
+    start = jax.lax.cond(done, lambda: guess, better_start)
+    second = jax.lax.while_loop(newton_goes_on, newton, _Iteration.begin(start))
     k = jnp.where(done, first.k, second.k)
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
-    return Solved(k, converged, first.defined, residual, first.count, second.count)
+    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.count, second.count)
 
 
 class State(eqx.Module):

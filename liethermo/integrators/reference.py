@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-import jax
+import equinox as eqx
 import numpy as np
 
 from ..errors import InputError
@@ -29,8 +30,7 @@ class Reference:
     atol: float | None = None
     scheme: str = "DOP853"
 
-    order = 8
-    preserves: frozenset[str] = frozenset()
+    preserves: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self):
         if not 0.0 < self.rtol < 1.0:
@@ -42,7 +42,7 @@ class Reference:
         """States at the times reached, shape (reached, n), the number of field evaluations and a message if it failed."""
         from scipy.integrate import solve_ivp
 
-        field = jax.jit(system.vector_field.__func__)  # type: ignore[attr-defined]
+        field = eqx.filter_jit(lambda system, x: system.vector_field(x))
         atol = self.rtol * 1e-2 if self.atol is None else self.atol
         result = solve_ivp(
             lambda _, x: np.asarray(field(system, x)),

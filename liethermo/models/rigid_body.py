@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import manifolds as mf
 
-from ..dissipation import KillingDissipation
+from ..dissipation import KillingDissipation, checked_rate
 from ..energy import Quadratic
 from ..errors import InputError
 from ..systems import LiePoissonSystem
@@ -32,7 +32,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
         mf.so(3),
         energy=Quadratic(1.0 / _inertia(inertia)),
         entropy=Quadratic(jnp.ones(3)),
-        dissipation=KillingDissipation(0.5 * jnp.asarray(rate, dtype=jnp.float64)),
+        dissipation=KillingDissipation(0.5 * checked_rate(rate)),
     )
 
 

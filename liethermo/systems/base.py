@@ -116,11 +116,25 @@ class System(eqx.Module):
         return "conserved" if self.dissipation is None else self.dissipation.entropy_law
 
     def invariants(self) -> dict[str, tuple[Energy, bool]]:
-        """Further functions worth recording along a run, by name, each with whether the system conserves it."""
+        """Further functions worth recording along a run, by name, each with whether the system conserves it.
+
+        What the dissipation preserves is a constant of the system only if the motion keeps it too: ``{L, H} = 0``.
+        """
         found = {name: (J, True) for name, J in self.momentum_maps.items()}
         for i, L in enumerate(self.preserved):
-            found.setdefault(f"preserved {i + 1}", (L, True))
+            found[f"preserved {i + 1}"] = (L, self._commutes(L))
         return found
+
+    def _commutes(self, L: Energy) -> bool:
+        points = np.random.default_rng(0).standard_normal((8, self.dim))
+
+        def terms(x):
+            dL, motion = L.gradient(x), self.poisson.sharp(x, self.energy.gradient(x))
+            return jnp.dot(dL, motion), jnp.linalg.norm(dL) * jnp.linalg.norm(motion)
+
+        bracket, size = (np.asarray(values) for values in jax.vmap(terms)(points))
+        inside = np.isfinite(bracket)
+        return bool(inside.any() and (np.abs(bracket) <= AXIOM_TOLERANCE * size)[inside].all())
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -131,14 +145,16 @@ class System(eqx.Module):
         ------
         InputError
         """
-        try:
-            x = jnp.asarray(x)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"a state is an array of {self.dim} real numbers: {error}") from None
+        if not isinstance(x, jax.Array):
+            try:
+                x = np.asarray(x)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
+            if x.dtype.kind not in "fiubc":
+                raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
+        x = jnp.asarray(x)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
-        if not jnp.issubdtype(x.dtype, jnp.number):
-            raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
             expected = f"(..., {self.dim})" if batch else f"({self.dim},)"
             raise InputError(f"a state of this system has shape {expected}, not {x.shape}")

@@ -68,10 +68,9 @@ def check_system(system: System, points, samples: int, seed: int, scale: float) 
             "their domain to system.check(points=...), and validate=False to the constructor"
         )
     rows = [
-        _row(system, name, values[inside], axiom, note)
-        for name, values in measured.items()
-        if name in _AXIOMS
-        for axiom, note in [_AXIOMS[name]]
+        _row(system, name, measured[name][inside], axiom, note)
+        for name, (axiom, note) in _AXIOMS.items()
+        if name in measured
     ]
     rows += [
         _row(system, name, values[inside], name, "a momentum map has to commute with H and lie in the kernel of K")

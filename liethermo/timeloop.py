@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import math
 import os
 import sys
 import time
 from importlib import metadata
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,9 @@ from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
 from .solution import Laws, Solution, Stats, Status
 from .systems import System
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 CHUNK_SAVES = 1024
 """Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
@@ -120,8 +124,7 @@ class _Run:
     def by_steps(self, bar) -> None:
         """Drive the engine chunk by chunk, to the end, a failure or Ctrl-C."""
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // self.every, _power_of_two(self.steps // self.every)))
-        state = array.begin(self.system, self.method, self.states[0][0])
-        interrupted = False
+        state, interrupted = array.begin(self.system, self.method, self.states[0][0]), False
         try:
             done = 0
             while done < self.steps and int(state.status) == array.RUNNING:
@@ -192,8 +195,13 @@ class _Run:
         """One call of the reference solver, its output at the times a fixed step would have."""
         counts = [*range(0, self.steps, self.every), self.steps]
         times = np.array([self._time(n) for n in counts] + ([self.span[1]] if self.last else []))
-        x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], np.unique(times))
-        self.times, self.states = list(np.unique(times)[: len(x)]), [x]
+        times = np.unique(times)
+        try:
+            x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
+        except KeyboardInterrupt:
+            self.status = Status("interrupted", "stopped by the user before SciPy returned anything", 0, times[0])
+            return
+        self.times, self.states = list(times[: len(x)]), [x]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
         now = self.times[-1]
         bar.update(now)
@@ -222,7 +230,7 @@ class _Run:
             entropy=entropy,
             casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
-            stats=Stats(**{**vars(self.stats), "wall_time": wall}),
+            stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=Laws(system.energy_law, system.entropy_law, conserved),
             provenance=self._provenance(),
         )
@@ -287,15 +295,16 @@ def _keeps(method, function) -> bool:
 
 
 def _stats(state: array.State) -> Stats:
+    followed = int(state.step) > 0
     return Stats(
         steps=int(state.step),
         fixed_point_iterations=int(state.fixed_point),
         newton_iterations=int(state.newton),
         most_iterations=int(state.most_iterations),
         worst_residual=float(state.worst_residual),
-        energy_range=(float(state.smallest_energy), float(state.largest_energy)),
-        least_entropy_increment=float(state.least_entropy_increment),
-        largest_energy_increment=float(state.largest_energy_increment),
+        energy_range=(float(state.smallest_energy), float(state.largest_energy)) if followed else None,
+        least_entropy_increment=float(state.least_entropy_increment) if followed else None,
+        largest_energy_increment=float(state.largest_energy_increment) if followed else None,
     )
 
 
@@ -315,7 +324,8 @@ class _Progress:
     """A progress bar on the standard error, shown only where someone is there to see it."""
 
     def __init__(self, span: tuple[float, float], wanted: bool | None):
-        self.span, self.bar = span, None
+        self.span = span
+        self.bar: Progress | None = None
         self.wanted = sys.stderr.isatty() if wanted is None else wanted
 
     def __enter__(self):
@@ -324,9 +334,9 @@ class _Progress:
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
             columns = (TextColumn("t = {task.fields[t]:.4g}"), BarColumn(), TimeRemainingColumn())
-            self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self.bar.start()
-            self.task = self.bar.add_task("", total=self.span[1] - self.span[0], t=self.span[0])
+            self.bar = bar = Progress(*columns, console=Console(stderr=True, force_terminal=True), transient=True)
+            bar.start()
+            self.task = bar.add_task("", total=self.span[1] - self.span[0], t=self.span[0])
         return self
 
     def update(self, t: float) -> None:

@@ -1,0 +1,198 @@
+"""The command line. What a command needs is imported inside it, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from .solution import Solution
+    from .spec import Spec
+    from .systems import System
+
+FAILED = 1
+"""Exit status where a law or an axiom fails, or the run stopped early."""
+
+UNUSABLE = 2
+"""Exit status for a spec or a file that cannot be used."""
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Integrate systems that obey the two laws of thermodynamics, and see that they do.",
+    epilog="Exit status: 0 where all laws hold, 1 where one fails or the run stopped early, 2 for a bad spec or file.",
+)
+SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, described in TOML.")]
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """Tell the library's errors in a message and an exit status, without a traceback."""
+    from manifolds import ManifoldsError
+
+    from .errors import AxiomError, LiethermoError
+
+    try:
+        yield
+    except (LiethermoError, ManifoldsError) as error:
+        typer.echo(f"liethermo: {error}", err=True)
+        raise typer.Exit(FAILED if isinstance(error, AxiomError) else UNUSABLE) from error
+
+
+@app.command()
+@_told()
+def run(
+    spec: SpecFile,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the results; by default named after the spec, here.")
+    ] = None,
+) -> None:
+    """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
+    from .timeloop import integrate
+    from .spec import read
+
+    plan = read(spec)
+    system = plan.system()
+    folder = _folder(spec, Path(spec.stem) if out is None else out)
+    start, end = plan.run.t_span
+    typer.echo(f"{plan.model}, {plan.method}, step {plan.run.step:g}, t = {start:g} to {end:g}")
+    file = folder / plan.outputs.netcdf
+    solution = integrate(
+        system,
+        plan.run.initial,
+        (start, end),
+        plan.run.step,
+        plan.method,
+        save_every=plan.run.save_every,
+        on_failure="return",
+        save_to=file,
+    ).with_provenance(spec=plan.table)
+    solution.save(file)
+    passed = _print_audit(solution)
+    if not solution.status.ok:
+        typer.echo(f"The run stopped early. The trajectory up to t = {solution.t[-1]:g} is kept.")
+    figures = _draw(plan, system, solution, folder)
+    typer.echo(f"In {folder}{os.sep}: {', '.join([file.name, *figures, spec.name])}")
+    raise typer.Exit(0 if passed else FAILED)
+
+
+@app.command()
+@_told()
+def check(spec: SpecFile) -> None:
+    """Validate a spec file and test the axioms of its system at random points, without running it."""
+    from .spec import read
+
+    plan = read(spec)
+    report = plan.system().check()
+    typer.echo(f"{spec}: the spec is valid")
+    rows = [(row.axiom, row.residual, row.tolerance, row.passed, row.note) for row in report.rows]
+    _print_verdicts(("axiom", "residual", "tolerance"), rows)
+    typer.echo(str(report).splitlines()[-1])
+    raise typer.Exit(0 if report.passed else FAILED)
+
+
+@app.command()
+def models() -> None:
+    """List the models that a spec file can name, with their parameters."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from . import models as catalogue
+
+    table = Table("model", "parameters", "what it is", box=None, pad_edge=False)
+    for name in catalogue.__all__:
+        model = getattr(catalogue, name)
+        parameters = [str(p.replace(annotation=p.empty)) for p in inspect.signature(model).parameters.values()]
+        table.add_row(name, "\n".join(parameters), (inspect.getdoc(model) or "").partition("\n")[0].replace("``", ""))
+    Console(markup=False).print(table)
+
+
+@app.command()
+@_told()
+def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
+    """Audit the laws of a saved run."""
+    from .solution import load
+
+    solution = load(file)
+    typer.echo(
+        f"{file}: {solution.provenance.get('system', 'a system')}, {solution.provenance.get('method', 'a method')}"
+    )
+    raise typer.Exit(0 if _print_audit(solution) else FAILED)
+
+
+def main() -> None:
+    """Entry point of the command ``liethermo``."""
+    app(prog_name="liethermo")
+
+
+# -- helpers --------------------------------------------------------------------------------------------------------
+
+
+def _folder(spec: Path, folder: Path) -> Path:
+    """The folder of the results, made ready, with a copy of the spec: a place that cannot be written shows at once."""
+    from .errors import FileError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(shutil.SameFileError):
+            shutil.copyfile(spec, folder / spec.name)
+    except OSError as error:
+        raise FileError(f"cannot write the results into {folder}: {error.strerror}") from error
+    return folder
+
+
+def _draw(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
+    """Draw the figures of a spec; returns the names of their files."""
+    os.environ.setdefault("MPLBACKEND", "agg")  # files only: no window, and no screen needed
+    from . import plot
+
+    files = []
+    for name in plan.outputs.figures:
+        figure = getattr(plot, name)
+        more = {"system": system} if "system" in inspect.signature(figure).parameters else {}
+        files.append(f"{name}.{plan.outputs.figure_format}")
+        figure(solution, path=folder / files[-1], **more)
+    return files
+
+
+def _print_audit(solution: Solution) -> bool:
+    """Print how a run ended and whether its laws held; returns whether they did."""
+    audit = solution.audit()
+    typer.echo(f"{solution.status} ({solution.stats.wall_time:.1f} s)")
+    rows = [(row.law, row.value, row.tolerance, row.passed, row.note) for row in audit.rows]
+    _print_verdicts(("law", "measured", "allowed"), rows)
+    typer.echo(str(audit).splitlines()[-1])
+    return audit.passed
+
+
+def _print_verdicts(
+    head: tuple[str, str, str], rows: Sequence[tuple[str, float, float | None, bool | None, str]]
+) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column(head[0])
+    for column in head[1:]:
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("")
+    table.add_column("", overflow="fold")
+    verdict = {True: "[green]ok[/]", False: "[bold red]FAILS[/]", None: "-"}
+    for name, value, tolerance, passed, note in rows:
+        allowed = "" if tolerance is None or passed is None else f"{tolerance:.1e}"
+        table.add_row(escape(name), f"{value:.2e}", allowed, verdict[passed], escape(note))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,263 @@
+"""Every dissipation on every algebra: the algebra of K, continuous and discrete, and the refusals."""
+
+import jax
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numpy as np
+import pytest
+
+from tests.cases import (
+    ALGEBRAS,
+    DISSIPATIONS,
+    REPRESENTATIVE,
+    TRANSCENDENTAL,
+    build,
+    combinations,
+    energy_of,
+    entropy_of,
+    state_of,
+    tolerance,
+)
+
+SAMPLES = 5
+
+
+def points(g):
+    return np.array([state_of(g, seed) for seed in range(SAMPLES)])
+
+
+@pytest.mark.parametrize(("g", "case"), combinations(REPRESENTATIVE))
+def test_axioms_hold(g, case):
+    """K symmetric, semidefinite, K grad H = 0, the laws along the field: the system's own report, at chosen points."""
+    report = build(g, case).check(points=points(g))
+    assert report.passed, f"\n{report}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("g", "case"), combinations(ALGEBRAS))
+def test_axioms_hold_everywhere(g, case):
+    report = build(g, case).check(points=points(g))
+    assert report.passed, f"\n{report}"
+
+
+def discrete_properties(system, g):
+    """Worst ``dgrad H . force`` and the smallest ``grad S . force``, both relative, over random discrete gradients."""
+
+    def at(x, dH, dS, dL):
+        force = system.dissipation.force(system, x, dH, dS, dL)
+        size = jnp.linalg.norm(force)
+        size = jnp.where(size > 0.0, size, 1.0)
+        return jnp.dot(dH, force) / (size * jnp.linalg.norm(dH)), jnp.dot(dS, force) / (size * jnp.linalg.norm(dS))
+
+    rng = np.random.default_rng(0)
+    x = points(g)
+    dH = jax.vmap(system.energy.gradient)(x) + 0.1 * rng.standard_normal(x.shape)  # not the gradient of H anywhere
+    dS = jax.vmap(system.entropy.gradient)(x)
+    dL = tuple(jax.vmap(L.gradient)(x) + 0.1 * rng.standard_normal(x.shape) for L in system.preserved)
+    first, second = jax.vmap(at)(x, dH, dS, dL)
+    return float(jnp.max(jnp.abs(first))), float(jnp.min(second))
+
+
+@pytest.mark.parametrize(("g", "case"), combinations(REPRESENTATIVE))
+def test_any_vector_in_place_of_the_gradient_is_in_the_kernel(g, case):
+    """BFM (4.6) and Remark 4.7: handed a vector that is *not* grad H, K_d has that vector in its kernel, and K_d >= 0."""
+    system = build(g, case)
+    energy_defect, production = discrete_properties(system, g)
+    if system.energy_law == "conserved":
+        assert energy_defect <= 10 * tolerance("kernel")
+    if system.entropy_law == "nondecreasing":
+        assert production >= -10 * tolerance("kernel")
+
+
+@pytest.mark.parametrize("g", [g for g in ALGEBRAS if g.casimir_count() and not g.is_abelian()], ids=lambda g: g.name)
+def test_killing_dissipation_works_or_refuses_with_a_reason(g):
+    """Over the whole catalogue: the laws, or the right refusal."""
+    case = DISSIPATIONS[0]
+    reason = case.exempt(g)
+    if reason is None:
+        system = build(g, case)
+        assert system.check(points=points(g)).passed
+        return
+    with pytest.raises(lt.LiethermoError) as refusal:
+        build(g, case)
+    message = str(refusal.value)
+    assert "ProjectedMetric" in message
+    assert "InnerProductDissipation" in message
+    if "indefinite" in reason:
+        assert isinstance(refusal.value, lt.IndefiniteError)
+        assert refusal.value.residual < 0
+
+
+def test_killing_on_so3_is_the_projected_metric():
+    """-kappa / 2 is the dot product: rate 1/2 reproduces (2.2) and the relaxed rigid body."""
+    g, H, S = mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3))
+    x = points(g)
+    killing = lt.LiePoissonSystem(g, H, S, lt.KillingDissipation(rate=0.5)).vector_field(x)
+    projected = lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric()).vector_field(x)
+    assert np.allclose(killing, projected, rtol=0, atol=1e-13)
+    bracket = lt.FourBracket.kulkarni_nomizu(np.eye(3) / 2, np.eye(3))
+    assert np.allclose(lt.LiePoissonSystem(g, H, S, bracket).vector_field(x), projected, rtol=0, atol=1e-13)
+    own = lt.LiePoissonSystem(g, H, S, lt.InnerProductDissipation(np.eye(3))).vector_field(x)
+    assert np.allclose(own, projected, rtol=0, atol=1e-13)
+
+
+def test_the_relaxed_body_as_printed():
+    """BFM Example 3.2: Pi' = Pi × Omega + |Omega|^2 Pi - (Omega . Pi) Omega, and the same from the force F(Omega) = Omega × Pi."""
+    inertia, system = np.array([10.0, 5.0, 1.0]), lt.models.rigid_body(inertia=(10, 5, 1), rate=1.0)
+    Pi = np.array([0.3, 1.0, -0.2])
+    Omega = Pi / inertia
+    expected = np.cross(Pi, Omega) + Omega @ Omega * Pi - Omega @ Pi * Omega
+    assert np.allclose(system.vector_field(Pi), expected, rtol=0, atol=1e-15)
+    forced = lt.EulerPoincareSystem(
+        mf.so(3),
+        lagrangian=lambda w: 0.5 * jnp.sum(inertia * w * w),
+        entropy=lt.Quadratic(np.ones(3)),
+        force=lambda w: jnp.cross(w, inertia * w),
+    )
+    assert np.allclose(forced.vector_field(Pi), expected, rtol=0, atol=1e-14)
+
+
+def test_normalisations_differ_by_the_length_of_dH():
+    g, H, S = mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3))
+    G, x = np.diag([1.0, 2.0, 0.5]), np.array([0.3, -0.7, 0.4])
+    plain, normalized = (
+        lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric(G, normalized=choice)).friction_matrix(x) for choice in (False, True)
+    )
+    dH = np.asarray(H.gradient(x))
+    assert np.allclose(plain, dH @ G @ dH * normalized, rtol=0, atol=1e-14)
+    assert np.allclose(plain, (dH @ G @ dH) * G - np.outer(G @ dH, G @ dH), rtol=0, atol=1e-14)
+
+
+def test_preserved_functions_and_dependent_ones():
+    """K kills the gradients of what it is told to preserve; a function of H adds nothing; without room K is 0."""
+    g, H, S = mf.so(4), energy_of(6, 0), lt.Quadratic(np.eye(6))
+    L, M, x = lt.Quadratic(np.diag(np.arange(1.0, 7.0))), lambda y: jnp.sin(y[0] + y[3]), np.linspace(-1, 1, 6)
+    for normalized in (False, True):
+        system = lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric(preserve=(L, M), normalized=normalized))
+        K = np.asarray(system.friction_matrix(x))
+        for gradient in (H.gradient(x), L.gradient(x), jax.grad(M)(x)):
+            assert np.abs(K @ gradient).max() <= 1e-13 * np.abs(K).max() * np.abs(gradient).max()
+        assert np.linalg.matrix_rank(K, tol=1e-10 * np.abs(K).max()) == 3
+    once = lt.ProjectedMetric(preserve=(lambda y: H.value(y) ** 2,), normalized=True)
+    K = lt.LiePoissonSystem(g, H, S, once).friction_matrix(x)
+    plain = lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric(normalized=True)).friction_matrix(x)
+    assert np.allclose(K, plain, atol=1e-12)
+
+
+def test_friction_operator_keeps_its_other_kernel_vectors():
+    """Remark 4.7: kernel vectors of K orthogonal to grad H (momentum maps) stay in the kernel of K_d."""
+    rng = np.random.default_rng(0)
+    kept, H = np.array([0.0, 0.0, 1.0, 0.0]), lt.Quadratic(np.diag([1.0, 2.0, 0.0, 3.0]))
+    spread = rng.standard_normal(4)
+
+    def K(x):
+        frame = jnp.linalg.qr(jnp.stack([H.gradient(x), jnp.asarray(kept), jnp.asarray(spread)], axis=1))[0]
+        return jnp.outer(frame[:, 2], frame[:, 2])
+
+    system = lt.MetriplecticSystem(np.zeros((4, 4)), H, lambda x: x[0] + x[2] ** 2, lt.FrictionOperator(K))
+    x, dH = rng.standard_normal(4), np.asarray(H.gradient(rng.standard_normal(4)))
+    K_d = np.asarray(jax.jacfwd(lambda dS: system.dissipation.force(system, x, dH, dS, ()))(jnp.zeros(4)))
+    assert np.abs(K_d @ kept).max() <= 1e-14
+    assert np.abs(K_d @ dH).max() <= 1e-13
+    assert np.allclose(K_d, K_d.T, atol=1e-14)
+    assert np.linalg.eigvalsh(K_d)[0] >= -1e-14
+
+
+def test_dissipations_add():
+    g, H, S = mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3))
+    a, b = lt.ProjectedMetric(rate=0.3), lt.KillingDissipation(rate=0.2)
+    x = points(g)
+    free = lt.LiePoissonSystem(g, H, S)
+    total = lt.LiePoissonSystem(g, H, S, a + b).vector_field(x)
+    parts = [lt.LiePoissonSystem(g, H, S, d).vector_field(x) - free.vector_field(x) for d in (a, b)]
+    assert np.allclose(total, free.vector_field(x) + parts[0] + parts[1], rtol=0, atol=1e-14)
+    mixed = lt.LiePoissonSystem(g, H, S, a + lt.DoubleBracket(0.1))
+    assert (mixed.energy_law, mixed.entropy_law) == ("nonincreasing", "nondecreasing")
+    unsure = lt.LiePoissonSystem(g, H, S, a + lt.EulerPoincareForce(lambda xi: xi))
+    assert unsure.entropy_law is None
+
+
+# -- controls: what must fail ---------------------------------------------------------------------------------------------
+
+
+class WrongEnergy(lt.Dissipation):
+    """Control: a projected metric built from the gradient of another function than H."""
+
+    def force(self, system, x, dH, dS, dL):
+        wrong = dH + jnp.ones_like(dH)
+        return jnp.dot(wrong, wrong) * dS - jnp.dot(wrong, dS) * wrong
+
+
+class WrongSign(lt.Dissipation):
+    """Control: minus a projected metric."""
+
+    def force(self, system, x, dH, dS, dL):
+        return jnp.dot(dH, dS) * dH - jnp.dot(dH, dH) * dS
+
+
+@pytest.mark.parametrize(
+    ("dissipation", "failing"),
+    [(WrongEnergy(), {"K grad H = 0", "energy law"}), (WrongSign(), {"K >= 0", "entropy law"})],
+    ids=["wrong energy", "wrong sign"],
+)
+def test_a_wrong_dissipation_fails_its_axioms_and_only_those(dissipation, failing):
+    system = lt.LiePoissonSystem(
+        mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation, validate=False
+    )
+    report = system.check()
+    assert {row.axiom for row in report.rows if row.passed is False} == failing
+    assert "NOT metriplectic" in str(report)
+    with pytest.raises(lt.AxiomError):
+        lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: lt.InnerProductDissipation(np.diag([1.0, -1.0, 1.0])), lt.IndefiniteError, "negative eigenvalue -1"),
+        (lambda: lt.InnerProductDissipation([[0, 1], [0, 0]]), lt.InputError, "not symmetric"),
+        (lambda: lt.InnerProductDissipation(np.ones(3)), lt.InputError, "square"),
+        (lambda: lt.ProjectedMetric(np.diag([1.0, -1.0])), lt.IndefiniteError, "cometric"),
+        (lambda: lt.ProjectedMetric(rate=-1.0), lt.InputError, ">= 0"),
+        (lambda: lt.KillingDissipation(rate=np.nan), lt.InputError, ">= 0"),
+        (lambda: lt.KillingDissipation(rate=[1.0, 2.0]), lt.InputError, "one number"),
+        (lambda: lt.FourBracket(np.ones((2, 2, 2, 2))), lt.InputError, r"R\[i,j,k,l\] = -R\[j,i,k,l\]"),
+        (lambda: lt.FourBracket(np.ones((2, 2, 2))), lt.InputError, r"\(n, n, n, n\)"),
+        (lambda: lt.FrictionOperator(-np.eye(2)), lt.IndefiniteError, "friction operator"),
+        (lambda: lt.DoubleBracket(metric=-np.eye(2)), lt.IndefiniteError, "metric"),
+    ],
+)
+def test_unusable_dissipations(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+@pytest.mark.parametrize(
+    "dissipation",
+    [
+        lt.InnerProductDissipation(np.eye(2)),
+        lt.FrictionOperator(lambda x: x),
+        lt.FourBracket(np.zeros((2, 2, 2, 2))),
+        lt.FourBracket.kulkarni_nomizu(np.eye(2), np.eye(3)),
+        lt.DoubleBracket(metric=np.eye(2)),
+        lt.EulerPoincareForce(lambda xi: xi[:2]),
+    ],
+    ids=lambda d: type(d).__name__,
+)
+def test_dissipations_of_the_wrong_size(dissipation):
+    with pytest.raises(lt.InputError, match=r"3|dimension"):
+        lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation)
+
+
+def test_algebra_dissipations_need_an_algebra():
+    with pytest.raises(lt.InputError, match="Lie algebra"):
+        lt.MetriplecticSystem(mf.Canonical(1), lambda x: x @ x, lambda x: 0.0 * x[0], lt.KillingDissipation())
+
+
+def test_every_transcendental_casimir_is_one():
+    """The table of the test-suite is itself checked: a Casimir that is none would weaken every test that uses it."""
+    for g in ALGEBRAS:
+        if g.name in TRANSCENDENTAL:
+            system = lt.LiePoissonSystem(g, energy_of(3, 0), entropy_of(g), validate=False)
+            assert system.check(points=points(g)).passed

@@ -1,0 +1,207 @@
+"""The time loop: what it accepts, how it fails, and that nothing computed is lost."""
+
+import signal
+import threading
+
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numpy as np
+import pytest
+from liethermo import timeloop as loop
+from liethermo.engine import array
+
+BODY = lt.models.rigid_body()
+X0 = [0.001, 1.0, 0.001]
+
+
+# -- times and saving -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("end", "h", "steps"), [(1.0, 0.1, 10), (100.0, 0.1, 1000), (1.05, 0.1, 11), (0.05, 0.1, 1), (0.3, 0.1, 3)])
+def test_the_run_ends_where_it_was_told_to(end, h, steps):
+    solution = lt.integrate(BODY, X0, (0.0, end), h)
+    assert solution.t[-1] == end
+    assert solution.stats.steps == steps
+    assert len(solution.t) == len(solution.x) == steps + 1
+    assert np.allclose(np.diff(solution.t)[:-1], h, atol=1e-12)
+
+
+@pytest.mark.parametrize("every", [1, 2, 7, 10, 100, 1000])
+def test_save_every(every):
+    full = lt.integrate(BODY, X0, (2.0, 12.05), 0.1)
+    thin = lt.integrate(BODY, X0, (2.0, 12.05), 0.1, save_every=every)
+    kept = sorted({*range(0, 101, every), 100, 101})
+    if every > 1:
+        kept = [n for n in kept if n % every == 0 or n in (100, 101)]
+    assert np.array_equal(thin.x, full.x[kept])
+    assert np.array_equal(thin.t, full.t[kept])
+    assert thin.stats.steps == full.stats.steps
+    assert thin.stats.least_entropy_increment == full.stats.least_entropy_increment
+
+
+def test_chunks_do_not_show(monkeypatch):
+    whole = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
+    monkeypatch.setattr(loop, "CHUNK_SAVES", 16)
+    pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
+    assert np.array_equal(whole.x, pieces.x)
+
+
+def test_runs_are_reproducible_and_pure():
+    first, second = (lt.integrate(BODY, X0, (0.0, 5.0), 0.1) for _ in range(2))
+    assert np.array_equal(first.x, second.x)
+    assert first.provenance["method"] == "MetriplecticMidpoint(gradient=Gonzalez)"
+
+
+# -- input ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("x0", "words"),
+    [
+        ([1.0, 2.0], r"shape \(3,\), not \(2,\)"),
+        ([[1.0, 2.0, 3.0]], r"\(1, 3\)"),
+        ([1.0, np.nan, 0.0], r"component \(1,\) is nan"),
+        ([1.0, np.inf, 0.0], "not finite"),
+        ([1.0, 1j, 0.0], "real"),
+        (["a", "b", "c"], "real numbers"),
+        ([[1.0], [2.0, 3.0]], "real numbers"),
+    ],
+)
+def test_unusable_states(x0, words):
+    with pytest.raises(lt.InputError, match=words):
+        lt.integrate(BODY, x0, (0.0, 1.0), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"step": 0.0}, "positive"),
+        ({"step": -0.1}, "positive"),
+        ({"step": np.nan}, "positive"),
+        ({"step": "small"}, "number"),
+        ({"step": 1e-20, "t_span": (1.0, 2.0)}, "vanishes"),
+        ({"t_span": (1.0, 0.0)}, "increasing"),
+        ({"t_span": (0.0, 0.0)}, "increasing"),
+        ({"t_span": (0.0, np.inf)}, "finite"),
+        ({"t_span": 3.0}, "two numbers"),
+        ({"save_every": 0}, "save_every"),
+        ({"save_every": 1.5}, "save_every"),
+        ({"engine": "quantum"}, "engine"),
+        ({"on_failure": "ignore"}, "on_failure"),
+        ({"method": "midpoint"}, "lt.MetriplecticMidpoint"),
+    ],
+)
+def test_unusable_arguments(arguments, words):
+    with pytest.raises(lt.InputError, match=words):
+        lt.integrate(BODY, X0, **{"t_span": (0.0, 1.0), "step": 0.1, **arguments})
+
+
+def test_the_system_comes_first():
+    with pytest.raises(lt.InputError, match="system"):
+        lt.integrate(lambda x: x, X0, (0.0, 1.0), 0.1)
+
+
+# -- failure ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_step_too_large_names_step_time_residual_and_advice():
+    stiff = lt.LiePoissonSystem(
+        mf.so(3), lambda p: jnp.sum(jnp.sin(40.0 * p)), lt.Quadratic(np.ones(3)), lt.KillingDissipation()
+    )
+    with pytest.raises(lt.ConvergenceError, match=r"step 1, from t = 0 with h = 50.*residual.*smaller step, for example 25") as caught:
+        lt.integrate(stiff, [0.3, 1.0, -0.2], (0.0, 500.0), 50.0)
+    solution = caught.value.solution
+    assert (solution.status.code, solution.status.step, solution.status.time) == ("not_converged", 0, 0.0)
+    assert solution.status.residual > array.PLATEAU
+    assert np.array_equal(solution.x, [[0.3, 1.0, -0.2]])
+    assert not solution.audit().passed
+    assert isinstance(caught.value, ArithmeticError)
+
+
+@pytest.mark.parametrize("h", [20.0, 50.0, 1e3])
+def test_huge_steps_either_keep_the_laws_or_fail(h):
+    """A diverging iteration is not taken for a converged one."""
+    solution = lt.integrate(BODY, [1.0, 20.0, 0.1], (0.0, 20 * h), h, on_failure="return")
+    if solution.status.ok:
+        assert solution.audit().passed
+    else:
+        assert solution.status.code == "not_converged"
+    assert np.abs(solution.x).max() < 1e3
+
+
+@pytest.mark.parametrize("method", list(lt.registered_methods()), ids=str)
+def test_one_iteration_is_not_enough_and_says_so(method, monkeypatch):
+    """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
+    monkeypatch.setattr(array, "FIXED_POINT_LIMIT", 1)
+    monkeypatch.setattr(array, "NEWTON_LIMIT", 1)
+    system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
+    solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.1, method, on_failure="return")
+    assert solution.status.code == "not_converged"
+
+
+def test_newton_takes_over_where_fixed_point_iteration_fails():
+    """A stiff body: the fixed point does not contract, Newton's method solves the same equations, the laws hold."""
+    system = lt.models.rigid_body(inertia=(10, 5, 1), rate=200.0)
+    solution = lt.integrate(system, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5)
+    assert solution.stats.newton_iterations > 0
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    assert solution.entropy[-1] == pytest.approx(10 * solution.energy[0], rel=1e-12)
+
+
+def domain_system():
+    """An energy that ends where the body is about to go: sqrt of something that becomes negative."""
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p * p / jnp.array([10.0, 5.0, 1.0])) + 1e-3 * jnp.sqrt(1.1 - p[0]),
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.5),
+        validate=False,
+    )
+
+
+def test_nan_midway_keeps_what_was_computed():
+    with pytest.raises(lt.NonFiniteError, match=r"NaN or infinity in step \d+.*energy first.*domain") as caught:
+        lt.integrate(domain_system(), [0.001, 1.0, 0.001], (0.0, 500.0), 0.1)
+    solution = caught.value.solution
+    assert solution.status.code == "non_finite"
+    assert len(solution.t) == solution.status.step + 1 > 10
+    assert solution.t[-1] == solution.status.time
+    assert np.isfinite(solution.x).all()
+    assert solution.audit().energy_drift < 1e-13
+    assert solution.x[-1, 0] < 1.1
+
+
+@pytest.mark.parametrize("every", [1, 7, 10_000])
+def test_on_failure_return(every):
+    solution = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, save_every=every, on_failure="return")
+    whole = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, on_failure="return")
+    assert str(solution.status) == str(whole.status)
+    assert np.array_equal(solution.x[-1], whole.x[-1])  # the last good state, between two saves too
+    assert solution.t[-1] == whole.t[-1]
+
+
+def test_the_reference_method_reports_failure_too():
+    solution = lt.integrate(domain_system(), X0, (0.0, 500.0), 1.0, lt.Reference(), on_failure="return")
+    assert solution.status.code in ("reference_failed", "completed")
+    assert np.isfinite(solution.x).all()
+    with pytest.raises(lt.InputError, match="rtol"):
+        lt.Reference(rtol=0.0)
+    with pytest.raises(lt.InputError, match="DOP853"):
+        lt.Reference(scheme="Euler")
+
+
+def test_ctrl_c_returns_what_exists():
+    threading.Timer(2.5, lambda: signal.raise_signal(signal.SIGINT)).start()
+    solution = lt.integrate(BODY, X0, (0.0, 1e9), 0.1, save_every=1000)
+    assert solution.status.code == "interrupted"
+    assert "stopped by the user" in str(solution.status)
+    assert len(solution.t) > 10
+    assert solution.audit().passed
+
+
+def test_progress_bar_is_silent_by_default_and_shown_on_request(capsys):
+    lt.integrate(BODY, X0, (0.0, 1.0), 0.1)
+    assert capsys.readouterr() == ("", "")
+    lt.integrate(BODY, X0, (0.0, 1.0), 0.1, progress=True)
+    assert "t =" in capsys.readouterr().err

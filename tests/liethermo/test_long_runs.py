@@ -1,0 +1,40 @@
+"""A million steps: no drift, no noise, no growth of the work."""
+
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numpy as np
+import pytest
+from liethermo.gradients import GRADIENTS
+
+MILLION = 1_000_000
+
+
+@pytest.mark.parametrize("h", [1e-5, 0.05, 0.1])
+def test_free_body_energy_after_a_million_steps(h):
+    """Relative drift below 2e-14: compensated summation, and an iteration that stops at its plateau and not before."""
+    system = lt.models.free_rigid_body()
+    solution = lt.integrate(system, [np.cos(1.1), 0, np.sin(1.1)], (0.0, MILLION * h), h, save_every=10_000)
+    assert solution.stats.steps == MILLION
+    assert solution.audit().energy_drift < 2e-14
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_relaxing_to_rounding_and_staying_there(name):
+    """A body with a non-quadratic energy relaxes until |x' - x| is at rounding, and stays for a million steps."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p * p / jnp.array([3.0, 2.0, 1.0])) + 0.1 * p[0] ** 4 + 0.05 * jnp.cos(p[1]),
+        lt.Quadratic(np.ones(3)),
+        lt.ProjectedMetric(rate=0.3),
+    )
+    method = lt.MetriplecticMidpoint(name)
+    early = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 3000.0), 0.1, method, save_every=100)
+    late = lt.integrate(system, early.x[-1], (0.0, 0.1 * MILLION), 0.1, method, save_every=1000)
+    assert early.audit().passed, f"\n{early.audit()}"
+    assert np.abs(early.x[-1] - early.x[-2]).max() < 1e-15
+    audit = late.audit(energy=1e-14)
+    assert audit.passed, f"\n{audit}"
+    assert np.abs(late.x - late.x[0]).max() < 1e-13  # no random walk along the equilibria
+    assert late.stats.iterations_per_step <= early.stats.iterations_per_step
+    assert late.stats.newton_iterations == 0

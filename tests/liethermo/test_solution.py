@@ -1,0 +1,147 @@
+"""Results: files that come back whole or say why not, xarray, the audit's verdicts."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import liethermo as lt
+import numpy as np
+import pytest
+
+X0 = [0.001, 1.0, 0.001]
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return lt.integrate(lt.models.rigid_body(), X0, (0.0, 20.0), 0.1)
+
+
+def test_save_and_load(solution, tmp_path):
+    path = solution.with_provenance(seed=7).save(tmp_path / "deep" / "run.nc")
+    loaded = lt.load(path)
+    for name in ("t", "x", "energy", "entropy"):
+        assert np.array_equal(getattr(loaded, name), getattr(solution, name)), name
+    assert loaded.casimirs.keys() == solution.casimirs.keys()
+    assert all(np.array_equal(loaded.casimirs[k], solution.casimirs[k]) for k in solution.casimirs)
+    assert (loaded.status, loaded.stats, loaded.laws) == (solution.status, solution.stats, solution.laws)
+    assert loaded.provenance["seed"] == 7
+    assert loaded.provenance["step"] == 0.1
+    assert str(loaded.audit()) == str(solution.audit())
+    assert [p.name for p in path.parent.iterdir()] == ["run.nc"]
+
+
+def test_no_entropy_and_no_invariants(tmp_path):
+    import manifolds as mf
+
+    system = lt.MetriplecticSystem(mf.Canonical(1), lambda x: x @ x)
+    loaded = lt.load(lt.integrate(system, [1.0, 0.0], (0.0, 1.0), 0.1).save(tmp_path / "a.nc"))
+    assert loaded.entropy is None
+    assert loaded.casimirs == {}
+    assert loaded.audit().passed
+    assert np.isnan(loaded.audit().entropy_min_increment)
+
+
+def test_xarray(solution):
+    dataset = solution.to_xarray()
+    assert dataset["x"].dims == ("time", "component")
+    assert float(dataset["entropy"].sel(time=20.0)) == solution.entropy[-1]
+    assert json.loads(dataset.attrs["provenance"])["library"].startswith("liethermo ")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 0.3, 0.9, 0.999])
+def test_a_file_cut_short(solution, tmp_path, keep):
+    path = solution.save(tmp_path / "run.nc")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(keep if keep >= 1 else keep * len(content))])
+    with pytest.raises(lt.FileError, match=r"run\.nc"):
+        lt.load(path)
+
+
+def test_other_files(tmp_path):
+    import xarray
+
+    with pytest.raises(lt.FileError, match="there is no file"):
+        lt.load(tmp_path / "none.nc")
+    xarray.Dataset({"a": ("b", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(lt.FileError, match="not a liethermo result"):
+        lt.load(tmp_path / "other.nc")
+    assert issubclass(lt.FileError, OSError)
+
+
+def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
+    path = solution.save(tmp_path / "run.nc")
+    before = path.read_bytes()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("xarray.Dataset.to_netcdf", full)
+    with pytest.raises(lt.FileError, match="No space left"):
+        solution.save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]
+
+
+def test_save_to_writes_on_failure_and_on_the_way(tmp_path, monkeypatch):
+    monkeypatch.setattr("liethermo.timeloop.CHECKPOINT_SECONDS", 0.0)
+    saved = []
+    original = lt.Solution.save
+    monkeypatch.setattr(lt.Solution, "save", lambda self, path: saved.append(len(self.t)) or original(self, path))
+    lt.integrate(lt.models.rigid_body(), X0, (0.0, 300.0), 0.1, save_to=tmp_path / "run.nc")
+    assert len(saved) > 2
+    assert saved == sorted(saved)
+    assert len(lt.load(tmp_path / "run.nc").t) == 3001
+
+
+# -- the audit ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_audit_sees_each_kind_of_damage(solution):
+    """Controls: a trajectory damaged in one respect fails in that respect."""
+    assert solution.audit().passed
+
+    def failing(**changes):
+        audit = dataclasses.replace(solution, **changes).audit()
+        assert not audit.passed
+        return [row.law for row in audit.rows if row.passed is False]
+
+    energy, entropy = solution.energy.copy(), solution.entropy.copy()
+    energy[7] *= 1 + 1e-12
+    assert failing(energy=energy) == ["energy drift"]
+    entropy[7] -= 1e-3
+    assert failing(entropy=entropy) == ["least entropy increment"]
+    assert failing(stats=dataclasses.replace(solution.stats, worst_residual=1e-6)) == ["stage residual"]
+    assert failing(stats=dataclasses.replace(solution.stats, least_entropy_increment=-1.0)) == ["least entropy increment"]
+    laws = dataclasses.replace(solution.laws, conserved=tuple(solution.casimirs))
+    assert failing(laws=laws)[0].startswith("drift of mu1**2")
+
+
+def test_audit_tolerances_are_the_users(solution):
+    assert not solution.audit(energy=0.0, residual=0.0).passed
+    with pytest.raises(lt.InputError, match=">= 0"):
+        solution.audit(energy=-1.0)
+    with pytest.raises(TypeError):
+        solution.audit(enthalpy=1.0)
+
+
+def test_zero_energy_is_measured_absolutely():
+    solution = lt.integrate(lt.models.rigid_body(), [0.0, 0.0, 0.0], (0.0, 1.0), 0.1)
+    assert solution.audit().passed
+    assert solution.audit().energy_drift == 0.0
+
+
+# -- imports --------------------------------------------------------------------------------------------------------------
+
+
+def test_import_is_light():
+    """What is not needed to integrate is not imported; the time itself is measured in benchmarks, not here."""
+    script = "import sys, liethermo; print([m for m in ('geomstats', 'matplotlib', 'xarray', 'pandas', 'rich') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_double_precision_is_on():
+    import jax.numpy as jnp
+
+    assert jnp.zeros(()).dtype == np.float64

@@ -1,0 +1,217 @@
+"""Systems: the Euler-Poincaré side, the axioms' report, and input that is refused."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.cases import energy_of, state_of
+
+SPHERE = lt.Quadratic(np.ones(3))
+
+
+# -- Euler-Poincaré ---------------------------------------------------------------------------------------------------
+
+
+def quartic(xi):
+    return 0.5 * jnp.sum(jnp.array([3.0, 2.0, 1.0]) * xi**2) + 0.1 * jnp.sum(xi**4)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_legendre_transform(seed):
+    """mu = dl/dxi and xi = dH/dmu are inverse; H(mu) = <mu, xi> - l(xi); grad H and its Hessian are consistent."""
+    system = _QUARTIC
+    xi = 2.0 * np.random.default_rng(seed).standard_normal(3)
+    mu = system.momentum(xi)
+    assert np.allclose(system.velocity(mu), xi, rtol=0, atol=1e-12)
+    assert float(system.energy(mu)) == pytest.approx(float(mu @ xi - quartic(xi)), rel=1e-13)
+    assert np.allclose(jax.grad(system.energy.value)(mu), xi, rtol=0, atol=1e-12)
+    hessian = jax.hessian(system.energy.value)(mu)
+    assert np.allclose(hessian @ jax.hessian(quartic)(xi), np.eye(3), rtol=0, atol=1e-11)
+
+
+_QUARTIC = lt.EulerPoincareSystem(mf.so(3), quartic, entropy=SPHERE, dissipation=lt.KillingDissipation(0.5))
+
+
+def test_quadratic_lagrangians_are_transformed_in_closed_form():
+    A = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.0], [0.0, 0.0, 0.5]])
+    b = np.array([0.1, -0.2, 0.3])
+    closed = lt.EulerPoincareSystem(mf.so(3), lt.Quadratic(A, b, 0.7), entropy=SPHERE)
+    general = lt.EulerPoincareSystem(mf.so(3), lambda xi: 0.5 * xi @ A @ xi + b @ xi + 0.7, entropy=SPHERE)
+    x = np.array([0.4, -1.2, 0.8])
+    assert isinstance(closed.energy, lt.Quadratic)
+    assert float(closed.energy(x)) == pytest.approx(float(general.energy(x)), abs=1e-13)
+    assert np.allclose(closed.vector_field(x), general.vector_field(x), rtol=0, atol=1e-13)
+    diagonal = lt.EulerPoincareSystem(mf.so(3), lt.Quadratic([2.0, 1.0, 0.5]))
+    assert np.allclose(diagonal.velocity([2.0, 1.0, 0.5]), 1.0)
+
+
+def test_an_euler_poincare_run_obeys_the_laws():
+    solution = lt.integrate(_QUARTIC, [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    assert solution.entropy[-1] > 1.05 * solution.entropy[0]
+
+
+def test_a_force_keeps_the_energy_whatever_it_is():
+    """BFM (3.2): any F; its entropy law is not promised, and the report shows the sign of the production."""
+    system = lt.EulerPoincareSystem(
+        mf.so(3), quartic, entropy=SPHERE, force=lambda xi: jnp.array([xi[1] ** 2, jnp.sin(xi[0]), xi[2]])
+    )
+    assert system.entropy_law is None
+    assert "min dS/dt" in str(system.check())
+    solution = lt.integrate(system, [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
+    assert solution.audit().passed
+    assert solution.stats.least_entropy_increment < 0  # nothing was promised
+
+
+@pytest.mark.parametrize(
+    "lagrangian", [lt.Quadratic([1.0, 0.0, 2.0]), lt.Quadratic(np.ones((3, 3))), lambda xi: xi[0] ** 2 + xi[1] ** 2]
+)
+def test_singular_lagrangians_are_refused(lagrangian):
+    with pytest.raises(lt.InputError, match="singular"):
+        lt.EulerPoincareSystem(mf.so(3), lagrangian)
+
+
+# -- metriplectic systems on R^n ------------------------------------------------------------------------------------------
+
+
+def test_a_system_on_rn_with_a_user_poisson_tensor():
+    """The damped oscillator with a heat bath: (q, p, S), H = p^2/2 + q^2/2 + T0 S, friction by a K(x)."""
+
+    def K(x):
+        v = jnp.array([0.0, 1.0, -x[1]])  # orthogonal to grad H = (q, p, 1)
+        return 0.3 * jnp.outer(v, v)
+
+    tensor = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    system = lt.MetriplecticSystem(
+        lambda x: jnp.asarray(tensor),
+        energy=lambda x: 0.5 * (x[0] ** 2 + x[1] ** 2) + x[2],
+        entropy=lambda x: x[2],
+        dissipation=lt.FrictionOperator(K),
+        dim=3,
+    )
+    assert system.check().passed
+    x = np.array([0.4, 0.7, 0.1])
+    assert np.allclose(system.vector_field(x), [0.7, -0.4 - 0.3 * 0.7, 0.3 * 0.7**2])
+    solution = lt.integrate(system, x, (0.0, 30.0), 0.1)
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    assert np.abs(solution.x[-1, :2]).max() < 0.05
+
+
+def test_canonical_structure():
+    system = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 - jnp.cos(x[0]))
+    solution = lt.integrate(system, [1.0, 0.0], (0.0, 50.0), 0.1)
+    assert solution.audit().passed
+    assert solution.entropy is None
+    assert system.entropy_law is None
+
+
+def test_batches_of_states():
+    system, x = lt.models.rigid_body(), np.random.default_rng(0).standard_normal((4, 2, 3))
+    assert system.energy(x).shape == (4, 2)
+    assert system.vector_field(x).shape == (4, 2, 3)
+    assert np.allclose(system.vector_field(x)[1, 1], system.vector_field(x[1, 1]), atol=1e-15)
+    assert (system.entropy_production(x) >= 0).all()
+
+
+def test_systems_are_pytrees_of_their_parameters():
+    """Rates and inertias can be mapped over and differentiated."""
+
+    def field(rate):
+        return lt.models.rigid_body(rate=rate).vector_field(jnp.array([0.3, 1.0, -0.2]))
+
+    rates = jnp.array([0.0, 1.0, 2.0])
+    swept = jax.vmap(field)(rates)
+    assert np.allclose(swept[2] - swept[1], swept[1] - swept[0], atol=1e-15)
+    assert np.allclose(jax.jacfwd(field)(1.0), swept[1] - swept[0], atol=1e-15)
+
+    class Stretched(eqx.Module):
+        stiffness: jax.Array
+
+        def __call__(self, mu):
+            return 0.5 * self.stiffness * jnp.sum(mu**4)
+
+    system = lt.LiePoissonSystem(mf.so(3), Stretched(jnp.asarray(2.0)), SPHERE)
+    assert any(leaf.shape == () and leaf == 2.0 for leaf in jax.tree_util.tree_leaves(system))
+
+
+# -- refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_entropy_that_is_no_casimir():
+    with pytest.raises(lt.CasimirError, match=r"not a Casimir.*g\.casimirs") as caught:
+        lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lambda mu: mu[0] ** 2, lt.KillingDissipation())
+    assert caught.value.residual > 0.1
+    built = lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lambda mu: mu[0] ** 2, lt.KillingDissipation(), validate=False)
+    assert [row.axiom for row in built.check().rows if row.passed is False][0] == "Pi grad S = 0"
+
+
+def test_a_poisson_tensor_that_is_none():
+    with pytest.raises(lt.AxiomError, match="Pi skew fails"):
+        lt.MetriplecticSystem(lambda x: jnp.eye(2), energy=lambda x: x @ x, dim=2)
+    with pytest.raises(lt.AxiomError, match="Jacobi fails"):
+        lt.MetriplecticSystem(
+            lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), lambda x: x @ x, dim=3
+        )
+
+
+def test_a_momentum_map_that_is_not_conserved():
+    with pytest.raises(lt.AxiomError, match="momentum map J"):
+        lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), SPHERE, momentum_maps={"J": lambda mu: mu[0]})
+
+
+@pytest.mark.parametrize(
+    ("energy", "error", "words"),
+    [
+        (lambda mu: mu, lt.FunctionError, r"one number.*\(3,\).*jnp.sum"),
+        (lambda mu: mu @ mu + 0j, lt.FunctionError, "real number"),
+        (lambda mu: np.sin(float(mu[0])), lt.FunctionError, "jax.numpy"),
+        (lambda mu: mu[0] + undefined, NameError, "undefined"),  # noqa: F821
+        (lambda a, b: a, lt.FunctionError, "could not be evaluated"),
+        (3.0, lt.FunctionError, "lt.Quadratic"),
+        (lt.Quadratic(np.ones(4)), lt.FunctionError, "shape"),
+    ],
+)
+def test_unusable_energies(energy, error, words):
+    with pytest.raises(error, match=words):
+        lt.LiePoissonSystem(mf.so(3), energy)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: lt.LiePoissonSystem("so(3)", SPHERE), "manifolds.LieAlgebra"),
+        (lambda: lt.LiePoissonSystem(mf.so(3), SPHERE, dissipation=lt.ProjectedMetric()), "needs an entropy"),
+        (lambda: lt.LiePoissonSystem(mf.so(3), SPHERE, SPHERE, dissipation=0.5), "Dissipation"),
+        (lambda: lt.MetriplecticSystem(lambda x: jnp.eye(2), lambda x: x @ x), "dim=n"),
+        (lambda: lt.MetriplecticSystem(mf.Canonical(1), lambda x: x @ x, dim=3), "dim is 3"),
+        (lambda: lt.Quadratic([[0.0, 1.0], [0.0, 0.0]]), "not symmetric"),
+        (lambda: lt.Quadratic(np.ones((2, 3))), r"\(n, n\)"),
+        (lambda: lt.Quadratic(np.ones(2), np.ones(3)), "b has shape"),
+        (lambda: lt.models.rigid_body(inertia=(1.0, 2.0)), "three numbers"),
+        (lambda: lt.models.rigid_body(inertia=(1.0, -2.0, 1.0)), "positive"),
+        (lambda: lt.models.rigid_body(rate=-1.0), "not -1.0"),
+    ],
+)
+def test_unusable_arguments(make, words):
+    with pytest.raises(lt.InputError, match=words):
+        make()
+
+
+def test_functions_outside_their_domain_everywhere():
+    with pytest.raises(lt.InputError, match=r"check\(points"):
+        lt.LiePoissonSystem(mf.so(3), lambda mu: jnp.log(-jnp.dot(mu, mu)), SPHERE)
+
+
+def test_the_report_counts_points_outside_the_domain():
+    system = lt.LiePoissonSystem(mf.so(3), lambda mu: jnp.sqrt(mu[0]), SPHERE)
+    report = system.check(samples=32)
+    assert report.passed
+    assert 0 < report.points < 32
+    assert "outside the domain" in str(report)
+    assert system.check(points=state_of(mf.so(3), 0) ** 2 + 0.1).points == 1

@@ -1,0 +1,323 @@
+"""Lie algebras: every registered one through the same properties, and controls that must fail."""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import manifolds as mf
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.cases import ALGEBRAS, algebra_id, tolerance
+
+seeds = st.integers(0, 10**6)
+each_algebra = pytest.mark.parametrize("g", ALGEBRAS, ids=algebra_id)
+
+
+def vectors(g, seed, count, shape=()):
+    return np.random.default_rng(seed).standard_normal((count, *shape, g.dim))
+
+
+def close(a, b, scale=1.0):
+    return np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0) <= tolerance("axiom") * scale
+
+
+# -- axioms and duality -----------------------------------------------------------------------------------------------
+
+
+@each_algebra
+@given(seed=seeds)
+def test_bracket_is_antisymmetric_and_satisfies_jacobi(g, seed):
+    x, y, z = vectors(g, seed, 3)
+    b = g.bracket
+    assert close(b(x, y), -b(y, x))
+    assert close(b(b(x, y), z) + b(b(y, z), x) + b(b(z, x), y), 0.0, 100.0)
+
+
+@each_algebra
+@given(seed=seeds)
+def test_ad_star_is_dual_to_ad(g, seed):
+    x, y, mu = vectors(g, seed, 3)
+    assert close(g.ad(x) @ y, g.bracket(x, y), 10.0)
+    assert close(jnp.dot(g.ad_star(x, mu), y), jnp.dot(mu, g.bracket(x, y)), 100.0)
+    assert close(g.ad(g.bracket(x, y)), g.ad(x) @ g.ad(y) - g.ad(y) @ g.ad(x), 100.0)
+
+
+@each_algebra
+def test_flipped_ad_star_breaks_duality(g):
+    """Control: with the other sign convention the duality test must fail, unless nothing brackets at all."""
+    x, y, mu = vectors(g, 1, 3)
+    wrong = jnp.dot(-g.ad_star(x, mu), y) - jnp.dot(mu, g.bracket(x, y))
+    assert g.is_abelian() or abs(float(wrong)) > 1e-6
+
+
+@each_algebra
+@given(seed=seeds)
+def test_killing_form_is_invariant(g, seed):
+    """kappa(x, [y, z]) is totally skew (BFM Remark 3.3)."""
+    kappa = g.killing_form()
+    x, y, z = vectors(g, seed, 3)
+
+    def form(a, b, c):
+        return float(a @ kappa @ np.asarray(g.bracket(b, c)))
+
+    scale = 100.0 * max(1.0, np.abs(kappa).max())
+    assert close(form(x, y, z), form(y, z, x), scale)
+    assert close(form(x, y, z), -form(y, x, z), scale)
+    assert np.allclose(kappa, [[np.trace(np.asarray(g.ad(a) @ g.ad(b))) for b in np.eye(g.dim)] for a in np.eye(g.dim)])
+
+
+@each_algebra
+def test_batches_equal_loops(g):
+    x, y = vectors(g, 2, 2, (4, 3))
+    for operation in (g.bracket, g.ad_star):
+        batched = np.asarray(operation(x, y))
+        assert batched.shape == (4, 3, g.dim)
+        assert close(batched[2, 1], operation(x[2, 1], y[2, 1]), 10.0)
+    assert g.ad(x).shape == (4, 3, g.dim, g.dim)
+    assert close(g.bracket(x, y[0, 0])[1, 2], g.bracket(x[1, 2], y[0, 0]), 10.0)
+    mapped = jax.jit(jax.vmap(jax.vmap(g.bracket)))(x, y)
+    assert close(mapped, g.bracket(x, y), 10.0)
+
+
+@each_algebra
+@given(seed=seeds)
+def test_matrices_represent_the_bracket(g, seed):
+    if g.basis is None:  # only where no faithful matrices are at hand
+        pytest.fail(f"{g.name} has no matrices")
+    x, y = vectors(g, seed, 2)
+    X, Y = g.hat(x), g.hat(y)
+    assert close(g.hat(g.bracket(x, y)), X @ Y - Y @ X, 100.0)
+    assert close(g.vee(X), x, 10.0)
+
+
+# -- structure ----------------------------------------------------------------------------------------------------------
+
+STRUCTURE = {
+    # name: (semisimple, compact type, solvable, nilpotent, unimodular), from the literature
+    "so(3)": (1, 1, 0, 0, 1),
+    "so(4)": (1, 1, 0, 0, 1),
+    "so(5)": (1, 1, 0, 0, 1),
+    "so(2)": (0, 0, 1, 1, 1),
+    "so(2,1)": (1, 0, 0, 0, 1),
+    "so(3,1)": (1, 0, 0, 0, 1),
+    "su(2)": (1, 1, 0, 0, 1),
+    "su(3)": (1, 1, 0, 0, 1),
+    "su(4)": (1, 1, 0, 0, 1),
+    "sl(2)": (1, 0, 0, 0, 1),
+    "sl(3)": (1, 0, 0, 0, 1),
+    "sp(1)": (1, 0, 0, 0, 1),
+    "sp(2)": (1, 0, 0, 0, 1),
+    "gl(1)": (0, 0, 1, 1, 1),
+    "gl(2)": (0, 0, 0, 0, 1),
+    "se(2)": (0, 0, 1, 0, 1),
+    "se(3)": (0, 0, 0, 0, 1),
+    "heisenberg(1)": (0, 0, 1, 1, 1),
+    "heisenberg(2)": (0, 0, 1, 1, 1),
+    "galilei(2)": (0, 0, 1, 0, 1),
+    "galilei(3)": (0, 0, 0, 0, 1),
+    "aff(1)": (0, 0, 1, 0, 0),
+    "aff(2)": (0, 0, 0, 0, 0),
+    "abelian(1)": (0, 0, 1, 1, 1),
+    "abelian(3)": (0, 0, 1, 1, 1),
+    "bianchi('I')": (0, 0, 1, 1, 1),
+    "bianchi('II')": (0, 0, 1, 1, 1),
+    "bianchi('III')": (0, 0, 1, 0, 0),
+    "bianchi('IV')": (0, 0, 1, 0, 0),
+    "bianchi('V')": (0, 0, 1, 0, 0),
+    "bianchi('VI', h=0)": (0, 0, 1, 0, 1),
+    "bianchi('VI', h=-0.25)": (0, 0, 1, 0, 0),
+    "bianchi('VI', h=-0.5)": (0, 0, 1, 0, 0),
+    "bianchi('VII', h=0)": (0, 0, 1, 0, 1),
+    "bianchi('VII', h=1)": (0, 0, 1, 0, 0),
+    "bianchi('VII', h=0.3)": (0, 0, 1, 0, 0),
+    "bianchi('VIII')": (1, 0, 0, 0, 1),
+    "bianchi('IX')": (1, 1, 0, 0, 1),
+    "so(3) + heisenberg(1)": (0, 0, 0, 0, 1),
+    "sl(2) x R^2": (0, 0, 0, 0, 1),
+}
+
+
+@each_algebra
+def test_structural_predicates(g):
+    found = (g.is_semisimple(), g.is_compact_type(), g.is_solvable(), g.is_nilpotent(), g.is_unimodular())
+    assert found == tuple(map(bool, STRUCTURE[g.name]))
+
+
+@each_algebra
+def test_cartan_involution(g):
+    """theta is an involutive automorphism and -kappa(x, theta y) is positive definite; none without semisimplicity."""
+    if not g.is_semisimple():
+        with pytest.raises(mf.LieAlgebraError, match="not semisimple"):
+            g.cartan_involution()
+        return
+    theta = g.cartan_involution()
+    x, y = vectors(g, 5, 2)
+    assert close(theta @ theta, np.eye(g.dim), 10.0)
+    assert close(theta @ np.asarray(g.bracket(x, y)), g.bracket(theta @ x, theta @ y), 100.0)
+    assert np.linalg.eigvalsh(-g.killing_form() @ theta).min() > 0.1
+
+
+@pytest.mark.parametrize("g", [mf.sl(2), mf.sl(3), mf.sp(2), mf.so(3, 1), mf.direct_sum(mf.so(3), mf.sl(2))], ids=algebra_id)
+@given(seed=seeds)
+def test_cartan_involution_without_matrices_in_a_skew_basis(g, seed):
+    """The construction from constants alone does not depend on a lucky basis."""
+    change = np.eye(g.dim) + 0.3 * np.random.default_rng(seed).standard_normal((g.dim, g.dim))
+    constants = np.einsum("ai,bj,abc,kc->ijk", change, change, g.structure_constants, np.linalg.inv(change))
+    skew = mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2)
+    theta = skew.cartan_involution()
+    form = -skew.killing_form() @ theta
+    assert np.abs(theta @ theta - np.eye(g.dim)).max() < 1e-8
+    assert np.linalg.eigvalsh((form + form.T) / 2).min() > 0
+
+
+def test_conventions():
+    """The signs and orders that other code relies on."""
+    assert np.array_equal(mf.so(3).bracket([1, 0, 0], [0, 1, 0]), [0, 0, 1])
+    assert np.array_equal(mf.su(2).structure_constants, mf.so(3).structure_constants)
+    x, mu = np.array([0.3, -0.2, 0.9]), np.array([0.1, 0.7, -0.4])
+    assert close(mf.so(3).ad_star(x, mu), np.cross(mu, x))
+    assert close(mf.so(3).hat(x) @ mu, np.cross(x, mu))
+    assert np.array_equal(mf.so(3).killing_form(), -2 * np.eye(3))
+    rotation, translation = np.eye(6)[0], np.eye(6)[4]
+    assert np.array_equal(mf.se(3).bracket(rotation, translation), np.eye(6)[5])
+    assert np.array_equal(mf.gl(2).basis[1], [[0, 1], [0, 0]])
+    assert mf.sp(2).dim == 10
+    f = mf.su(3).structure_constants
+    assert f[3, 4, 7] == pytest.approx(np.sqrt(3) / 2)
+    assert f[0, 1, 2] == 1.0
+    assert f[0, 3, 6] == pytest.approx(0.5)
+    assert np.array_equal(mf.bianchi("III").structure_constants, mf.bianchi("VI", h=-1).structure_constants)
+    assert np.array_equal(mf.bianchi("IX").structure_constants, mf.so(3).structure_constants)
+
+
+def test_sums():
+    g = mf.direct_sum(mf.so(3), mf.sl(2))
+    assert g.dim == 6
+    assert close(g.bracket(np.eye(6)[0], np.eye(6)[4]), 0.0)
+    assert close(g.bracket(np.eye(6)[3], np.eye(6)[4])[3:], mf.sl(2).bracket([1, 0, 0], [0, 1, 0]))
+    motions = mf.semidirect_sum(mf.so(3), mf.so(3).hat)
+    assert motions == mf.se(3)
+    assert hash(motions) == hash(mf.se(3))
+    assert mf.semidirect_sum(mf.so(3), np.zeros((3, 2, 2))).basis is not None  # not faithful: the matrices of g help out
+    with pytest.raises(mf.RepresentationError, match=r"rho\(e1\), rho\(e2\)"):
+        mf.semidirect_sum(mf.so(3), 2 * np.asarray(mf.so(3).basis))
+    with pytest.raises(mf.ShapeError):
+        mf.semidirect_sum(mf.so(3), np.zeros((2, 2, 2)))
+
+
+# -- what is refused ------------------------------------------------------------------------------------------------------
+
+
+def broken(change):
+    """The constants of se(3), a good control for Jacobi (on so(3) almost anything passes), with one of them changed."""
+    constants = mf.se(3).structure_constants.astype(int).astype(object)
+    change(constants)
+    return constants
+
+
+def test_jacobi_failure_names_the_triple():
+    def change(C):
+        C[0, 1, 2], C[1, 0, 2] = 2, -2
+
+    with pytest.raises(mf.JacobiError, match=r"\(e1, e2, e4\).*checked exactly") as caught:
+        mf.LieAlgebra.from_structure_constants(broken(change))
+    assert caught.value.indices == (0, 1, 3)
+    assert caught.value.residual == 1.0
+    assert isinstance(caught.value, ValueError)
+
+
+def test_jacobi_is_exact_for_fractions():
+    """A defect of 1e-14 passes no exact check, though a tolerance would let it through."""
+    tiny = Fraction(1, 10**14)
+
+    def change(C):
+        C[0, 1, 2] += tiny
+        C[1, 0, 2] -= tiny
+
+    with pytest.raises(mf.JacobiError):
+        mf.LieAlgebra.from_structure_constants(broken(change))
+    thirds = mf.se(3).structure_constants.astype(int).astype(object) * Fraction(1, 3)
+    assert mf.LieAlgebra.from_structure_constants(thirds).rational_constants.denominator == 3
+
+
+def test_antisymmetry_failure_names_the_pair():
+    constants = np.zeros((2, 2, 2))
+    constants[0, 1, 1] = 1.0
+    with pytest.raises(mf.AntisymmetryError, match=r"\[e1, e2\]"):
+        mf.LieAlgebra.from_structure_constants(constants)
+
+
+@pytest.mark.parametrize(
+    ("constants", "error"),
+    [
+        (np.zeros((2, 3, 2)), mf.ShapeError),
+        (np.zeros((0, 0, 0)), mf.ShapeError),
+        (1j * mf.so(3).structure_constants, mf.ComponentError),
+        (np.full((2, 2, 2), np.nan), mf.ComponentError),
+        ([[["a"]]], mf.ComponentError),
+        ([[[1, 2], [3]]], mf.ComponentError),
+    ],
+)
+def test_unusable_constants(constants, error):
+    with pytest.raises(error):
+        mf.LieAlgebra.from_structure_constants(constants)
+
+
+def test_matrices_that_are_no_basis():
+    E = np.asarray(mf.sl(2).basis)
+    with pytest.raises(mf.ClosureError, match=r"\[e1, e2\] leaves the span"):
+        mf.LieAlgebra.from_matrices(E[1:])
+    with pytest.raises(mf.ClosureError, match="linearly dependent"):
+        mf.LieAlgebra.from_matrices([E[0], E[1], E[2], E[0] + E[1]])
+    with pytest.raises(mf.ShapeError):
+        mf.LieAlgebra.from_matrices(np.zeros((2, 3)))
+    # i times a real form is independent over the reals: sl(2, C) as a real algebra
+    assert mf.LieAlgebra.from_matrices(np.concatenate([E, 1j * E])).dim == 6
+
+
+def test_arguments_are_checked():
+    g = mf.so(3)
+    with pytest.raises(mf.ShapeError, match="last axis 3"):
+        g.bracket([1, 2], [1, 2, 3])
+    with pytest.raises(mf.ComponentError, match="real"):
+        g.ad(np.ones(3) * 1j)
+    with pytest.raises(mf.LieAlgebraError, match="not in so"):
+        g.vee(np.eye(3))
+    with pytest.raises(mf.LieAlgebraError, match="from_matrices"):
+        mf.LieAlgebra.from_structure_constants(g.structure_constants).hat([1, 2, 3])
+    with pytest.raises(ValueError, match="read-only"):
+        g.structure_constants[0, 0, 0] = 1.0
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: mf.so(1),
+        lambda: mf.su(1),
+        lambda: mf.sl(True),
+        lambda: mf.sp(1.5),
+        lambda: mf.bianchi("X"),
+        lambda: mf.bianchi("VI"),
+        lambda: mf.bianchi("V", h=1.0),
+        lambda: mf.bianchi("VI", h=0.5),
+        lambda: mf.bianchi("VII", h=-0.5),
+    ],
+)
+def test_catalogue_parameters(call):
+    with pytest.raises(mf.ParameterError):
+        call()
+
+
+@given(seed=seeds)
+def test_random_rational_algebras_keep_their_identity(seed):
+    """A rational change of basis gives an algebra that is found rational again and passes the exact check."""
+    rng = np.random.default_rng(seed)
+    g = mf.se(2)
+    upper = np.triu(rng.integers(-3, 4, (3, 3)), 1) + np.eye(3, dtype=int)
+    inverse = np.round(np.linalg.inv(upper)).astype(int)
+    C = np.einsum("ia,jb,abc,ck->ijk", upper, upper, g.structure_constants.astype(int), inverse)
+    assert mf.LieAlgebra.from_structure_constants(C).rational_constants is not None
+    assert mf.LieAlgebra.from_structure_constants(C.astype(float)).rational_constants is not None

@@ -1,0 +1,65 @@
+"""Poisson structures: the axioms, on Lie algebras and on R^2n, and controls that must fail."""
+
+import jax.numpy as jnp
+import manifolds as mf
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.cases import ALGEBRAS, algebra_id, tolerance
+
+seeds = st.integers(0, 10**6)
+STRUCTURES = [mf.LiePoisson(g) for g in ALGEBRAS] + [mf.Canonical(1), mf.Canonical(3)]
+each_structure = pytest.mark.parametrize("P", STRUCTURES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
+
+
+def functions(n, seed):
+    a, b, c = np.random.default_rng(seed).standard_normal((3, n)) / np.sqrt(n)
+    return (lambda x: jnp.sin(a @ x)), (lambda x: (b @ x) ** 2), (lambda x: jnp.exp(c @ x / 2))
+
+
+@each_structure
+@given(seed=seeds)
+def test_axioms(P, seed):
+    x = np.random.default_rng(seed).standard_normal(P.dim)
+    f, g, h = functions(P.dim, seed)
+    tensor = np.asarray(P.tensor(x))
+    assert np.array_equal(tensor, -tensor.T)
+    assert float(P.jacobi_residual(x)) <= tolerance("axiom") * 10
+    assert np.allclose(P.sharp(x, h_ := np.ones(P.dim)), tensor @ h_, atol=1e-13)
+    fg = P.bracket(f, g)
+    assert float(fg(x)) == pytest.approx(-float(P.bracket(g, f)(x)), abs=1e-12)
+    leibniz = P.bracket(lambda y: f(y) * g(y), h)(x)
+    assert float(leibniz) == pytest.approx(float(f(x) * P.bracket(g, h)(x) + g(x) * P.bracket(f, h)(x)), abs=1e-12)
+
+
+@pytest.mark.parametrize("P", [mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.sl(3)), mf.Canonical(2)], ids=["se3", "sl3", "T*R2"])
+def test_jacobi_identity_of_the_bracket(P):
+    x = np.random.default_rng(0).standard_normal(P.dim)
+    f, g, h = functions(P.dim, 0)
+    cyclic = sum(P.bracket(P.bracket(a, b), c)(x) for a, b, c in [(f, g, h), (g, h, f), (h, f, g)])
+    assert abs(float(cyclic)) < 1e-12
+
+
+def test_hamiltonian_fields():
+    H = lambda x: 0.5 * x[1] ** 2 + jnp.cos(x[0])  # noqa: E731
+    assert np.allclose(mf.Canonical(1).hamiltonian_vector_field(H)([0.3, 0.7]), [0.7, np.sin(0.3)])
+    P, Omega = np.array([0.1, 0.7, -0.3]), np.array([2.0, 1.0, 0.5])
+    field = mf.LiePoisson(mf.so(3)).hamiltonian_vector_field(lambda m: 0.5 * jnp.sum(Omega * m * m))
+    assert np.allclose(field(P), np.cross(P, Omega * P))
+    assert mf.LiePoisson(mf.so(3)).rank(P) == 2
+
+
+def test_a_tensor_of_ones_own():
+    P = mf.PoissonTensor(lambda x: jnp.array([[0.0, x[0]], [-x[0], 0.0]]), dim=2)  # in two dimensions any tensor is one
+    assert float(P.jacobi_residual([0.4, 0.2])) == 0.0
+    # {x1, x2} = x2, {x2, x3} = 1: v . curl v = 1 for the vector v of the tensor, so Jacobi fails
+    not_poisson = mf.PoissonTensor(
+        lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), dim=3
+    )
+    assert float(not_poisson.jacobi_residual([0.4, 0.2, 1.0])) > 0.1
+    with pytest.raises(mf.ShapeError):
+        mf.PoissonTensor(np.zeros((2, 3)))
+    with pytest.raises(mf.ParameterError):
+        mf.Canonical(0)
