@@ -36,10 +36,10 @@ from .errors import (
     SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .timeloop import integrate
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
+from .timeloop import integrate
 
 __all__ = [
     "Audit",

@@ -86,7 +86,9 @@ class Audit:
         lines = [f"{'law':<{width}}  {'measured':>10}  {'allowed':>9}"]
         for row in self.rows:
             allowed = " " * 9 if row.tolerance is None else f"{row.tolerance:9.1e}"
-            lines.append(f"{row.law:<{width}}  {row.value:10.2e}  {allowed}  {verdict[row.passed]:<5} {row.note}".rstrip())
+            lines.append(
+                f"{row.law:<{width}}  {row.value:10.2e}  {allowed}  {verdict[row.passed]:<5} {row.note}".rstrip()
+            )
         lines.append("the laws hold" if self.passed else "A LAW FAILS")
         return "\n".join(lines)
 
@@ -130,7 +132,9 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
     status = solution.status  # a run stopped by its user is short, but breaks no law
     failed = not status.ok and status.code != "interrupted"
-    rows.append(AuditRow("steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else status.code))
+    rows.append(
+        AuditRow("steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else status.code)
+    )
     return Audit(drift, least, casimir_drift, stats.worst_residual, tuple(rows))
 
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifolds as mf
 import numpy as np
+
+import manifolds as mf
 
 from .energy import Energy, as_energy
 from .errors import IndefiniteError, InputError
@@ -144,7 +145,7 @@ class InnerProductDissipation(Dissipation):
 
 
 class KillingDissipation(Dissipation):
-    """Dissipation by the Killing form kappa, made positive: an :class:`InnerProductDissipation` with 𝒦 of the algebra's own.
+    """Dissipation by the Killing form kappa, made positive: :class:`InnerProductDissipation` with the algebra's own 𝒦.
 
     ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
     noncompact semisimple algebras, and ``-rate * kappa`` again wherever that is at least semidefinite (se(3)). On so(3)
@@ -178,8 +179,8 @@ class KillingDissipation(Dissipation):
         if lowest < -tolerance:
             raise IndefiniteError(
                 f"{g.name} is not semisimple and minus its Killing form is indefinite (lowest eigenvalue "
-                f"{lowest:.3g}), so it cannot measure dissipation: entropy would fall along some motions. Give an inner "
-                "product of your own with InnerProductDissipation(K), or use ProjectedMetric(), which needs none",
+                f"{lowest:.3g}), so it cannot measure dissipation: entropy would fall along some motions. Give "
+                "an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which needs none",
                 residual=lowest,
                 tolerance=tolerance,
             )
@@ -188,10 +189,10 @@ class KillingDissipation(Dissipation):
     def prepared(self, system):
         g = _need_algebra(system, "KillingDissipation")
         form = self.inner_product(g)
-        if not np.abs(form).max() > 0.0:
+        if not np.abs(g.structure_constants @ form).max() > 1e-12 * max(1.0, np.abs(form).max()):
             raise InputError(
-                f"the Killing form of {g.name} vanishes, so KillingDissipation would do nothing; use "
-                "ProjectedMetric() or InnerProductDissipation(K)"
+                f"the Killing form of {g.name} vanishes on brackets, as on every solvable algebra, so "
+                "KillingDissipation would do nothing; use ProjectedMetric() or InnerProductDissipation(K)"
             )
         return KillingDissipation(self.rate, jnp.asarray(form))
 
@@ -203,10 +204,10 @@ class KillingDissipation(Dissipation):
 class ProjectedMetric(Dissipation):
     """Dissipation by a cometric G, projected off what it has to conserve [BFM 2.2, Remark 2.1].
 
-    ``K(alpha, beta) = det(C) G(P alpha, P beta)``, P the G-orthogonal projector off the span of dH and the gradients dL_a
-    of ``preserve``, and ``C_ab = G(dL_a, dL_b)`` with L_1 = H. For the energy alone ``det(C) = G(dH, dH)`` and this is
-    BFM (2.2), ``G(dH, dH) G(alpha, beta) - G(dH, alpha) G(dH, beta)``. With ``normalized=True`` the factor det(C) is left
-    out (Remark 2.1).
+    ``K(alpha, beta) = det(C) G(P alpha, P beta)``, P the G-orthogonal projector off the span of dH and the
+    gradients dL_a of ``preserve``, and ``C_ab = G(dL_a, dL_b)`` with L_1 = H. For the energy alone
+    ``det(C) = G(dH, dH)`` and this is BFM (2.2), ``G(dH, dH) G(alpha, beta) - G(dH, alpha) G(dH, beta)``. With
+    ``normalized=True`` the factor det(C) is left out (Remark 2.1).
 
     Parameters
     ----------
@@ -306,9 +307,9 @@ class FrictionOperator(Dissipation):
 class FourBracket(Dissipation):
     """Metriplectic 4-bracket dissipation ``(F, G) = (F, H; G, H)`` [Morrison & Updike 2024].
 
-    The 4-bracket ``(F, K; G, N) = R^{ijkl} F_i K_j G_k N_l`` has the symmetries of a curvature tensor, so H is conserved
-    whatever R is. Two families have constructors of their own: :meth:`kulkarni_nomizu`, which contains (BFM 2.2), and
-    :meth:`lie_algebra`, which is (BFM 3.7).
+    The 4-bracket ``(F, K; G, N) = R^{ijkl} F_i K_j G_k N_l`` has the symmetries of a curvature tensor, so H is
+    conserved whatever R is. Two families have constructors of their own: :meth:`kulkarni_nomizu`, which contains
+    (BFM 2.2), and :meth:`lie_algebra`, which is (BFM 3.7).
 
     Parameters
     ----------
@@ -379,10 +380,11 @@ class KulkarniNomizu(Dissipation):
 
 
 class DoubleBracket(Dissipation):
-    """Double-bracket dissipation: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
+    """Double bracket: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
 
-    ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯`` on a Lie
-    algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir and is conserved.
+    ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
+    on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir
+    and is conserved.
 
     Parameters
     ----------
@@ -422,7 +424,7 @@ class DoubleBracket(Dissipation):
 
 
 class EulerPoincareForce(Dissipation):
-    """Any force of the form ``ad*_xi F(xi)`` [BFM 3.2, 3.4]: ``mu' = ad*_xi (mu + F(xi))`` conserves the energy for every F.
+    """A force ``ad*_xi F(xi)`` [BFM 3.2, 3.4]: ``mu' = ad*_xi (mu + F(xi))`` conserves the energy for every F.
 
     The entropy law is not guaranteed; ``system.check()`` reports the sign of the entropy production at random points.
 

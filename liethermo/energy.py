@@ -12,6 +12,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+
 import manifolds as mf
 
 from .errors import FunctionError, InputError
@@ -46,7 +48,7 @@ class Energy(eqx.Module):
 
 
 class Quadratic(Energy):
-    """``x . A x / 2 + b . x + c``.
+    """``x @ A @ x / 2 + b @ x + c``.
 
     Parameters
     ----------
@@ -117,12 +119,24 @@ def as_energy(function, role: str) -> Energy:
     if isinstance(function, Energy):
         return function
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
-        origin = jnp.zeros(function.dim)
-        value, gradient = jax.value_and_grad(function)(origin)
-        return Quadratic(jax.hessian(function)(origin), gradient, value)
+        return _quadratic(function)
     if callable(function):
         return Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
+
+
+def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
+    A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
+    for power, coefficient in polynomial.terms:
+        factors = np.repeat(np.arange(polynomial.dim), power)
+        if len(factors) == 2:
+            A[factors[0], factors[1]] += float(coefficient)
+            A[factors[1], factors[0]] += float(coefficient)
+        elif len(factors) == 1:
+            b[factors[0]] += float(coefficient)
+        else:
+            c += float(coefficient)
+    return Quadratic(A, b if b.any() else None, c)
 
 
 def check_scalar(energy: Energy, dim: int, role: str) -> None:
@@ -136,6 +150,8 @@ def check_scalar(energy: Energy, dim: int, role: str) -> None:
             "It must be written with jax.numpy and accept one array"
         ) from error
     if result.shape != ():
-        raise FunctionError(f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?")
+        raise FunctionError(
+            f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?"
+        )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")

@@ -6,10 +6,10 @@ first *predicted* by Gauss quadrature of the gradient along the segment,
 
     H(x + d) - H(x)  =  int_0^1 grad H(x + t d) . d dt  ~  sum_j w_j grad H(x + c_j d) . d,
 
-whose rounding error is about ``eps |grad H| |d|``: it vanishes with d. Only what the quadrature misses, its *defect*
-(difference minus prediction), needs the difference itself. The defect is let through where it matters and shut out where
-it is rounding noise, by a gate that is continuous, scale free, and closed near d = 0 (:func:`_gate`).
-Quadratic terms have closed forms with no quotient at all.
+whose rounding error is about ``eps |grad H| |d|``: it vanishes with d. Only what the quadrature misses, its
+*defect* (difference minus prediction), needs the difference itself. The defect is let through where it matters and
+shut out where it is rounding noise, by a gate that is continuous, scale free, and closed near d = 0
+(:func:`_gate`). Quadratic terms have closed forms with no quotient at all.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class DiscreteGradient(eqx.Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
     A sum of energies is treated term by term: discrete gradients add. ``low`` is what rounding has kept from x
-    (compensated summation): points along the step are ``x + (low + c d)``, so that a step far below the rounding of x is
-    still seen. Without it the rounding of the midpoint lets the energy drift linearly.
+    (compensated summation): points along the step are ``x + (low + c d)``, so that a step far below the rounding of
+    x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
     """
 
     @property

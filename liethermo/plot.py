@@ -143,7 +143,7 @@ def _quantities(solution: Solution, system: System | None) -> tuple[_Quantity | 
     else:
         energy = _quadric_through(solution.x) if solution.laws.energy == "conserved" else None
         spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")
-        entropy = (lambda x: (x * x).sum(axis=-1) / 2) if spheres else None
+        entropy = (lambda x: (x * x).sum(axis=-1)) if spheres else None
     found = [None if energy is None else _Quantity("energy", energy, solution.energy), None]
     if entropy is not None and solution.entropy is not None:
         found[1] = _Quantity("entropy", entropy, solution.entropy)

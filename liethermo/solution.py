@@ -188,10 +188,12 @@ def load(path: str | os.PathLike) -> Solution:
             dataset.load()
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
         raise FileError(
-            f"{path} cannot be read as NetCDF ({type(error).__name__}: {error}): it is cut short, damaged or of another kind"
+            f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
         ) from error
     if dataset.attrs.get("format") != FORMAT:
-        raise FileError(f"{path} is a NetCDF file, but not a liethermo result (its format is {dataset.attrs.get('format')!r})")
+        raise FileError(
+            f"{path} is a NetCDF file, but not a liethermo result (its format is {dataset.attrs.get('format')!r})"
+        )
     try:
         stored = {name: json.loads(dataset.attrs[name]) for name in ("status", "stats", "laws", "provenance")}
         t, x = dataset["time"].values, dataset["x"].values

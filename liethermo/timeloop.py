@@ -114,7 +114,7 @@ class _Run:
         self.stats = Stats()
         # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
         steps = (span[1] - span[0]) / h
-        self.steps = int(math.floor(steps * (1 + 1e-12)))
+        self.steps = math.floor(steps * (1 + 1e-12))
         self.last = span[1] - (span[0] + self.steps * h)
         if self.last <= 1e-12 * (span[1] - span[0]):
             self.last = 0.0
@@ -168,7 +168,8 @@ class _Run:
         if code == array.NOT_CONVERGED:
             message = (
                 f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
-                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). Try a smaller step, for example {h / 2:g}"
+                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). "
+                f"Try a smaller step, for example {h / 2:g}"
             )
             return Status("not_converged", message, step, now, residual)
         message = (
@@ -263,7 +264,9 @@ class _Run:
 
 def _check(system, t_span, step, save_every, engine, on_failure) -> None:
     if not isinstance(system, System):
-        raise InputError(f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}")
+        raise InputError(
+            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
+        )
     try:
         start, end = (float(t) for t in t_span)
     except (TypeError, ValueError):

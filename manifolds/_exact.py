@@ -13,7 +13,7 @@ import scipy.sparse as sp
 LARGEST_DENOMINATOR = 1000
 
 MACHINE_INTEGERS = 2**28
-"""Numerators below this are kept as int64: sums of a hundred products of two are then exact. Larger ones are Python's."""
+"""Numerators below this are int64: sums of a hundred products of two are then exact. Larger ones are Python's."""
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,8 @@ def row_echelon(rows: np.ndarray, modulus: int = 0, tolerance: float = 0) -> tup
 
     Of integers modulo a prime below 2**31; or, without modulus, of fractions or floats, where ``tolerance`` is zero.
     """
-    rows, pivots = reduced(rows.copy(), modulus), []
+    rows = reduced(rows.copy(), modulus)
+    pivots: list[int] = []
     for column in range(rows.shape[1]):
         rank = len(pivots)
         if rank == len(rows):

@@ -278,7 +278,8 @@ def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
 
 def _odd_primes(n: int) -> set[int]:
     """The primes of odd exponent in n."""
-    odd, p = set(), 2
+    odd: set[int] = set()
+    p = 2
     while n > 1:
         if p * p > n:
             p = n
@@ -290,6 +291,9 @@ def _odd_primes(n: int) -> set[int]:
 
 def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
     """F, given in the basis ``sqrt(r_a) e_a``, in the basis e_a, with leading coefficient 1."""
-    weights = [c * abs(c) * math.prod(r**e for r, e in zip(squares, power, strict=True)) for power, c in F.terms]
+    weights = []
+    for power, c in F.terms:
+        scale: int = math.prod(r**e for r, e in zip(squares, power, strict=True))
+        weights.append(Fraction(c) * abs(Fraction(c)) * scale)
     roots = [math.copysign(math.sqrt(abs(w / weights[0])), w) for w in weights]
     return Polynomial(F.exponents, roots)

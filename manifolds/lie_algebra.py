@@ -162,7 +162,9 @@ class LieAlgebra:
         ShapeError
             If the last axes differ from ``dim``.
         """
-        return jnp.einsum("abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu"))
+        return jnp.einsum(
+            "abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu")
+        )
 
     def killing_form(self) -> np.ndarray:
         """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
@@ -536,7 +538,7 @@ def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
             residual=float(residual),
             tolerance=tolerance,
         )
-    snapped = np.round(theta)
+    snapped = np.asarray(np.round(theta))
     return snapped if np.abs(snapped - theta).max() < 1e-10 else theta
 
 

@@ -104,7 +104,7 @@ class MatrixGroup:
             If g is singular. That g is in the group is taken for granted: see :meth:`belongs`.
         """
         g = self._element(g, "g")
-        inverse = self.inverse_map(g)
+        inverse = _compiled(self.inverse_map, g)
         if (index := _first_failure(inverse, 2)) is not None:
             raise DomainError(f"{self.name}: g{_at(index)} has no inverse: it is singular or not finite")
         return inverse
@@ -118,7 +118,7 @@ class MatrixGroup:
         -------
         array of bool, shape (...)
         """
-        return self.defect(self._element(g, "g")) <= tolerance
+        return _compiled(self.defect, self._element(g, "g")) <= tolerance
 
     def random(self, key_or_seed, size: tuple[int, ...] = (), scale: float = 0.5) -> jax.Array:
         """Random elements ``exp(x)``, the components of x normal with standard deviation ``scale``; not Haar measure.
@@ -148,7 +148,7 @@ class MatrixGroup:
         -------
         array, shape (..., m, m)
         """
-        return _exp(self, self._components(x, "x"))
+        return _compiled(self.exp_map, self.algebra, self._components(x, "x"))
 
     def log(self, g) -> jax.Array:
         """Principal logarithm: the x with ``exp(x) = g`` and eigenvalues of ``hat(x)`` at heights below pi.
@@ -211,11 +211,17 @@ class MatrixGroup:
 
         Raises
         ------
-        LieAlgebraError
+        DomainError
             If ``g hat(x) g^-1`` leaves the algebra, so that g is not in the group (not checked under tracing).
         """
-        g = self._element(g, "g")[..., None, :, :]
-        return self.algebra.vee(g @ self.algebra._known_basis() @ self.inverse_map(g)).swapaxes(-1, -2)
+        matrix, residual = _adjoint_action(self, self._element(g, "g"))
+        index = None if is_traced(residual) else _first(~(np.asarray(residual) <= MEMBERSHIP_TOLERANCE))
+        if index is not None:
+            raise DomainError(
+                f"Ad on {self.name}: g{_at(index)} is not in the group, since g hat(x) g^-1 leaves {self.algebra.name} "
+                f"(relative residual {float(residual[index]):.3g}, tolerance {MEMBERSHIP_TOLERANCE:.0e})"
+            )
+        return matrix
 
     def Ad_star(self, g, mu) -> jax.Array:
         """Coadjoint action, defined by ``<Ad_star(g, mu), x> = <mu, Ad(g) x>``.
@@ -321,13 +327,13 @@ def SL(n: int) -> MatrixGroup:
     return group if n == 2 else replace(group, cayley_map=None)
 
 
-@register((1,), (2,))
+@register((2,))
 def Sp(n: int) -> MatrixGroup:
     """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
     return MatrixGroup(f"Sp({n})", catalogue.sp(n), closed.symplectic_defect, closed.symplectic_inverse)
 
 
-@register((1,), (2,))
+@register((2,))
 def GL(n: int) -> MatrixGroup:
     """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
     return MatrixGroup(f"GL({n})", catalogue.gl(n), closed.invertible_defect)
@@ -351,8 +357,18 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
 
 
 @partial(jax.jit, static_argnums=0)
-def _exp(group: MatrixGroup, x):
-    return group.exp_map(group.algebra, x)
+def _compiled(function: Callable, *arguments):
+    return function(*arguments)
+
+
+@partial(jax.jit, static_argnums=0)
+def _adjoint_action(group: MatrixGroup, g):
+    """The matrix of Ad(g), and how far from the algebra the images of its basis are."""
+    g = g[..., None, :, :]
+    images = g @ group.algebra._known_basis() @ group.inverse_map(g)
+    rows = group.algebra.vee(images)
+    residual = general.largest(images - group.algebra.hat(rows)) / jnp.maximum(general.largest(images), 1.0)
+    return rows.swapaxes(-1, -2), residual.max(axis=-1)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -382,10 +398,13 @@ _log = jax.jit(_principal_log, static_argnums=0)
 
 def _first_failure(result, core: int) -> tuple[int, ...] | None:
     """Batch index of the first result that is not finite, its last ``core`` axes one element; None while tracing."""
-    if is_traced(result) or bool(jnp.isfinite(result).all()):
+    if is_traced(result):
         return None
-    failed = ~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0)))
-    return tuple(int(i) for i in np.argwhere(failed)[0])
+    return _first(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))
+
+
+def _first(failed: np.ndarray) -> tuple[int, ...] | None:
+    return tuple(int(i) for i in np.argwhere(failed)[0]) if failed.any() else None
 
 
 def _at(index: tuple[int, ...]) -> str:

@@ -37,7 +37,7 @@ class PoissonStructure(eqx.Module):
         return self.tensor(x) @ alpha
 
     def bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``{f, g}``: ``x -> grad f . Pi(x) grad g``."""
+        """The function ``{f, g}``: ``x -> grad f @ Pi(x) @ grad g``."""
 
         def value(x):
             x = jnp.asarray(x, dtype=jnp.float64)

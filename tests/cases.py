@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import numpy as np
+
 import liethermo as lt
 import manifolds as mf
-import numpy as np
 
 EPS = float(np.finfo(float).eps)
 
@@ -138,12 +139,11 @@ def _curvature_tensor(g, energy, rng):
 
 
 def _no_killing(g: mf.LieAlgebra) -> str | None:
-    if g.is_nilpotent():
-        return "the Killing form of a nilpotent algebra vanishes"
     if g.is_semisimple():
         return None
-    lowest = np.linalg.eigvalsh(-g.killing_form())[0]
-    return "minus the Killing form is indefinite" if lowest < -1e-10 else None
+    if np.linalg.eigvalsh(-g.killing_form())[0] < -1e-10:
+        return "minus the Killing form is indefinite"
+    return "the Killing form vanishes on brackets (Cartan's criterion)" if g.is_solvable() else None
 
 
 def _abelian(g: mf.LieAlgebra) -> str | None:
@@ -169,7 +169,9 @@ DISSIPATIONS = [
     Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian),
     Case(
         "sum",
-        lambda g, H, rng: lt.ProjectedMetric(rate=0.1) + lt.FourBracket.kulkarni_nomizu(0.1 * np.eye(g.dim), np.eye(g.dim)),
+        lambda g, H, rng: (
+            lt.ProjectedMetric(rate=0.05) + lt.FourBracket.kulkarni_nomizu(0.03 * np.eye(g.dim), np.eye(g.dim))
+        ),
     ),
 ]
 

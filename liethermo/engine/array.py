@@ -1,9 +1,9 @@
 """The array engine: any one-step method on any system, in JAX.
 
-A step solves ``k = slopes(k)`` by fixed-point iteration from extrapolated slopes and, where that converges slowly or not
-at all, by simplified Newton with the exact Jacobian. Both stop at the *rounding plateau*, where the update no longer
-shrinks, rather than at a tolerance that could lie below it. All loops are ``lax.while_loop``: unrolling them would
-make the compiler duplicate work exponentially.
+A step solves ``k = slopes(k)`` by fixed-point iteration from extrapolated slopes and, where that converges slowly
+or not at all, by simplified Newton with the exact Jacobian. Both stop at the *rounding plateau*, where the update
+no longer shrinks, rather than at a tolerance that could lie below it. All loops are ``lax.while_loop``: unrolling
+them would make the compiler duplicate work exponentially.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class _Iteration(NamedTuple):
     best: jax.Array
     stalled: jax.Array  # iterations in a row that did not shrink the update
     rate: jax.Array
-    count: jax.Array
+    made: jax.Array  # iterations so far
 
     @classmethod
     def begin(cls, k) -> _Iteration:
@@ -74,9 +74,9 @@ class _Iteration(NamedTuple):
 
     def after(self, k) -> _Iteration:
         update = jnp.max(jnp.abs(k - self.k))
-        rate = jnp.where(self.count > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
+        rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
         stalled = jnp.where(update < SHRINKING * self.best, 0, self.stalled + 1)
-        return _Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.count + 1)
+        return _Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
 
     def settled(self, scale) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk."""
@@ -87,8 +87,8 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
 
     def fixed_point_goes_on(s: _Iteration):
-        hopeless = (s.count >= 3) & ((s.rate > SLOW) | ~jnp.isfinite(s.update)) & (s.best > PLATEAU * scale(s.k))
-        return ~s.settled(scale(s.k)) & ~hopeless & (s.count < FIXED_POINT_LIMIT)
+        hopeless = (s.made >= 3) & ((s.rate > SLOW) | ~jnp.isfinite(s.update)) & (s.best > PLATEAU * scale(s.k))
+        return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
 
     first = jax.lax.while_loop(fixed_point_goes_on, lambda s: s.after(slopes(s.k)), _Iteration.begin(guess))
     done = first.settled(scale(first.k)) & jnp.isfinite(first.update)
@@ -100,7 +100,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
         return jnp.where(misfit[0] <= misfit[1], guess, nothing)
 
     def newton_goes_on(s: _Iteration):
-        return ~done & ~s.settled(scale(s.k)) & (s.count < NEWTON_LIMIT) & jnp.isfinite(jnp.sum(s.k))
+        return ~done & ~s.settled(scale(s.k)) & (s.made < NEWTON_LIMIT) & jnp.isfinite(jnp.sum(s.k))
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
@@ -109,21 +109,21 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
         def reuse(carry):
             inner, _ = carry
             step = jax.scipy.linalg.lu_solve(factors, flat(inner.k.ravel())).reshape(guess.shape)
-            return inner.after(inner.k - step), inner.count + 1 - s.count
+            return inner.after(inner.k - step), inner.made + 1 - s.made
 
         def goes_on(carry):
             inner, used = carry
             fresh = (used == 0) | ((used < NEWTON_REUSE) & (inner.rate < 0.3))
             return fresh & newton_goes_on(inner)
 
-        return jax.lax.while_loop(goes_on, reuse, (s, jnp.zeros_like(s.count)))[0]
+        return jax.lax.while_loop(goes_on, reuse, (s, jnp.zeros_like(s.made)))[0]
 
     start = jax.lax.cond(done, lambda: guess, better_start)
     second = jax.lax.while_loop(newton_goes_on, newton, _Iteration.begin(start))
     k = jnp.where(done, first.k, second.k)
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
-    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.count, second.count)
+    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
 
 
 class State(eqx.Module):
@@ -182,9 +182,7 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def scale(k):
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
-    solved = solve_stages(
-        lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale
-    )
+    solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale)
     # x + low is the state; add the increment with its rounding error caught (Neumaier's two-sum)
     increment = method.increment(h, solved.k) + low
     new = x + increment

@@ -1,10 +1,12 @@
-"""Integrators: each the definition of a step, with its order and its guarantees; how it is run is the engines' business."""
+"""Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
 
 from .base import OneStepMethod, registered_methods
 from .midpoint import MetriplecticMidpoint
 from .reference import Reference
 
-METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {"Reference": Reference}
+METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
+    "Reference": Reference
+}
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""
 
 __all__ = ["METHODS", "MetriplecticMidpoint", "OneStepMethod", "Reference", "registered_methods"]

@@ -15,7 +15,7 @@ _registry: list[OneStepMethod] = []
 
 
 class OneStepMethod(eqx.Module):
-    """An implicit one-step method: ``stages`` slopes ``k``, shape (stages, n), that solve ``k = slopes(system, x, low, h, k)``.
+    """An implicit one-step method: slopes ``k``, shape (stages, n), that solve ``k = slopes(system, x, low, h, k)``.
 
     The state is ``x + low``, an unevaluated sum: low is what rounding has kept from x in the steps before (compensated
     summation), and a scheme should form its points as ``x + (low + …)``.
@@ -28,8 +28,8 @@ class OneStepMethod(eqx.Module):
     ----------
     order : int
     preserves : frozenset of str
-        Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"`` (for every
-        entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"quadratic_invariants"`` and
+        Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"``
+        (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"quadratic_invariants"`` and
         ``"linear_invariants"`` (of the system).
     stages : int
     """

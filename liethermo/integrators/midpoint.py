@@ -12,8 +12,8 @@ from .base import OneStepMethod, register
 class MetriplecticMidpoint(OneStepMethod):
     """``(x' - x)/h = Pi(z) dgrad H + K_d(z) grad S(z)``, z the midpoint, dgrad a discrete gradient [BFM 4.5].
 
-    K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly: for every H, step and
-    dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
+    K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly: for every H,
+    step and dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
     (``MetriplecticGauss`` removes that restriction). Quadratic Casimirs of a Lie-Poisson bracket, and all linear
     invariants, are kept exactly; others drift at O(h^2).
 

@@ -39,7 +39,7 @@ class Reference:
             raise InputError(f"no SciPy scheme {self.scheme!r}; take DOP853, RK45, RK23, Radau, BDF or LSODA")
 
     def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str]:
-        """States at the times reached, shape (reached, n), the number of field evaluations and a message if it failed."""
+        """States at the times reached, shape (reached, n), the number of field evaluations, a message on failure."""
         from scipy.integrate import solve_ivp
 
         field = eqx.filter_jit(lambda system, x: system.vector_field(x))

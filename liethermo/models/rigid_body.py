@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+
 import manifolds as mf
 
 from ..dissipation import KillingDissipation, checked_rate
@@ -25,8 +26,8 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     inertia : three positive numbers
         Principal moments of inertia (mass * length**2).
     rate : float, >= 0
-        1 is the equation as printed in the paper, where 𝒦 is the dot product: ``KillingDissipation(rate / 2)``, since the
-        Killing form of so(3) is -2 times it.
+        1 is the equation as printed in the paper, where 𝒦 is the dot product: ``KillingDissipation(rate / 2)``,
+        since the Killing form of so(3) is -2 times it.
     """
     return LiePoissonSystem(
         mf.so(3),

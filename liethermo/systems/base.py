@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifolds as mf
 import numpy as np
+
+import manifolds as mf
 
 from ..dissipation import Dissipation, Law
 from ..energy import Energy, as_energy, check_scalar
@@ -19,8 +20,8 @@ from .check import AXIOM_TOLERANCE, CheckReport, check_system
 class System(eqx.Module):
     """A metriplectic system on R^n [BFM §2.3]; see the subclasses for how to build one.
 
-    A system is a pytree: its parameters (those of ``lt.Quadratic``, the rates, the arrays of ``equinox`` modules used as
-    functions) are leaves, which can be swept, batched and differentiated.
+    A system is a pytree: its parameters (those of ``lt.Quadratic``, the rates, the arrays of ``equinox`` modules
+    used as functions) are leaves, which can be swept, batched and differentiated.
 
     Attributes
     ----------
@@ -56,7 +57,7 @@ class System(eqx.Module):
             check_scalar(J, dim, f"momentum map {name!r}")
         if dissipation is not None and not isinstance(dissipation, Dissipation):
             raise InputError(
-                f"dissipation must be one of the library's Dissipation objects or None, not {type(dissipation).__name__}"
+                f"dissipation must be a Dissipation of this library or None, not {type(dissipation).__name__}"
             )
         if dissipation is not None and self.entropy is None and dissipation.needs_entropy:
             raise InputError(f"{type(dissipation).__name__} drives the entropy up, so the system needs an entropy")
@@ -84,7 +85,7 @@ class System(eqx.Module):
         return jnp.vectorize(self._vector_field, signature="(n)->(n)")(x)
 
     def entropy_production(self, x) -> jax.Array:
-        """``grad S . x'``, the rate of growth of the entropy, shape (...)."""
+        """The rate of growth of the entropy, ``grad S @ x'``, shape (...)."""
         entropy = self._needed_entropy()
         return jnp.vectorize(lambda y: jnp.dot(entropy.gradient(y), self._vector_field(y)), signature="(n)->()")(
             self.state(x, batch=True)
@@ -95,8 +96,8 @@ class System(eqx.Module):
         x = self.state(x)
         if self.dissipation is None:
             return jnp.zeros((self.dim, self.dim))
-        dH, dL = self.energy.gradient(x), self._preserved_gradients(x)
-        return jax.jacfwd(lambda dS: self.dissipation.force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
+        force, dH, dL = self.dissipation.force, self.energy.gradient(x), self._preserved_gradients(x)
+        return jax.jacfwd(lambda dS: force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
@@ -105,12 +106,12 @@ class System(eqx.Module):
 
     @property
     def energy_law(self) -> Law:
-        """"conserved", or "nonincreasing" under double-bracket dissipation."""
+        """ "conserved", or "nonincreasing" under double-bracket dissipation."""
         return "conserved" if self.dissipation is None else self.dissipation.energy_law
 
     @property
     def entropy_law(self) -> Law | None:
-        """"nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
+        """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
         if self.entropy is None:
             return None
         return "conserved" if self.dissipation is None else self.dissipation.entropy_law
@@ -118,23 +119,17 @@ class System(eqx.Module):
     def invariants(self) -> dict[str, tuple[Energy, bool]]:
         """Further functions worth recording along a run, by name, each with whether the system conserves it.
 
-        What the dissipation preserves is a constant of the system only if the motion keeps it too: ``{L, H} = 0``.
+        Momentum maps are claimed to be conserved. What the dissipation preserves is a constant only if the motion keeps
+        it too, and a Casimir only if the dissipation does: that is found out at random points.
         """
-        found = {name: (J, True) for name, J in self.momentum_maps.items()}
-        for i, L in enumerate(self.preserved):
-            found[f"preserved {i + 1}"] = (L, self._commutes(L))
-        return found
+        found = {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)} | self._casimirs()
+        constant = _conserved(self, tuple(found.values()))
+        claimed = {name: (J, True) for name, J in self.momentum_maps.items()}
+        return claimed | {name: (f, kept) for (name, f), kept in zip(found.items(), constant, strict=True)}
 
-    def _commutes(self, L: Energy) -> bool:
-        points = np.random.default_rng(0).standard_normal((8, self.dim))
-
-        def terms(x):
-            dL, motion = L.gradient(x), self.poisson.sharp(x, self.energy.gradient(x))
-            return jnp.dot(dL, motion), jnp.linalg.norm(dL) * jnp.linalg.norm(motion)
-
-        bracket, size = (np.asarray(values) for values in jax.vmap(terms)(points))
-        inside = np.isfinite(bracket)
-        return bool(inside.any() and (np.abs(bracket) <= AXIOM_TOLERANCE * size)[inside].all())
+    def _casimirs(self) -> dict[str, Energy]:
+        """Casimirs of the Poisson structure worth recording."""
+        return {}
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -204,6 +199,31 @@ class System(eqx.Module):
         if self.entropy is None:
             raise InputError("this system has no entropy")
         return self.entropy
+
+
+def _conserved(system: System, functions: tuple[Energy, ...]) -> list[bool]:
+    """Whether each function is constant along the vector field, at random points inside its domain."""
+    if not functions:
+        return []
+    points = np.random.default_rng(0).standard_normal((8, system.dim))
+    rates, sizes = (np.asarray(values) for values in _rates_of_change(system, functions, points))
+    inside = np.isfinite(rates)
+    return [
+        bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
+        for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
+    ]
+
+
+@eqx.filter_jit
+def _rates_of_change(system: System, functions: tuple[Energy, ...], points):
+    def at(x):
+        velocity, gradients = system.vector_field(x), jnp.stack([f.gradient(x) for f in functions])
+        speed = jnp.linalg.norm(velocity) + jnp.linalg.norm(
+            system.poisson.tensor(x) @ jnp.abs(system.energy.gradient(x))
+        )
+        return gradients @ velocity, jnp.linalg.norm(gradients, axis=1) * speed
+
+    return jax.vmap(at)(points)
 
 
 def square_field(function: Callable, dim: int, what: str) -> None:

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifolds as mf
 import numpy as np
+
+import manifolds as mf
 
 from ..dissipation import Dissipation, EulerPoincareForce
 from ..energy import Energy, Quadratic, as_energy, check_scalar
@@ -16,7 +17,9 @@ from ..errors import InputError
 from .lie_poisson import LiePoissonSystem
 
 NEWTON_STEPS = 50
-_SINGULAR = "the Lagrangian is singular: its Hessian has no inverse, so the momentum mu does not determine the velocity xi"
+_SINGULAR = (
+    "the Lagrangian is singular: its Hessian has no inverse, so the momentum mu does not determine the velocity xi"
+)
 
 
 class Legendre(Energy):
@@ -48,7 +51,7 @@ class Legendre(Energy):
 
 
 class EulerPoincareSystem(LiePoissonSystem):
-    """Forced Euler-Poincaré equations ``d/dt dl/dxi = ad*_xi (dl/dxi + F(xi))`` in the momentum mu = dl/dxi [BFM 3.2, 3.4].
+    """Forced Euler-Poincaré equations ``d/dt dl/dxi = ad*_xi (dl/dxi + F(xi))`` [BFM 3.2, 3.4], in mu = dl/dxi.
 
     The state is mu; ``system.velocity(mu)`` gives xi and ``system.momentum(xi)`` the way back. A quadratic Lagrangian
     given as ``lt.Quadratic`` is transformed in closed form.

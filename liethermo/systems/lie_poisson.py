@@ -7,6 +7,7 @@ import math
 import warnings
 
 import equinox as eqx
+
 import manifolds as mf
 
 from ..dissipation import Dissipation
@@ -57,18 +58,12 @@ class LiePoissonSystem(System):
         self.algebra = algebra
         self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
 
-    def invariants(self) -> dict[str, tuple[Energy, bool]]:
-        """Momentum maps, preserved functions, and the low-degree Casimirs of the algebra.
-
-        The bracket keeps every Casimir. Dissipation that raises the entropy need not, so the Casimirs are claimed only
-        where there is none or it is a double bracket.
-        """
-        kept = self.dissipation is None or self.entropy_law == "conserved" or self.energy_law == "nonincreasing"
-        return super().invariants() | {name: (C, kept) for name, C in _casimirs(self.algebra).items()}
+    def _casimirs(self) -> dict[str, Energy]:
+        return _recorded_casimirs(self.algebra)
 
 
 @functools.cache
-def _casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
+def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
     found: dict[str, Energy] = {}
     count = algebra.casimir_count()
     for degree in range(1, algebra.dim + 1):

@@ -44,7 +44,9 @@ class MetriplecticSystem(System):
         if not isinstance(poisson, mf.PoissonStructure):
             poisson = mf.PoissonTensor(poisson, dim)
         if poisson.dim is None:
-            raise InputError("the dimension of the state is not known: give dim=n beside a Poisson tensor that is a function")
+            raise InputError(
+                "the dimension of the state is not known: give dim=n beside a Poisson tensor that is a function"
+            )
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         square_field(poisson.tensor, poisson.dim, "the Poisson tensor")

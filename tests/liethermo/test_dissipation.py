@@ -2,11 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-import liethermo as lt
-import manifolds as mf
 import numpy as np
 import pytest
 
+import liethermo as lt
+import manifolds as mf
 from tests.cases import (
     ALGEBRAS,
     DISSIPATIONS,
@@ -61,7 +61,7 @@ def discrete_properties(system, g):
 
 @pytest.mark.parametrize(("g", "case"), combinations(REPRESENTATIVE))
 def test_any_vector_in_place_of_the_gradient_is_in_the_kernel(g, case):
-    """BFM (4.6) and Remark 4.7: handed a vector that is *not* grad H, K_d has that vector in its kernel, and K_d >= 0."""
+    """BFM (4.6), Remark 4.7: handed a vector that is *not* grad H, K_d has it in its kernel, and K_d >= 0."""
     system = build(g, case)
     energy_defect, production = discrete_properties(system, g)
     if system.energy_law == "conserved":
@@ -103,7 +103,7 @@ def test_killing_on_so3_is_the_projected_metric():
 
 
 def test_the_relaxed_body_as_printed():
-    """BFM Example 3.2: Pi' = Pi × Omega + |Omega|^2 Pi - (Omega . Pi) Omega, and the same from the force F(Omega) = Omega × Pi."""
+    """BFM Example 3.2: Pi' = Pi × Omega + |Omega|^2 Pi - (Omega . Pi) Omega; so does the force F = Omega × Pi."""
     inertia, system = np.array([10.0, 5.0, 1.0]), lt.models.rigid_body(inertia=(10, 5, 1), rate=1.0)
     Pi = np.array([0.3, 1.0, -0.2])
     Omega = Pi / inertia
@@ -122,7 +122,8 @@ def test_normalisations_differ_by_the_length_of_dH():
     g, H, S = mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3))
     G, x = np.diag([1.0, 2.0, 0.5]), np.array([0.3, -0.7, 0.4])
     plain, normalized = (
-        lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric(G, normalized=choice)).friction_matrix(x) for choice in (False, True)
+        lt.LiePoissonSystem(g, H, S, lt.ProjectedMetric(G, normalized=choice)).friction_matrix(x)
+        for choice in (False, True)
     )
     dH = np.asarray(H.gradient(x))
     assert np.allclose(plain, dH @ G @ dH * normalized, rtol=0, atol=1e-14)
@@ -178,7 +179,7 @@ def test_dissipations_add():
     assert unsure.entropy_law is None
 
 
-# -- controls: what must fail ---------------------------------------------------------------------------------------------
+# -- controls: what must fail -------------------------------------------------------------------------------------
 
 
 class WrongEnergy(lt.Dissipation):
@@ -202,9 +203,7 @@ class WrongSign(lt.Dissipation):
     ids=["wrong energy", "wrong sign"],
 )
 def test_a_wrong_dissipation_fails_its_axioms_and_only_those(dissipation, failing):
-    system = lt.LiePoissonSystem(
-        mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation, validate=False
-    )
+    system = lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation, validate=False)
     report = system.check()
     assert {row.axiom for row in report.rows if row.passed is False} == failing
     assert "NOT metriplectic" in str(report)

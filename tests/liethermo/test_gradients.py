@@ -2,13 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-import liethermo as lt
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from liethermo.gradients import GRADIENTS
 
+import liethermo as lt
+from liethermo.gradients import GRADIENTS
 from tests.cases import EPS, energy_of
 
 NAMES = list(GRADIENTS)
@@ -113,7 +113,9 @@ def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
 
 
 @each_gradient
-@pytest.mark.parametrize("function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])])
+@pytest.mark.parametrize(
+    "function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])]
+)
 def test_short_length_scales(gradient, function):
     """The gate is scale free: a function that varies on lengths of 1e-3 keeps the identity at every distance."""
     energy, x, direction = lt.Function(function), np.array([0.7, 0.4]), np.array([1.0, 0.5])

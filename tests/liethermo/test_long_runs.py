@@ -1,10 +1,11 @@
 """A million steps: no drift, no noise, no growth of the work."""
 
 import jax.numpy as jnp
-import liethermo as lt
-import manifolds as mf
 import numpy as np
 import pytest
+
+import liethermo as lt
+import manifolds as mf
 from liethermo.gradients import GRADIENTS
 
 MILLION = 1_000_000

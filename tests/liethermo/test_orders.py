@@ -1,10 +1,11 @@
 """Observed orders, against hand-written ones, on nonlinear problems; and the reference values of the paper's bodies."""
 
 import jax.numpy as jnp
-import liethermo as lt
-import manifolds as mf
 import numpy as np
 import pytest
+
+import liethermo as lt
+import manifolds as mf
 
 SLACK = 0.2
 
@@ -17,15 +18,18 @@ ORDERS = [
 
 
 def nonlinear_systems():
+    # not separable: for a sum of functions of one coordinate each the coordinate increment is symmetric after all
     so3 = lt.LiePoissonSystem(
         mf.so(3),
-        lambda p: 0.5 * jnp.sum(p * p / jnp.array([3.0, 2.0, 1.0])) + 0.1 * p[0] ** 4 + 0.05 * jnp.cos(p[1]),
+        lambda p: (
+            0.5 * jnp.sum(p * p / jnp.array([3.0, 2.0, 1.0])) + 0.1 * p[0] ** 4 + 0.05 * jnp.cos(p[1] + 2.0 * p[2])
+        ),
         lambda p: jnp.log(1.0 + jnp.dot(p, p)),
         lt.ProjectedMetric(rate=0.3),
     )
     se3 = lt.LiePoissonSystem(
         mf.se(3),
-        lambda m: 0.5 * jnp.sum(m[:3] ** 2 / jnp.array([2.0, 1.5, 1.0])) + jnp.sin(m[5]) + 0.2 * m[3] ** 4,
+        lambda m: 0.5 * jnp.sum(m[:3] ** 2 / jnp.array([2.0, 1.5, 1.0])) + jnp.sin(m[5] + m[0]) + 0.2 * m[3] ** 4,
         mf.se(3).casimirs(2)[1],
         lt.KillingDissipation(rate=0.05),
     )
@@ -42,8 +46,10 @@ def test_observed_order(system, x0, gradient, order):
     method = lt.MetriplecticMidpoint(gradient)
     assert method.order == order
     exact = lt.integrate(system, x0, (0.0, 4.0), 4.0, lt.Reference(rtol=1e-13)).x[-1]
-    steps = np.array([40, 80, 160, 320])
-    errors = np.array([np.abs(lt.integrate(system, x0, (0.0, 4.0), 4.0 / n, method).x[-1] - exact).max() for n in steps])
+    steps = np.array([40, 80, 160, 320]) * (4 if order == 1 else 1)
+    errors = np.array(
+        [np.abs(lt.integrate(system, x0, (0.0, 4.0), 4.0 / n, method).x[-1] - exact).max() for n in steps]
+    )
     slopes = np.log2(errors[:-1] / errors[1:])
     assert (errors > 1e-11).all()
     assert (np.abs(slopes - order) < SLACK).all(), (errors, slopes)
@@ -70,7 +76,9 @@ def test_free_body_reference_values():
 def test_figure_1_of_the_paper():
     """I = (10, 5, 1), h = 0.1, Pi(0) = (0.001, 1, 0.001): energy to 1e-14, entropy never falls, S -> I_max H."""
     system = lt.models.rigid_body(inertia=(10, 5, 1), rate=1.0)
-    solution = lt.integrate(system, [0.001, 1.0, 0.001], (0.0, 500.0), 0.1, lt.MetriplecticMidpoint(gradient="gonzalez"))
+    solution = lt.integrate(
+        system, [0.001, 1.0, 0.001], (0.0, 500.0), 0.1, lt.MetriplecticMidpoint(gradient="gonzalez")
+    )
     audit = solution.audit(energy=1e-14)
     assert audit.passed
     assert audit.energy_drift < 1e-14

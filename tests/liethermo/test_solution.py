@@ -5,9 +5,10 @@ import json
 import subprocess
 import sys
 
-import liethermo as lt
 import numpy as np
 import pytest
+
+import liethermo as lt
 
 X0 = [0.001, 1.0, 0.001]
 
@@ -94,7 +95,7 @@ def test_save_to_writes_on_failure_and_on_the_way(tmp_path, monkeypatch):
     assert len(lt.load(tmp_path / "run.nc").t) == 3001
 
 
-# -- the audit ------------------------------------------------------------------------------------------------------------
+# -- the audit ----------------------------------------------------------------------------------------------------
 
 
 def test_the_audit_sees_each_kind_of_damage(solution):
@@ -112,7 +113,9 @@ def test_the_audit_sees_each_kind_of_damage(solution):
     entropy[7] -= 1e-3
     assert failing(entropy=entropy) == ["least entropy increment"]
     assert failing(stats=dataclasses.replace(solution.stats, worst_residual=1e-6)) == ["stage residual"]
-    assert failing(stats=dataclasses.replace(solution.stats, least_entropy_increment=-1.0)) == ["least entropy increment"]
+    assert failing(stats=dataclasses.replace(solution.stats, least_entropy_increment=-1.0)) == [
+        "least entropy increment"
+    ]
     laws = dataclasses.replace(solution.laws, conserved=tuple(solution.casimirs))
     assert failing(laws=laws)[0].startswith("drift of mu1**2")
 
@@ -131,12 +134,13 @@ def test_zero_energy_is_measured_absolutely():
     assert solution.audit().energy_drift == 0.0
 
 
-# -- imports --------------------------------------------------------------------------------------------------------------
+# -- imports ------------------------------------------------------------------------------------------------------
 
 
 def test_import_is_light():
     """What is not needed to integrate is not imported; the time itself is measured in benchmarks, not here."""
-    script = "import sys, liethermo; print([m for m in ('geomstats', 'matplotlib', 'xarray', 'pandas', 'rich') if m in sys.modules])"
+    heavy = ("geomstats", "matplotlib", "xarray", "pandas", "rich")
+    script = f"import sys, liethermo; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 

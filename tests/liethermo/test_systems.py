@@ -3,13 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import liethermo as lt
-import manifolds as mf
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import liethermo as lt
+import manifolds as mf
 from tests.cases import energy_of, state_of
 
 SPHERE = lt.Quadratic(np.ones(3))
@@ -77,7 +77,7 @@ def test_singular_lagrangians_are_refused(lagrangian):
         lt.EulerPoincareSystem(mf.so(3), lagrangian)
 
 
-# -- metriplectic systems on R^n ------------------------------------------------------------------------------------------
+# -- metriplectic systems on R^n ----------------------------------------------------------------------------------
 
 
 def test_a_system_on_rn_with_a_user_poisson_tensor():
@@ -140,15 +140,17 @@ def test_systems_are_pytrees_of_their_parameters():
     assert any(leaf.shape == () and leaf == 2.0 for leaf in jax.tree_util.tree_leaves(system))
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------------
+# -- refusals -----------------------------------------------------------------------------------------------------
 
 
 def test_an_entropy_that_is_no_casimir():
     with pytest.raises(lt.CasimirError, match=r"not a Casimir.*g\.casimirs") as caught:
         lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lambda mu: mu[0] ** 2, lt.KillingDissipation())
     assert caught.value.residual > 0.1
-    built = lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lambda mu: mu[0] ** 2, lt.KillingDissipation(), validate=False)
-    assert [row.axiom for row in built.check().rows if row.passed is False][0] == "Pi grad S = 0"
+    built = lt.LiePoissonSystem(
+        mf.so(3), energy_of(3, 0), lambda mu: mu[0] ** 2, lt.KillingDissipation(), validate=False
+    )
+    assert "Pi grad S = 0" in [row.axiom for row in built.check().rows if row.passed is False]
 
 
 def test_a_poisson_tensor_that_is_none():

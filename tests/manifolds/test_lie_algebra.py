@@ -4,12 +4,12 @@ from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
-import manifolds as mf
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import manifolds as mf
 from tests.cases import ALGEBRAS, algebra_id, tolerance
 
 seeds = st.integers(0, 10**6)
@@ -93,7 +93,7 @@ def test_matrices_represent_the_bracket(g, seed):
     assert close(g.vee(X), x, 10.0)
 
 
-# -- structure ----------------------------------------------------------------------------------------------------------
+# -- structure ----------------------------------------------------------------------------------------------------
 
 STRUCTURE = {
     # name: (semisimple, compact type, solvable, nilpotent, unimodular), from the literature
@@ -160,7 +160,9 @@ def test_cartan_involution(g):
     assert np.linalg.eigvalsh(-g.killing_form() @ theta).min() > 0.1
 
 
-@pytest.mark.parametrize("g", [mf.sl(2), mf.sl(3), mf.sp(2), mf.so(3, 1), mf.direct_sum(mf.so(3), mf.sl(2))], ids=algebra_id)
+@pytest.mark.parametrize(
+    "g", [mf.sl(2), mf.sl(3), mf.sp(2), mf.so(3, 1), mf.direct_sum(mf.so(3), mf.sl(2))], ids=algebra_id
+)
 @given(seed=seeds)
 def test_cartan_involution_without_matrices_in_a_skew_basis(g, seed):
     """The construction from constants alone does not depend on a lucky basis."""
@@ -201,14 +203,16 @@ def test_sums():
     motions = mf.semidirect_sum(mf.so(3), mf.so(3).hat)
     assert motions == mf.se(3)
     assert hash(motions) == hash(mf.se(3))
-    assert mf.semidirect_sum(mf.so(3), np.zeros((3, 2, 2))).basis is not None  # not faithful: the matrices of g help out
+    assert (
+        mf.semidirect_sum(mf.so(3), np.zeros((3, 2, 2))).basis is not None
+    )  # not faithful: the matrices of g help out
     with pytest.raises(mf.RepresentationError, match=r"rho\(e1\), rho\(e2\)"):
         mf.semidirect_sum(mf.so(3), 2 * np.asarray(mf.so(3).basis))
     with pytest.raises(mf.ShapeError):
         mf.semidirect_sum(mf.so(3), np.zeros((2, 2, 2)))
 
 
-# -- what is refused ------------------------------------------------------------------------------------------------------
+# -- what is refused ----------------------------------------------------------------------------------------------
 
 
 def broken(change):

@@ -1,13 +1,13 @@
 """Poisson structures: the axioms, on Lie algebras and on R^2n, and controls that must fail."""
 
 import jax.numpy as jnp
-import manifolds as mf
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.cases import ALGEBRAS, algebra_id, tolerance
+import manifolds as mf
+from tests.cases import ALGEBRAS, tolerance
 
 seeds = st.integers(0, 10**6)
 STRUCTURES = [mf.LiePoisson(g) for g in ALGEBRAS] + [mf.Canonical(1), mf.Canonical(3)]
@@ -34,7 +34,9 @@ def test_axioms(P, seed):
     assert float(leibniz) == pytest.approx(float(f(x) * P.bracket(g, h)(x) + g(x) * P.bracket(f, h)(x)), abs=1e-12)
 
 
-@pytest.mark.parametrize("P", [mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.sl(3)), mf.Canonical(2)], ids=["se3", "sl3", "T*R2"])
+@pytest.mark.parametrize(
+    "P", [mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.sl(3)), mf.Canonical(2)], ids=["se3", "sl3", "T*R2"]
+)
 def test_jacobi_identity_of_the_bracket(P):
     x = np.random.default_rng(0).standard_normal(P.dim)
     f, g, h = functions(P.dim, 0)
@@ -55,9 +57,7 @@ def test_a_tensor_of_ones_own():
     P = mf.PoissonTensor(lambda x: jnp.array([[0.0, x[0]], [-x[0], 0.0]]), dim=2)  # in two dimensions any tensor is one
     assert float(P.jacobi_residual([0.4, 0.2])) == 0.0
     # {x1, x2} = x2, {x2, x3} = 1: v . curl v = 1 for the vector v of the tensor, so Jacobi fails
-    not_poisson = mf.PoissonTensor(
-        lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), dim=3
-    )
+    not_poisson = mf.PoissonTensor(lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), dim=3)
     assert float(not_poisson.jacobi_residual([0.4, 0.2, 1.0])) > 0.1
     with pytest.raises(mf.ShapeError):
         mf.PoissonTensor(np.zeros((2, 3)))

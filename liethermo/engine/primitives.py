@@ -1,0 +1,590 @@
+"""Scalar arithmetic that simplifies itself, and the rules by which each JAX primitive becomes such arithmetic.
+
+A scalar is a Python number, known at compile time, or a ``str``, the name of a variable. An array is a NumPy array of
+such objects, so NumPy itself moves data: reshaping, slicing or transposing costs the program nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Scalar = str | float | int | bool
+
+
+class Instruction(NamedTuple):
+    """``target = op(*args)``, op a key of :data:`OPERATIONS`."""
+
+    target: str
+    op: str
+    args: tuple[Scalar, ...]
+
+
+OPERATIONS = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "pow": "{0} ** {1}",
+    "abs": "abs({0})",
+    "sign": "np.sign({0})",
+    "sqrt": "np.sqrt({0})",
+    "cbrt": "np.cbrt({0})",
+    "exp": "np.exp({0})",
+    "exp2": "np.exp2({0})",
+    "expm1": "np.expm1({0})",
+    "log": "np.log({0})",
+    "log1p": "np.log1p({0})",
+    "sin": "np.sin({0})",
+    "cos": "np.cos({0})",
+    "tan": "np.tan({0})",
+    "asin": "np.arcsin({0})",
+    "acos": "np.arccos({0})",
+    "atan": "np.arctan({0})",
+    "atan2": "np.arctan2({0}, {1})",
+    "sinh": "np.sinh({0})",
+    "cosh": "np.cosh({0})",
+    "tanh": "np.tanh({0})",
+    "asinh": "np.arcsinh({0})",
+    "acosh": "np.arccosh({0})",
+    "atanh": "np.arctanh({0})",
+    "erf": "np.float64(math.erf({0}))",
+    "erfc": "np.float64(math.erfc({0}))",
+    "floor": "np.floor({0})",
+    "ceil": "np.ceil({0})",
+    "trunc": "np.trunc({0})",
+    "rint": "np.rint({0})",
+    "rem": "np.fmod({0}, {1})",
+    "max": "{0} if {0} > {1} or {0} != {0} else {1}",  # like XLA's, NaN if either is
+    "min": "{0} if {0} < {1} or {0} != {0} else {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "is_finite": "np.isfinite({0})",
+    "and": "{0} & {1}",
+    "or": "{0} | {1}",
+    "xor": "{0} ^ {1}",
+    "not": "not {0}",
+    "select": "{1} if {0} else {2}",
+    "float": "np.float64({0})",
+    "int": "np.int64({0})",
+    # XLA converts NaN to 0 and what is too large to the nearest integer; the C conversion leaves both undefined.
+    "truncate": "np.int64({0}) if abs({0}) < 2.0**63 else np.int64(0 if {0} != {0} else "
+    "-9223372036854775808 if {0} < 0.0 else 9223372036854775807)",
+}
+"""What each operation means, as Python; numba compiles the same text with ``error_model="numpy"``."""
+
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    op: eval(f"lambda a=0, b=0, c=0: {text.format('a', 'b', 'c')}", {"np": np, "math": math})
+    for op, text in OPERATIONS.items()
+}
+
+COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+
+
+class LimitExceededError(Exception):
+    """More instructions than allowed."""
+
+
+class Builder:
+    """Collects instructions. Each method returns the scalar that holds its result.
+
+    No instruction is emitted where its result is known, equals an earlier one, or differs from it by a sign that can be
+    moved on. Everything is exact, to the sign of a zero, with one agreed exception: a structural zero times anything is
+    zero, and so is a structural zero divided by anything. Sums are never reassociated.
+    """
+
+    def __init__(self, limit: int):
+        self.limit = limit
+        self.instructions: list[Instruction] = []
+        self._emitted: dict[tuple[str, ...], str] = {}
+        self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
+
+    def op(self, op: str, *args: Scalar) -> Scalar:
+        """The result of an operation, with no simplification but constants folded and equal expressions merged."""
+        if not any(type(a) is str for a in args):
+            return fold(op, *args)
+        if op in COMMUTATIVE and (type(args[1]) is not str or (type(args[0]) is str and args[1] < args[0])):  # type: ignore[operator]
+            args = args[::-1]
+        key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
+        name = self._emitted.get(key)
+        if name is None:
+            if len(self.instructions) >= self.limit:
+                raise LimitExceededError
+            name = self._emitted[key] = f"t{len(self.instructions)}"
+            self.instructions.append(Instruction(name, op, args))
+        return name
+
+    def add(self, a, b):
+        if type(a) is not str and type(b) is not str:
+            return a + b
+        if a == 0:
+            return b
+        if b == 0:
+            return a
+        if b in self._opposite:
+            return self.sub(a, self._opposite[b])
+        if a in self._opposite:
+            return self.sub(b, self._opposite[a])
+        return self.op("add", a, b)
+
+    def sub(self, a, b):
+        if type(a) is not str and type(b) is not str:
+            return a - b
+        if b == 0:
+            return a
+        if a == 0:
+            return self.neg(b)
+        if b in self._opposite:
+            return self.add(a, self._opposite[b])
+        return self.op("sub", a, b)
+
+    def neg(self, a):
+        if type(a) is not str:
+            return -a
+        if a in self._opposite:
+            return self._opposite[a]
+        result = self.op("neg", a)
+        self._opposite[result] = a
+        return result
+
+    def mul(self, a, b):
+        if type(a) is not str and type(b) is not str:
+            return a * b
+        if a == 0 or b == 0:
+            return abs(a if a == 0 else b)
+        if a == 1:
+            return b
+        if b == 1:
+            return a
+        return self._signed(self.mul, "mul", a, b)
+
+    def div(self, a, b):
+        if type(a) is not str and type(b) is not str:
+            return fold("div", a, b)
+        if a == 0:
+            return abs(a)
+        if b == 1:
+            return a
+        return self._signed(self.div, "div", a, b)
+
+    def _signed(self, method, op, a, b):
+        """A product or quotient, minus signs taken out of it."""
+        for x, result in (a, lambda y: method(y, b)), (b, lambda y: method(a, y)):
+            opposite = self._opposite.get(x) if type(x) is str else -x if x < 0 else None
+            if opposite is not None:
+                return self.neg(result(opposite))
+        return self.op(op, a, b)
+
+    def integer_pow(self, a, n: int):
+        """``a**n`` by repeated squaring."""
+        if n < 0:
+            return self.div(1.0, self.integer_pow(a, -n))
+        result: Scalar = 1.0
+        while n:
+            if n & 1:
+                result = self.mul(result, a)
+            n >>= 1
+            if n:
+                a = self.mul(a, a)
+        return result
+
+    def pow(self, a, b):
+        if type(b) is not str and float(b).is_integer() and abs(b) <= 3:
+            return self.integer_pow(a, int(b))
+        return self.op("pow", a, b)
+
+    def select(self, condition, a, b):
+        """``a if condition else b``."""
+        if type(condition) is not str:
+            return a if condition else b
+        return a if type(a) is type(b) and repr(a) == repr(b) else self.op("select", condition, a, b)
+
+    def max(self, a, b):
+        return self.op("max", a, b)
+
+    def min(self, a, b):
+        return self.op("min", a, b)
+
+    def logistic(self, a):
+        return self.div(1.0, self.add(1.0, self.op("exp", self.neg(a))))
+
+    def round_half_away(self, a):
+        whole = self.op("trunc", a)
+        beyond = self.op("ge", self.op("abs", self.sub(a, whole)), 0.5)  # false at infinity
+        return self.select(beyond, self.add(whole, self.op("sign", a)), whole)
+
+    def all(self, conditions):
+        return reduce(lambda a, b: self.op("and", a, b), conditions, True)
+
+
+def fold(op: str, *args: Scalar) -> Scalar:
+    """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
+    with np.errstate(all="ignore"):
+        value = FUNCTIONS[op](*(np.float64(a) if type(a) is float else a for a in args))
+    return value.item() if isinstance(value, np.generic) else value
+
+
+# -- arrays of scalars ----------------------------------------------------------------------------------------------
+
+
+def constant(value, dtype=None) -> np.ndarray:
+    """An array of numbers as an array of scalars."""
+    return np.asarray(value, dtype=dtype).astype(object)
+
+
+def array(scalars: Sequence[Scalar], shape) -> np.ndarray:
+    result = np.empty(len(scalars), object)
+    result[:] = scalars
+    return result.reshape(shape)
+
+
+def elementwise(function: Callable[..., Scalar], *arrays: np.ndarray) -> np.ndarray:
+    """Apply a function entry by entry."""
+    arrays = np.broadcast_arrays(*arrays)
+    return array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
+
+
+def integers(x: np.ndarray) -> np.ndarray:
+    """An array of scalars as the integers they must be to serve as indices."""
+    if any(type(i) is str for i in x.flat):
+        raise NotImplementedError("with indices known only at run time")
+    return x.astype(np.int64)
+
+
+def _rows(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
+    """The entries along some axes, for each place on the others; and the shape of those others."""
+    kept = [i for i in range(x.ndim) if i not in axes]
+    shape = tuple(x.shape[i] for i in kept)
+    size = math.prod(x.shape[i] for i in axes)
+    return x.transpose(*kept, *axes).reshape(math.prod(shape), size).tolist(), shape
+
+
+# -- the rules: rule(builder, equation, *arrays) -> array or list of arrays -------------------------------------------
+
+Rule = Callable[..., "np.ndarray | list[np.ndarray]"]
+
+
+def _dtype(eqn, argument: int = 0) -> np.dtype:
+    return eqn.invars[argument].aval.dtype
+
+
+def _numeric(method: str) -> Rule:
+    """A method of the builder, on numbers."""
+
+    def rule(b, eqn, *arrays):
+        if _dtype(eqn) == bool:
+            raise NotImplementedError("on truth values")
+        return elementwise(getattr(b, method), *arrays)
+
+    return rule
+
+
+def _plain(op: str) -> Rule:
+    """An operation that has nothing to simplify."""
+    return lambda b, eqn, *arrays: elementwise(lambda *args: b.op(op, *args), *arrays)
+
+
+def _move(function: Callable[..., Any]) -> Rule:
+    """A rearrangement of entries: ``function(array, parameters)``."""
+    return lambda b, eqn, x: function(x, eqn.params)
+
+
+def _alike(b, eqn, *arrays):
+    return list(arrays)
+
+
+def _divide(b, eqn, x, y):
+    if np.issubdtype(_dtype(eqn), np.integer):
+        return elementwise(_integer_quotient, x, y)
+    return _numeric("div")(b, eqn, x, y)
+
+
+def _remainder(b, eqn, x, y):
+    if np.issubdtype(_dtype(eqn), np.integer):
+        return elementwise(lambda a, n: a - n * _integer_quotient(a, n), x, y)
+    return _plain("rem")(b, eqn, x, y)
+
+
+def _integer_quotient(a, n):
+    if type(a) is str or type(n) is str or n == 0:
+        raise NotImplementedError("of integers known only at run time")
+    return abs(a) // abs(n) * (1 if (a < 0) == (n < 0) else -1)
+
+
+def _not(b, eqn, x):
+    if _dtype(eqn) != bool:
+        raise NotImplementedError("on the bits of integers")
+    return _plain("not")(b, eqn, x)
+
+
+def _clamp(b, eqn, low, x, high):
+    return elementwise(lambda lo, a, hi: b.min(b.max(lo, a), hi), low, x, high)
+
+
+def _round(b, eqn, x):
+    to_even = eqn.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    return elementwise((lambda a: b.op("rint", a)) if to_even else b.round_half_away, x)
+
+
+def _select(b, eqn, which, *cases):
+    if _dtype(eqn) == bool:
+        return elementwise(b.select, which, cases[1], cases[0])
+    chosen = cases[-1]
+    for i in reversed(range(len(cases) - 1)):
+        chosen = elementwise(lambda w, a, rest, i=i: b.select(b.op("le", w, i), a, rest), which, cases[i], chosen)
+    return chosen
+
+
+def _convert(b, eqn, x):
+    old, new = _dtype(eqn), np.dtype(eqn.params["new_dtype"])
+    if new == old or (np.issubdtype(old, np.integer) and np.issubdtype(new, np.integer)):
+        return x
+    if new == bool:
+        return elementwise(lambda a: b.op("ne", a, 0), x)
+    if new == np.float64:
+        return elementwise(lambda a: b.op("float", a), x)
+    return elementwise(lambda a: b.op("int" if old == bool else "truncate", a), x)
+
+
+def _reduction(combine: Callable[..., Scalar], empty: Scalar) -> Rule:
+    def rule(b, eqn, x):
+        rows, shape = _rows(x, eqn.params["axes"])
+        start = _dtype(eqn).type(empty).item() if x.size == 0 else empty
+        return array([reduce(lambda u, v: combine(b, u, v), row) if row else start for row in rows], shape)
+
+    return rule
+
+
+def _op(op: str) -> Callable[..., Scalar]:
+    return lambda b, u, v: b.op(op, u, v)
+
+
+def _arg_extreme(better: str) -> Rule:
+    """The first place of the extreme entry; NaN counts as one."""
+
+    def first(b, row):
+        best, at = row[0], 0
+        for i, v in enumerate(row[1:], 1):
+            nan_first = b.op("and", b.op("ne", v, v), b.op("eq", best, best))
+            wins = b.op("or", b.op(better, v, best), nan_first)
+            best, at = b.select(wins, v, best), b.select(wins, i, at)
+        return at
+
+    def rule(b, eqn, x):
+        rows, shape = _rows(x, eqn.params["axes"])
+        return array([first(b, row) for row in rows], shape)
+
+    return rule
+
+
+def _cumulative(combine: Callable[..., Scalar]) -> Rule:
+    def rule(b, eqn, x):
+        axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
+        rows, shape = _rows(x, (axis,))
+        sums = [list(itertools.accumulate(row[::step], lambda u, v: combine(b, u, v)))[::step] for row in rows]
+        return np.moveaxis(array(sum(sums, []), (*shape, x.shape[axis])), -1, axis)
+
+    return rule
+
+
+def _dot_general(b, eqn, x, y):
+    (sum_x, sum_y), (batch_x, batch_y) = eqn.params["dimension_numbers"]
+    rest_x = [i for i in range(x.ndim) if i not in (*sum_x, *batch_x)]
+    rest_y = [i for i in range(y.ndim) if i not in (*sum_y, *batch_y)]
+    shape = [x.shape[i] for i in (*batch_x, *rest_x)] + [y.shape[i] for i in rest_y]
+    batch, size = math.prod(x.shape[i] for i in batch_x), math.prod(x.shape[i] for i in sum_x)
+    left = x.transpose(*batch_x, *rest_x, *sum_x).reshape(batch, math.prod(x.shape[i] for i in rest_x), size)
+    right = y.transpose(*batch_y, *rest_y, *sum_y).reshape(batch, math.prod(y.shape[i] for i in rest_y), size)
+    zero, result = _dtype(eqn).type(0).item(), []
+    for rows, columns in zip(left.tolist(), right.tolist(), strict=True):
+        sparse = [[(k, a) for k, a in enumerate(row) if a != 0] for row in rows]  # structure constants are mostly zero
+        for entries, column in itertools.product(sparse, columns):
+            result.append(reduce(b.add, (b.mul(a, column[k]) for k, a in entries), zero))
+    return array(result, shape)
+
+
+def _broadcast(x, params):
+    inner = np.ones(len(params["shape"]), int)
+    inner[list(params["broadcast_dimensions"])] = x.shape
+    return np.broadcast_to(x.reshape(inner), params["shape"])
+
+
+def _iota(b, eqn):
+    shape, axis = eqn.params["shape"], eqn.params["dimension"]
+    counts = np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(shape))])
+    return constant(np.broadcast_to(counts, shape), eqn.params["dtype"])
+
+
+def _platform_index(b, eqn):
+    """Which of several implementations is the CPU's, or that for any platform."""
+    return constant(next(i for i, names in enumerate(eqn.params["platforms"]) if names is None or "cpu" in names))
+
+
+def _slice(x, params):
+    steps = params["strides"] or [1] * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
+
+
+def _window(x: np.ndarray, starts, sizes) -> tuple[slice, ...]:
+    """The window of a dynamic slice: moved inside the array where it sticks out."""
+    starts = [min(max(int(integers(i)), 0), n - m) for i, n, m in zip(starts, x.shape, sizes, strict=True)]
+    return tuple(slice(i, i + m) for i, m in zip(starts, sizes, strict=True))
+
+
+def _dynamic_slice(b, eqn, x, *starts):
+    return x[_window(x, starts, eqn.params["slice_sizes"])]
+
+
+def _dynamic_update_slice(b, eqn, x, update, *starts):
+    result = x.copy()
+    result[_window(x, starts, update.shape)] = update
+    return result
+
+
+def _pad(b, eqn, x, filling):
+    shape = eqn.outvars[0].aval.shape
+    result = np.full(shape, filling.item(), object)
+    sources, targets = [], []
+    for n, size, (low, _, between) in zip(x.shape, shape, eqn.params["padding_config"], strict=True):
+        place = int(low) + np.arange(n) * (int(between) + 1)
+        sources.append(np.flatnonzero((place >= 0) & (place < size)))
+        targets.append(place[sources[-1]])
+    result[np.ix_(*targets)] = x[np.ix_(*sources)]
+    return result
+
+
+def _split(x, params):
+    return np.split(x, np.cumsum([int(n) for n in params["sizes"]])[:-1], axis=params["axis"])
+
+
+# Gathering and scattering have intricate rules for indices. JAX itself is asked where each entry goes: the primitive is
+# run on the numbers of the entries.
+
+
+def _gather(b, eqn, x, indices):
+    numbers = jnp.arange(x.size).reshape(x.shape)
+    where = integers(indices).astype(_dtype(eqn, 1))
+    came_from = np.asarray(eqn.primitive.bind(numbers, where, **{**eqn.params, "fill_value": -1}))
+    fill_value = eqn.params["fill_value"]
+    if fill_value is None:
+        fill_value = {"f": math.nan, "b": True}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
+    entries = [*x.ravel().tolist(), fill_value]
+    return array([entries[i] for i in came_from.ravel()], came_from.shape)
+
+
+def _scatter(b, eqn, x, indices, updates):
+    numbers = jnp.arange(x.size + updates.size)
+    old, new = numbers[: x.size].reshape(x.shape), numbers[x.size :].reshape(updates.shape)
+    where = integers(indices).astype(_dtype(eqn, 1))
+    came_from = np.asarray(eqn.primitive.bind(old, where, new, **eqn.params))
+    entries = x.ravel().tolist() + updates.ravel().tolist()
+    return array([entries[i] for i in came_from.ravel()], came_from.shape)
+
+
+def _scatter_add(b, eqn, x, indices, updates):
+    where = integers(indices).astype(_dtype(eqn, 1))
+    # The transpose of scattering tells each update which entry it goes to; 0 for one that is dropped.
+    scatter = lambda u: eqn.primitive.bind(jnp.zeros(x.shape), where, u, **eqn.params)  # noqa: E731
+    numbers = jnp.arange(1.0, x.size + 1).reshape(x.shape)
+    (goes_to,) = jax.vjp(scatter, jnp.zeros(updates.shape))[1](numbers)
+    entries = [0.0, *x.ravel().tolist()]
+    for i, u in zip(np.asarray(goes_to, int).flat, updates.flat, strict=True):
+        entries[i] = b.add(entries[i], u)
+    return array(entries[1:], x.shape)
+
+
+def _cholesky(b, eqn, a):
+    n = a.shape[-1]
+    lower = constant(np.zeros(a.shape))
+    for A, L in zip(a.reshape(-1, n, n), lower.reshape(-1, n, n), strict=True):
+        positive: Scalar = True
+        for j in range(n):
+            pivot = reduce(b.sub, (b.mul(v, v) for v in L[j, :j]), A[j, j])
+            positive = b.op("and", positive, b.op("gt", pivot, 0.0))
+            L[j, j] = b.op("sqrt", pivot)
+            for i in range(j + 1, n):
+                L[i, j] = b.div(reduce(b.sub, map(b.mul, L[i, :j], L[j, :j]), A[i, j]), L[j, j])
+        L[...] = elementwise(lambda v, ok=positive: b.select(ok, v, math.nan), L)
+    return lower
+
+
+def _triangular_solve(b, eqn, a, rhs):
+    """``x`` with ``a x = rhs``, or ``x a = rhs``, by substitution."""
+    params = eqn.params
+    if params["transpose_a"] == params["left_side"]:
+        a = a.swapaxes(-1, -2)
+    if not params["left_side"]:
+        rhs = rhs.swapaxes(-1, -2)
+    lower = params["lower"] != (params["transpose_a"] == params["left_side"])
+    n, x = a.shape[-1], rhs.copy()
+    order = range(n) if lower else range(n)[::-1]
+    for A, X in zip(a.reshape(-1, n, n), x.reshape(-1, n, rhs.shape[-1]), strict=True):
+        for done, i in enumerate(order):
+            for k in range(X.shape[1]):
+                rest = reduce(b.sub, (b.mul(A[i, j], X[j, k]) for j in order[:done]), X[i, k])
+                X[i, k] = rest if params["unit_diagonal"] else b.div(rest, A[i, i])
+    return x if params["left_side"] else x.swapaxes(-1, -2)
+
+
+RULES: dict[str, Rule] = {
+    **{name: _numeric(name) for name in ("add", "sub", "mul", "neg", "pow", "max", "min", "logistic")},
+    "add_any": _numeric("add"),
+    "div": _divide,
+    "rem": _remainder,
+    "square": lambda b, eqn, x: elementwise(b.mul, x, x),
+    "integer_pow": lambda b, eqn, x: elementwise(lambda a: b.integer_pow(a, eqn.params["y"]), x),
+    "rsqrt": lambda b, eqn, x: elementwise(lambda a: b.div(1.0, b.op("sqrt", a)), x),
+    "clamp": _clamp,
+    "round": _round,
+    **{
+        name: _plain(name)
+        for name in ["abs", "sign", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor"]
+    },
+    "not": _not,
+    "select_n": _select,
+    "convert_element_type": _convert,
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), _alike),
+    "reduce_sum": _reduction(Builder.add, 0),
+    "reduce_prod": _reduction(Builder.mul, 1),
+    "reduce_max": _reduction(Builder.max, -math.inf),
+    "reduce_min": _reduction(Builder.min, math.inf),
+    "reduce_and": _reduction(_op("and"), True),
+    "reduce_or": _reduction(_op("or"), False),
+    "argmax": _arg_extreme("gt"),
+    "argmin": _arg_extreme("lt"),
+    "cumsum": _cumulative(Builder.add),
+    "cumprod": _cumulative(Builder.mul),
+    "cummax": _cumulative(Builder.max),
+    "cummin": _cumulative(Builder.min),
+    "dot_general": _dot_general,
+    "broadcast_in_dim": _move(_broadcast),
+    **{name: lambda b, eqn, x: x.reshape(eqn.outvars[0].aval.shape) for name in ("reshape", "squeeze", "expand_dims")},
+    "transpose": _move(lambda x, params: x.transpose(params["permutation"])),
+    "rev": _move(lambda x, params: np.flip(x, params["dimensions"])),
+    "slice": _move(_slice),
+    "split": _move(_split),
+    "concatenate": lambda b, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
+    "pad": _pad,
+    "iota": _iota,
+    "platform_index": _platform_index,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter": _scatter,
+    "scatter-add": _scatter_add,
+    "cholesky": _cholesky,
+    "triangular_solve": _triangular_solve,
+}
+"""How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.engine.scalarize`."""

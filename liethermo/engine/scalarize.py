@@ -1,0 +1,307 @@
+"""From a traced JAX function of small arrays to a straight-line program of scalar instructions.
+
+The jaxpr, derivatives included, is unrolled entry by entry. What is known at compile time is computed then, structural
+zeros vanish, equal subexpressions merge and dead ones are dropped, so an ``einsum`` with structure constants becomes the
+few products that it stands for. The result is the same to rounding as JAX's, or there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+from ..errors import InputError, LiethermoError
+from .primitives import (
+    FUNCTIONS,
+    OPERATIONS,
+    RULES,
+    Builder,
+    Instruction,
+    LimitExceededError,
+    Scalar,
+    array,
+    constant,
+    elementwise,
+)
+
+LIMIT = 200_000
+"""Instructions that a program may have: far more than compile in reasonable time."""
+
+
+class UnsupportedPrimitive(LiethermoError, NotImplementedError):
+    """A function that cannot be unrolled.
+
+    Attributes
+    ----------
+    primitive : str
+        The JAX primitive in the way.
+    where : str
+        The line of the user's code that called for it, as far as JAX knows.
+    """
+
+    def __init__(self, primitive: str, where: str, reason: str = ""):
+        self.primitive, self.where = primitive, where
+        super().__init__(
+            f"the compiled engine cannot run the JAX primitive {primitive!r} {reason}".rstrip() + f" ({where})"
+        )
+
+
+@dataclass(frozen=True)
+class Program:
+    """Scalar instructions in order, each variable assigned once.
+
+    Attributes
+    ----------
+    inputs : tuple of tuple of str
+        Names of the entries of each input array, in row-major order.
+    instructions : tuple of Instruction
+    outputs : tuple of tuple of scalars
+        For each output array its entries: names, or numbers where they are constant.
+    shapes : tuple of tuple of int
+        Shapes of the output arrays.
+    """
+
+    inputs: tuple[tuple[str, ...], ...]
+    instructions: tuple[Instruction, ...]
+    outputs: tuple[tuple[Scalar, ...], ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    @property
+    def operations(self) -> Counter[str]:
+        """How many instructions there are of each kind."""
+        return Counter(instruction.op for instruction in self.instructions)
+
+    def evaluate(self, *arrays) -> list[np.ndarray]:
+        """The outputs for given input arrays, interpreted with Python's floats."""
+        values: dict[Scalar, Scalar] = {}
+        for names, x in zip(self.inputs, arrays, strict=True):
+            values.update(zip(names, np.asarray(x, dtype=np.float64).ravel(), strict=True))
+        with np.errstate(all="ignore"):
+            for target, op, args in self.instructions:
+                values[target] = FUNCTIONS[op](*(values[a] if type(a) is str else a for a in args))
+        return [
+            np.array([values[a] if type(a) is str else a for a in entries]).reshape(shape)
+            for entries, shape in zip(self.outputs, self.shapes, strict=True)
+        ]
+
+    def body(self, sources: Sequence[str], targets: Sequence[str], prefix: str = "") -> list[str]:
+        """The program as lines of Python, to be placed in a function that numba compiles.
+
+        All inputs are read before any output is written, so the two may overlap.
+
+        Parameters
+        ----------
+        sources : sequence of str
+            An expression for each entry of the inputs, all arrays one after another.
+        targets : sequence of str
+            What to assign each entry of the outputs to, likewise.
+        prefix : str
+            Put before the name of every variable.
+        """
+        names = [name for entries in self.inputs for name in entries]
+        results = [a for entries in self.outputs for a in entries]
+        used = {a for instruction in self.instructions for a in instruction.args} | set(results)
+
+        def text(a: Scalar) -> str:
+            return prefix + a if isinstance(a, str) else _number(a)
+
+        loads = [f"{prefix}{name} = {source}" for name, source in zip(names, sources, strict=True) if name in used]
+        lines = [f"{prefix}{i.target} = {OPERATIONS[i.op].format(*map(text, i.args))}" for i in self.instructions]
+        stores = [f"{target} = {text(a)}" for target, a in zip(targets, results, strict=True)]
+        return loads + lines + stores
+
+    def source(self, arrays: int | None = None, name: str = "program") -> str:
+        """Python source of ``def name(x, p, out)`` on flat arrays, for numba with ``error_model="numpy"``.
+
+        It uses ``np`` and ``math``. The first ``arrays`` input arrays, by default all, are read from x, one after
+        another, the others from p.
+        """
+        sources = []
+        for array_name, group in ("x", self.inputs[:arrays]), ("p", self.inputs[len(self.inputs[:arrays]) :]):
+            sources += [f"{array_name}[{i}]" for i in range(sum(map(len, group)))]
+        targets = [f"out[{i}]" for i in range(sum(map(len, self.outputs)))]
+        return "\n    ".join([f"def {name}(x, p, out):", *self.body(sources, targets), "return"]) + "\n"
+
+
+def scalarize(closed: ClosedJaxpr, known: Sequence | None = None, limit: int = LIMIT) -> Program:
+    """Unroll a closed jaxpr, as ``jax.make_jaxpr`` gives it, into scalar instructions.
+
+    Parameters
+    ----------
+    closed : ClosedJaxpr
+        Of a function of float64 arrays.
+    known : sequence, optional
+        For each input array None, or an array of its shape: a number fixes that entry at compile time, NaN leaves it to
+        run time. (A parameter matrix that is diagonal may as well be so in the program.)
+    limit : int
+        Largest number of instructions.
+
+    Raises
+    ------
+    UnsupportedPrimitive
+        Where there is no rule for a primitive, where indices depend on the input, or beyond the limit.
+    """
+    builder = Builder(limit)
+    inputs, arguments = [], []
+    for i, var in enumerate(closed.jaxpr.invars):
+        if var.aval.dtype != np.float64:
+            raise InputError(f"argument {i} of a compiled function must be of float64, not of {var.aval.dtype}")
+        names = [f"x{i}_{j}" for j in range(math.prod(var.aval.shape))]
+        fixed = None if known is None or known[i] is None else np.asarray(known[i], dtype=np.float64)
+        entries = (
+            names if fixed is None else [n if v != v else v for n, v in zip(names, fixed.ravel().tolist(), strict=True)]
+        )
+        inputs.append(tuple(names))
+        arguments.append(array(entries, var.aval.shape))
+    results = _unroll(builder, closed.jaxpr, closed.consts, arguments)
+    outputs = [x.ravel().tolist() for x in results]
+    instructions, renamed = _live(builder.instructions, [a for entries in outputs for a in entries])
+    return Program(
+        tuple(inputs),
+        instructions,
+        tuple(tuple(renamed.get(a, a) if type(a) is str else a for a in entries) for entries in outputs),
+        tuple(x.shape for x in results),
+    )
+
+
+def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The outputs of a jaxpr as arrays of scalars."""
+    values = dict(zip(jaxpr.constvars, map(constant, consts), strict=True))
+    values.update(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(v) -> np.ndarray:
+        return constant(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v]
+
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        try:
+            rule = CONTROL.get(name) or RULES.get(name)
+            if rule is None:
+                raise NotImplementedError
+            found = rule(b, eqn, *map(read, eqn.invars))
+        except NotImplementedError as error:
+            if isinstance(error, UnsupportedPrimitive):  # from inside
+                raise
+            raise UnsupportedPrimitive(name, _where(eqn), str(error)) from None
+        except LimitExceededError:
+            reason = f"within the size limit: the program exceeds {b.limit} scalar instructions"
+            raise UnsupportedPrimitive(name, _where(eqn), reason) from None
+        results = found if isinstance(found, list) else [found]
+        for var, result in zip(eqn.outvars, results, strict=True):
+            _check(name, eqn, var.aval, result)
+            values[var] = result
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _check(name, eqn, aval, result: np.ndarray) -> None:
+    """Refuse types whose arithmetic differs from that of Python's float, int and bool."""
+    assert result.shape == aval.shape, f"{name}: {result.shape} is not {aval.shape}"
+    if aval.dtype in (np.float64, np.int64, np.bool_):
+        return
+    harmless = name == "convert_element_type" and eqn.invars[0].aval.dtype == bool  # 0 and 1 do not overflow
+    if np.issubdtype(aval.dtype, np.signedinteger) and (harmless or not any(type(a) is str for a in result.flat)):
+        return
+    raise UnsupportedPrimitive(name, _where(eqn), f"with a result of dtype {aval.dtype}")
+
+
+# -- primitives that contain jaxprs -----------------------------------------------------------------------------------
+
+
+def _call(b, eqn, *arguments):
+    inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+    if isinstance(inner, ClosedJaxpr):
+        return _unroll(b, inner.jaxpr, inner.consts, arguments)
+    return _unroll(b, inner, (), arguments)
+
+
+def _cond(b, eqn, index, *arguments):
+    """Every branch, then a choice of results: the branches are pure."""
+    branches = eqn.params["branches"]
+    which = index.item()
+    if type(which) is not str:
+        branches = (branches[min(max(which, 0), len(branches) - 1)],)
+    *others, chosen = (_unroll(b, branch.jaxpr, branch.consts, arguments) for branch in branches)
+    for i in reversed(range(len(others))):
+        first = b.op("le", which, i)
+        chosen = [
+            elementwise(lambda u, v, c=first: b.select(c, u, v), x, y) for x, y in zip(others[i], chosen, strict=True)
+        ]
+    return chosen
+
+
+def _scan(b, eqn, *arguments):
+    """A loop of known length, unrolled."""
+    params = eqn.params
+    inner, consts, carried = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
+    carry, slices = list(arguments[consts:carried]), arguments[carried:]
+    rows = range(params["length"])
+    gathered = []
+    for i in reversed(rows) if params["reverse"] else rows:
+        results = _unroll(b, inner.jaxpr, inner.consts, [*arguments[:consts], *carry, *(x[i, ...] for x in slices)])
+        carry = results[: len(carry)]
+        gathered.append(results[len(carry) :])
+    if params["reverse"]:
+        gathered.reverse()
+    stacked = [
+        array([a for row in gathered for a in row[k].flat], var.aval.shape)
+        for k, var in enumerate(eqn.outvars[len(carry) :])
+    ]
+    return carry + stacked
+
+
+CONTROL = {
+    **dict.fromkeys(
+        ["jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat", "remat2"], _call
+    ),
+    "cond": _cond,
+    "scan": _scan,
+}
+
+
+# -- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _live(
+    instructions: Sequence[Instruction], results: Sequence[Scalar]
+) -> tuple[tuple[Instruction, ...], dict[str, str]]:
+    """The instructions that results depend on, each as late as its first use allows, and their new names.
+
+    Computing a value just before it is used keeps few alive at a time: registers are scarce.
+    """
+    defined = {instruction.target: instruction for instruction in instructions}
+    order: list[Instruction] = []
+    renamed: dict[Scalar, str] = {}
+    for result in results:
+        stack = [result]
+        while stack:
+            instruction = defined.get(stack[-1])
+            if instruction is None or instruction.target in renamed:
+                stack.pop()
+            elif missing := [a for a in instruction.args if a in defined and a not in renamed]:
+                stack.extend(reversed(missing))
+            else:
+                args = tuple(renamed.get(a, a) if type(a) is str else a for a in instruction.args)
+                renamed[stack.pop()] = f"t{len(order)}"
+                order.append(Instruction(f"t{len(order)}", instruction.op, args))
+    return tuple(order), renamed
+
+
+def _number(a: float) -> str:
+    """A number as Python source, safe inside any expression."""
+    if isinstance(a, float) and not math.isfinite(a):
+        return "np.nan" if a != a else "np.inf" if a > 0 else "(-np.inf)"
+    return repr(a) if not repr(a).startswith("-") else f"({a!r})"
+
+
+def _where(eqn) -> str:
+    """The innermost line outside JAX that led to an equation."""
+    for frame in getattr(eqn.source_info.traceback, "frames", ()):
+        if not {"jax", "jaxlib", "equinox"} & set(Path(frame.file_name).parts):
+            return f"{Path(frame.file_name).name}:{frame.line_num}, in {frame.function_name}"
+    return "of unknown origin"
