@@ -8,6 +8,7 @@ import math
 import os
 import sys
 import time
+import warnings
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engine import array
+from .engine import array, compiled
+from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
 from .solution import Laws, Solution, Stats, Status
@@ -30,8 +32,18 @@ CHUNK_SAVES = 1024
 CHUNK_STEPS = 100_000
 """Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
 
+COMPILED_STEPS = 200_000
+"""Steps from which "auto" compiles: the array engine would take longer for them than the compiler does."""
+
+COMPILED_DIM = 40
+"""Components up to which unrolled scalar code is a good idea."""
+
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
+
+
+class CompiledEngineWarning(UserWarning):
+    """A system that the compiled engine cannot run, so that the array engine does."""
 
 
 def integrate(
@@ -42,7 +54,7 @@ def integrate(
     method: OneStepMethod | Reference | None = None,
     *,
     save_every: int = 1,
-    engine: Literal["auto", "array"] = "auto",
+    engine: Literal["auto", "array", "compiled"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
     save_to: str | os.PathLike | None = None,
@@ -61,7 +73,10 @@ def integrate(
         ``MetriplecticMidpoint()`` by default.
     save_every : int
         Keep every so-manieth state, and the last; the laws are followed at every step all the same.
-    engine : {"auto", "array"}
+    engine : {"auto", "array", "compiled"}
+        JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
+        more, after some seconds of compiling the first time. "auto" compiles for runs that are long enough to repay
+        it, and falls back, with a warning, where the system uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -88,7 +103,7 @@ def integrate(
     _check(system, t_span, step, save_every, engine, on_failure)
     x = system.state(x0)
     span = (float(t_span[0]), float(t_span[1]))
-    run = _Run(system, method, x, span, float(step), save_every, save_to)
+    run = _Run(system, method, x, span, float(step), save_every, save_to, engine)
     with _Progress(span, progress) as bar:
         (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
     solution = run.solution()
@@ -104,7 +119,7 @@ def integrate(
 class _Run:
     """A run under way: what has been saved, and how it stands."""
 
-    def __init__(self, system, method, x0, span, h, every, save_to):
+    def __init__(self, system, method, x0, span, h, every, save_to, engine):
         self.system, self.method, self.span, self.h, self.every = system, method, span, h, every
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
@@ -118,6 +133,9 @@ class _Run:
         self.last = span[1] - (span[0] + self.steps * h)
         if self.last <= 1e-12 * (span[1] - span[0]):
             self.last = 0.0
+        long = self.steps >= COMPILED_STEPS and system.dim <= COMPILED_DIM
+        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and long) else "array"
+        self.fallback = engine == "auto"
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -142,7 +160,17 @@ class _Run:
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
-        state, (x, reached) = array.advance(self.system, self.method, state, h, saves, every, capacity)
+        arguments = (self.system, self.method, state, h, saves, every, capacity)
+        if self.engine == "compiled":
+            try:
+                state, (x, reached) = compiled.advance(*arguments)
+            except UnsupportedPrimitive as error:
+                if not self.fallback:
+                    raise
+                warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=5)
+                self.engine = "array"
+        if self.engine == "array":
+            state, (x, reached) = array.advance(*arguments)
         kept = int(np.asarray(reached).sum())
         states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
         if int(state.step) > before + every * kept:  # it failed between two saves: keep what there is
@@ -249,6 +277,7 @@ class _Run:
             "jax": jax.__version__,
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "method": str(self.method),
+            "engine": None if isinstance(self.method, Reference) else self.engine,
             "step": self.h,
             "t_span": list(self.span),
             "save_every": self.every,
@@ -283,8 +312,8 @@ def _check(system, t_span, step, save_every, engine, on_failure) -> None:
         raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
     if isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1:
         raise InputError(f"save_every must be a positive integer, not {save_every!r}")
-    if engine not in ("auto", "array"):
-        raise InputError(f"engine must be 'auto' or 'array', not {engine!r}")
+    if engine not in ("auto", "array", "compiled"):
+        raise InputError(f"engine must be 'auto', 'array' or 'compiled', not {engine!r}")
     if on_failure not in ("raise", "return"):
         raise InputError(f"on_failure must be 'raise' or 'return', not {on_failure!r}")
 

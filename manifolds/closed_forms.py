@@ -53,8 +53,7 @@ def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     largest = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     q = jnp.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
     q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
-    x = _rotation_vector(q[..., 0], q[..., 1:])
-    return jnp.where(_square(x) <= (math.pi - HALF_TURN_MARGIN) ** 2, x, jnp.nan)
+    return _rotation_vector(q[..., :1], q[..., 1:], math.pi - HALF_TURN_MARGIN)
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -93,8 +92,7 @@ def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
     a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
     w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
-    x = _rotation_vector(w, v)
-    return jnp.where(_square(x) <= (2 * (math.pi - HALF_TURN_MARGIN)) ** 2, x, jnp.nan)
+    return _rotation_vector(w[..., None], v, 2 * (math.pi - HALF_TURN_MARGIN))
 
 
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -194,8 +192,9 @@ def _square(x: jax.Array) -> jax.Array:
     return jnp.sum(x**2, axis=-1, keepdims=True)
 
 
-def _rotation_vector(w: jax.Array, v: jax.Array) -> jax.Array:
-    """Twice the angle of the quaternion (w, v), of any norm, times its axis."""
-    size = jnp.linalg.norm(v, axis=-1)
-    factor = jnp.where(size > 0, 2 * jnp.arctan2(size, w) / jnp.where(size > 0, size, 1.0), 2.0 / w)
-    return factor[..., None] * v
+def _rotation_vector(w: jax.Array, v: jax.Array, limit: float) -> jax.Array:
+    """Twice the angle of the quaternion (w, v), of any norm, times its axis; NaN above the limit."""
+    size = jnp.linalg.norm(v, axis=-1, keepdims=True)
+    angle = 2 * jnp.arctan2(size, w)
+    x = jnp.where(size > 0, angle / jnp.where(size > 0, size, 1.0), 2.0 / w) * v
+    return jnp.where(angle <= limit, x, jnp.nan)

@@ -157,20 +157,27 @@ def _norm(matrix) -> jax.Array:
 
 
 def _eliminate(a, b):
-    """Solution of ``a x = b`` and determinant of a."""
+    """Solution of ``a x = b`` and determinant of a.
+
+    In each step the pivot column leaves the table on the left and the pivot row enters at the bottom, so that the
+    program needs no indices that vary.
+    """
     m = a.shape[-1]
     row = jnp.arange(m)
 
     def step(k, state):
         table, det = state
-        best = jnp.argmax(jnp.where(row >= k, jnp.abs(table[..., k]), -1.0), axis=-1)[..., None]
-        exchanged = jnp.where(row == k, best, jnp.where(row == best, k, row))
-        table = jnp.take_along_axis(table, exchanged[..., None], axis=-2)
-        pivot = table[..., k, k]
-        pivot_row = (table[..., k, :] / pivot[..., None])[..., None, :]
-        table = jnp.where((row == k)[:, None], pivot_row, table - table[..., k][..., None] * pivot_row)
-        return table, det * jnp.where(best[..., 0] == k, pivot, -pivot)
+        column = table[..., 0]
+        best = jnp.argmax(jnp.where(row < m - k, jnp.abs(column), -1.0), axis=-1)[..., None]
+        chosen = (row == best)[..., None]
+        pivot_row = jnp.where(chosen, table, 0.0).sum(axis=-2, keepdims=True)
+        pivot = pivot_row[..., :1]
+        pivot_row = pivot_row / pivot
+        rest = jnp.where(chosen, table[..., :1, :], table)[..., 1:, :]
+        table = jnp.concatenate([rest - rest[..., :1] * pivot_row, pivot_row], axis=-2)
+        table = jnp.concatenate([table[..., 1:], jnp.zeros_like(table[..., :1])], axis=-1)
+        return table, det * jnp.where(best == 0, pivot[..., 0], -pivot[..., 0])[..., 0]
 
     start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
     table, det = jax.lax.fori_loop(0, m, step, start)
-    return table[..., m:], det
+    return table[..., : b.shape[-1]], det

@@ -5,7 +5,7 @@ import jax
 import pytest
 
 hypothesis.settings.register_profile(
-    "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=10
+    "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=6
 )
 hypothesis.settings.load_profile("liethermo")
 

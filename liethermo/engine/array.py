@@ -152,7 +152,7 @@ class State(eqx.Module):
 def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
-    energy, entropy = _values(system, x)
+    energy, entropy = values(system, x)
     zero, count = jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
     return State(
         x=x,
@@ -188,7 +188,7 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     new = x + increment
     back = new - x
     new_low = (x - (new - back)) + (increment - back)
-    energy, entropy = _values(system, new)
+    energy, entropy = values(system, new)
     finite = jnp.isfinite(jnp.sum(new) + energy + entropy)
     good = solved.converged & finite
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
@@ -239,6 +239,7 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves, every
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
 
 
-def _values(system: System, x) -> tuple[jax.Array, jax.Array]:
+def values(system: System, x) -> tuple[jax.Array, jax.Array]:
+    """Energy and entropy at one state, shape (n,); zero in place of an entropy that the system does not have."""
     entropy = jnp.zeros(()) if system.entropy is None else system.entropy.value(x)
     return system.energy.value(x), entropy

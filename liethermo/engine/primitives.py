@@ -98,11 +98,11 @@ class LimitExceededError(Exception):
 
 
 class Builder:
-    """Collects instructions. Each method returns the scalar that holds its result.
+    """Collects instructions; each method returns the scalar that holds its result.
 
-    No instruction is emitted where its result is known, equals an earlier one, or differs from it by a sign that can be
-    moved on. Everything is exact, to the sign of a zero, with one agreed exception: a structural zero times anything is
-    zero, and so is a structural zero divided by anything. Sums are never reassociated.
+    Nothing is emitted for a result that is known, equals an earlier one, or is one but for a sign that can be moved on.
+    All this is exact, save for the sign of a zero and one licence: a structural zero times anything, or divided by
+    anything, is zero. Sums are never reassociated.
     """
 
     def __init__(self, limit: int):
@@ -115,8 +115,8 @@ class Builder:
         """The result of an operation, with no simplification but constants folded and equal expressions merged."""
         if not any(type(a) is str for a in args):
             return fold(op, *args)
-        if op in COMMUTATIVE and (type(args[1]) is not str or (type(args[0]) is str and args[1] < args[0])):  # type: ignore[operator]
-            args = args[::-1]
+        if op in COMMUTATIVE:
+            args = tuple(sorted(args, key=str))
         key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
         name = self._emitted.get(key)
         if name is None:
@@ -187,11 +187,11 @@ class Builder:
                 return self.neg(result(opposite))
         return self.op(op, a, b)
 
-    def integer_pow(self, a, n: int):
+    def integer_pow(self, a, n: int, one: Scalar = 1.0):
         """``a**n`` by repeated squaring."""
         if n < 0:
-            return self.div(1.0, self.integer_pow(a, -n))
-        result: Scalar = 1.0
+            return self.div(one, self.integer_pow(a, -n))
+        result = one
         while n:
             if n & 1:
                 result = self.mul(result, a)
@@ -323,6 +323,11 @@ def _integer_quotient(a, n):
     return abs(a) // abs(n) * (1 if (a < 0) == (n < 0) else -1)
 
 
+def _integer_pow(b, eqn, x):
+    one = _dtype(eqn).type(1).item()
+    return elementwise(lambda a: b.integer_pow(a, eqn.params["y"], one), x)
+
+
 def _not(b, eqn, x):
     if _dtype(eqn) != bool:
         raise NotImplementedError("on the bits of integers")
@@ -358,11 +363,13 @@ def _convert(b, eqn, x):
     return elementwise(lambda a: b.op("int" if old == bool else "truncate", a), x)
 
 
-def _reduction(combine: Callable[..., Scalar], empty: Scalar) -> Rule:
+def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> Rule:
     def rule(b, eqn, x):
         rows, shape = _rows(x, eqn.params["axes"])
-        start = _dtype(eqn).type(empty).item() if x.size == 0 else empty
-        return array([reduce(lambda u, v: combine(b, u, v), row) if row else start for row in rows], shape)
+        if start is None and not all(rows):
+            raise NotImplementedError("of no entries")
+        empty = None if start is None else _dtype(eqn).type(start).item()
+        return array([reduce(lambda u, v: combine(b, u, v), row) if row else empty for row in rows], shape)
 
     return rule
 
@@ -394,7 +401,7 @@ def _cumulative(combine: Callable[..., Scalar]) -> Rule:
         axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
         rows, shape = _rows(x, (axis,))
         sums = [list(itertools.accumulate(row[::step], lambda u, v: combine(b, u, v)))[::step] for row in rows]
-        return np.moveaxis(array(sum(sums, []), (*shape, x.shape[axis])), -1, axis)
+        return np.moveaxis(array([a for row in sums for a in row], (*shape, x.shape[axis])), -1, axis)
 
     return rule
 
@@ -419,6 +426,10 @@ def _broadcast(x, params):
     inner = np.ones(len(params["shape"]), int)
     inner[list(params["broadcast_dimensions"])] = x.shape
     return np.broadcast_to(x.reshape(inner), params["shape"])
+
+
+def _reshape(x, params):
+    return (x if params["dimensions"] is None else x.transpose(params["dimensions"])).reshape(params["new_sizes"])
 
 
 def _iota(b, eqn):
@@ -493,16 +504,22 @@ def _scatter(b, eqn, x, indices, updates):
     return array([entries[i] for i in came_from.ravel()], came_from.shape)
 
 
-def _scatter_add(b, eqn, x, indices, updates):
-    where = integers(indices).astype(_dtype(eqn, 1))
-    # The transpose of scattering tells each update which entry it goes to; 0 for one that is dropped.
-    scatter = lambda u: eqn.primitive.bind(jnp.zeros(x.shape), where, u, **eqn.params)  # noqa: E731
-    numbers = jnp.arange(1.0, x.size + 1).reshape(x.shape)
-    (goes_to,) = jax.vjp(scatter, jnp.zeros(updates.shape))[1](numbers)
-    entries = [0.0, *x.ravel().tolist()]
-    for i, u in zip(np.asarray(goes_to, int).flat, updates.flat, strict=True):
-        entries[i] = b.add(entries[i], u)
-    return array(entries[1:], x.shape)
+def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
+    def rule(b, eqn, x, indices, updates):
+        where = integers(indices).astype(_dtype(eqn, 1))
+        options = {key: eqn.params[key] for key in ("dimension_numbers", "mode")}
+
+        def scatter(u):
+            return jax.lax.scatter_add(jnp.zeros(x.shape), where, u, **options)
+
+        # The transpose of scattering tells each update which entry it goes to; 0 for one that is dropped.
+        (goes_to,) = jax.linear_transpose(scatter, jnp.zeros(updates.shape))(jnp.arange(1.0, x.size + 1).reshape(x.shape))
+        entries = [0.0, *x.ravel().tolist()]
+        for i, u in zip(np.asarray(goes_to, int).flat, updates.flat, strict=True):
+            entries[i] = combine(b, entries[i], u) if i else 0.0
+        return array(entries[1:], x.shape)
+
+    return rule
 
 
 def _cholesky(b, eqn, a):
@@ -544,22 +561,59 @@ RULES: dict[str, Rule] = {
     "div": _divide,
     "rem": _remainder,
     "square": lambda b, eqn, x: elementwise(b.mul, x, x),
-    "integer_pow": lambda b, eqn, x: elementwise(lambda a: b.integer_pow(a, eqn.params["y"]), x),
+    "integer_pow": _integer_pow,
     "rsqrt": lambda b, eqn, x: elementwise(lambda a: b.div(1.0, b.op("sqrt", a)), x),
     "clamp": _clamp,
     "round": _round,
     **{
         name: _plain(name)
-        for name in ["abs", "sign", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor"]
+        for name in [
+            "abs",
+            "sign",
+            "sqrt",
+            "cbrt",
+            "exp",
+            "exp2",
+            "expm1",
+            "log",
+            "log1p",
+            "sin",
+            "cos",
+            "tan",
+            "asin",
+            "acos",
+            "atan",
+            "atan2",
+            "sinh",
+            "cosh",
+            "tanh",
+            "asinh",
+            "acosh",
+            "atanh",
+            "erf",
+            "erfc",
+            "floor",
+            "ceil",
+            "is_finite",
+            "eq",
+            "ne",
+            "lt",
+            "le",
+            "gt",
+            "ge",
+            "and",
+            "or",
+            "xor",
+        ]
     },
     "not": _not,
     "select_n": _select,
     "convert_element_type": _convert,
-    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), _alike),
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "name", "optimization_barrier"), _alike),
     "reduce_sum": _reduction(Builder.add, 0),
     "reduce_prod": _reduction(Builder.mul, 1),
-    "reduce_max": _reduction(Builder.max, -math.inf),
-    "reduce_min": _reduction(Builder.min, math.inf),
+    "reduce_max": _reduction(Builder.max),
+    "reduce_min": _reduction(Builder.min),
     "reduce_and": _reduction(_op("and"), True),
     "reduce_or": _reduction(_op("or"), False),
     "argmax": _arg_extreme("gt"),
@@ -570,12 +624,16 @@ RULES: dict[str, Rule] = {
     "cummin": _cumulative(Builder.min),
     "dot_general": _dot_general,
     "broadcast_in_dim": _move(_broadcast),
-    **{name: lambda b, eqn, x: x.reshape(eqn.outvars[0].aval.shape) for name in ("reshape", "squeeze", "expand_dims")},
+    "reshape": _move(_reshape),
+    **{name: lambda b, eqn, x: x.reshape(eqn.outvars[0].aval.shape) for name in ("squeeze", "expand_dims")},
     "transpose": _move(lambda x, params: x.transpose(params["permutation"])),
     "rev": _move(lambda x, params: np.flip(x, params["dimensions"])),
     "slice": _move(_slice),
     "split": _move(_split),
     "concatenate": lambda b, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
+    "stack": lambda b, eqn, *xs: np.stack(xs, axis=eqn.params["axis"]),
+    "unstack": _move(lambda x, params: list(np.moveaxis(x, params["axis"], 0))),
+    "tile": _move(lambda x, params: np.tile(x, params["reps"])),
     "pad": _pad,
     "iota": _iota,
     "platform_index": _platform_index,
@@ -583,8 +641,21 @@ RULES: dict[str, Rule] = {
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
     "scatter": _scatter,
-    "scatter-add": _scatter_add,
+    "scatter-add": _scatter_combining(Builder.add),
+    "scatter-sub": _scatter_combining(Builder.sub),
+    "scatter-mul": _scatter_combining(Builder.mul),
+    "scatter-min": _scatter_combining(Builder.min),
+    "scatter-max": _scatter_combining(Builder.max),
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
 }
 """How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.engine.scalarize`."""
+
+PARAMETERS = set(
+    """accuracy axes axis broadcast_dimensions conjugate_a dimension dimension_numbers dimensions dtype fill_value
+    index_dtype indices_are_sorted left_side limit_indices lower mode name new_dtype new_sizes out_sharding padding_config
+    permutation platforms precision preferred_element_type reps reverse rounding_method shape sharding sizes slice_sizes
+    start_indices strides transpose_a unique_indices unit_diagonal update_consts update_jaxpr weak_type y""".split()
+)
+"""Parameters of primitives that the rules heed, or that do not matter here. One that is not among them, if it is set, may
+mean anything: the primitive is refused."""

@@ -20,6 +20,7 @@ from ..errors import InputError, LiethermoError
 from .primitives import (
     FUNCTIONS,
     OPERATIONS,
+    PARAMETERS,
     RULES,
     Builder,
     Instruction,
@@ -33,8 +34,10 @@ from .primitives import (
 LIMIT = 200_000
 """Instructions that a program may have: far more than compile in reasonable time."""
 
+UNKNOWN = "of unknown origin"
 
-class UnsupportedPrimitive(LiethermoError, NotImplementedError):
+
+class UnsupportedPrimitive(LiethermoError):
     """A function that cannot be unrolled.
 
     Attributes
@@ -43,13 +46,14 @@ class UnsupportedPrimitive(LiethermoError, NotImplementedError):
         The JAX primitive in the way.
     where : str
         The line of the user's code that called for it, as far as JAX knows.
+    reason : str
+        What about it is not supported, where it is not the primitive as such.
     """
 
     def __init__(self, primitive: str, where: str, reason: str = ""):
-        self.primitive, self.where = primitive, where
-        super().__init__(
-            f"the compiled engine cannot run the JAX primitive {primitive!r} {reason}".rstrip() + f" ({where})"
-        )
+        self.primitive, self.where, self.reason = primitive, where, reason
+        refusal = f"the compiled engine cannot run the JAX primitive {primitive!r} {reason}".rstrip()
+        super().__init__(f"{refusal} ({where})")
 
 
 @dataclass(frozen=True)
@@ -181,33 +185,52 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         try:
-            rule = CONTROL.get(name) or RULES.get(name)
-            if rule is None:
-                raise NotImplementedError
-            found = rule(b, eqn, *map(read, eqn.invars))
+            _check_equation(eqn)
+            found = (CONTROL.get(name) or RULES.get(name) or _refuse)(b, eqn, *map(read, eqn.invars))
+            results = found if isinstance(found, list) else [found]
+            _check_results(eqn, results)
         except NotImplementedError as error:
-            if isinstance(error, UnsupportedPrimitive):  # from inside
-                raise
             raise UnsupportedPrimitive(name, _where(eqn), str(error)) from None
+        except UnsupportedPrimitive as inside:
+            if inside.where != UNKNOWN:
+                raise
+            raise UnsupportedPrimitive(inside.primitive, _where(eqn), inside.reason) from None
         except LimitExceededError:
             reason = f"within the size limit: the program exceeds {b.limit} scalar instructions"
             raise UnsupportedPrimitive(name, _where(eqn), reason) from None
-        results = found if isinstance(found, list) else [found]
-        for var, result in zip(eqn.outvars, results, strict=True):
-            _check(name, eqn, var.aval, result)
-            values[var] = result
+        values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _check(name, eqn, aval, result: np.ndarray) -> None:
-    """Refuse types whose arithmetic differs from that of Python's float, int and bool."""
-    assert result.shape == aval.shape, f"{name}: {result.shape} is not {aval.shape}"
-    if aval.dtype in (np.float64, np.int64, np.bool_):
-        return
-    harmless = name == "convert_element_type" and eqn.invars[0].aval.dtype == bool  # 0 and 1 do not overflow
-    if np.issubdtype(aval.dtype, np.signedinteger) and (harmless or not any(type(a) is str for a in result.flat)):
-        return
-    raise UnsupportedPrimitive(name, _where(eqn), f"with a result of dtype {aval.dtype}")
+def _refuse(b, eqn, *arguments):
+    raise NotImplementedError
+
+
+def _check_equation(eqn) -> None:
+    """Refuse what the rules were not written for."""
+    if eqn.primitive.name in RULES:
+        for name, value in eqn.params.items():
+            if name not in PARAMETERS and value is not None:
+                raise NotImplementedError(f"with {name}={value}")
+    for var in (*eqn.invars, *eqn.outvars):
+        if getattr(getattr(var.aval, "dtype", None), "kind", None) not in ("f", "i", "b"):
+            raise NotImplementedError(f"on {var.aval}")
+
+
+def _check_results(eqn, results: Sequence[np.ndarray]) -> None:
+    """Refuse what Python's float and int would not compute alike: other precisions, integers that could wrap around."""
+    truth = eqn.primitive.name == "convert_element_type" and eqn.invars[0].aval.dtype == bool
+    for var, result in zip(eqn.outvars, results, strict=True):
+        dtype = var.aval.dtype
+        assert result.shape == var.aval.shape, f"{eqn.primitive.name}: {result.shape} is not {var.aval.shape}"
+        if dtype.kind == "f" and dtype != np.float64:
+            raise NotImplementedError(f"on {dtype}")
+        if dtype.kind == "i":
+            limits, numbers = np.iinfo(dtype), [a for a in result.flat if type(a) is not str]
+            if len(numbers) < result.size and dtype != np.int64 and not truth:
+                raise NotImplementedError(f"on {dtype} at run time")
+            if not all(limits.min <= a <= limits.max for a in numbers):
+                raise NotImplementedError(f"beyond the range of {dtype}")
 
 
 # -- primitives that contain jaxprs -----------------------------------------------------------------------------------
@@ -218,6 +241,13 @@ def _call(b, eqn, *arguments):
     if isinstance(inner, ClosedJaxpr):
         return _unroll(b, inner.jaxpr, inner.consts, arguments)
     return _unroll(b, inner, (), arguments)
+
+
+def _linear_solve(b, eqn, *arguments):
+    """The user's way of solving; the matrix is only there for derivatives, and they have been taken."""
+    sizes, solve = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
+    start = sizes.matvec + sizes.vecmat
+    return _unroll(b, solve.jaxpr, solve.consts, [*arguments[start : start + sizes.solve], *arguments[sum(sizes) :]])
 
 
 def _cond(b, eqn, index, *arguments):
@@ -256,9 +286,11 @@ def _scan(b, eqn, *arguments):
 
 
 CONTROL = {
-    **dict.fromkeys(
-        ["jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat", "remat2"], _call
-    ),
+    **{
+        name: _call
+        for name in """jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2""".split()
+    },
+    "custom_linear_solve": _linear_solve,
     "cond": _cond,
     "scan": _scan,
 }
@@ -304,4 +336,4 @@ def _where(eqn) -> str:
     for frame in getattr(eqn.source_info.traceback, "frames", ()):
         if not {"jax", "jaxlib", "equinox"} & set(Path(frame.file_name).parts):
             return f"{Path(frame.file_name).name}:{frame.line_num}, in {frame.function_name}"
-    return "of unknown origin"
+    return UNKNOWN

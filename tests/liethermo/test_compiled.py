@@ -1,0 +1,198 @@
+"""The compiled engine: trajectories, statuses and work as in the array engine, and a cache that breaks no run."""
+
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engine import compiled, step_loop
+from tests.cases import DISSIPATIONS, build, state_of
+
+BODY = lt.models.rigid_body()
+X0 = [0.001, 1.0, 0.001]
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path_factory.getbasetemp() / "liethermo"))
+
+
+def both(system, x0, span, h, method=None, **options):
+    return [
+        lt.integrate(system, x0, span, h, method, engine=engine, on_failure="return", **options)
+        for engine in ("array", "compiled")
+    ]
+
+
+def assert_same(a, b, tolerance=1e-13):
+    assert (a.status.code, a.status.step, a.laws) == (b.status.code, b.status.step, b.laws)
+    assert np.array_equal(a.t, b.t)
+    assert np.abs(a.x - b.x).max() <= tolerance * np.abs(a.x).max()
+    # the plateau is met an iteration earlier or later as rounding has it
+    assert b.stats.iterations_per_step == pytest.approx(a.stats.iterations_per_step, rel=0.05)
+
+
+CASES = [
+    ("so(3)", "projected", "gonzalez"),
+    ("so(3)", "double_bracket", "mean_value"),
+    ("so(3)", "friction_operator", "symmetric_coordinate_increment"),
+    ("so(3)", "projected_preserve", "gonzalez"),
+    ("se(3)", "force", "gonzalez"),
+    ("sl(2)", "killing", "coordinate_increment"),
+    ("su(3)", "kulkarni_nomizu", "gonzalez"),
+]
+
+
+def cases():
+    for i, case in enumerate(CASES):
+        yield pytest.param(*case, marks=pytest.mark.slow if i > 1 else (), id="-".join(case))
+
+
+@pytest.mark.parametrize(("algebra", "dissipation", "gradient"), cases())
+def test_same_trajectories(algebra, dissipation, gradient):
+    g = next(g for g in (mf.so(3), mf.se(3), mf.sl(2), mf.su(3)) if g.name == algebra)
+    system = build(g, next(case for case in DISSIPATIONS if case.name == dissipation))
+    a, b = both(system, state_of(g, 1), (0.0, 2.0), 0.02, lt.MetriplecticMidpoint(gradient))
+    assert b.provenance["engine"] == "compiled"
+    assert_same(a, b, 1e-12)
+    if system.energy_law == "conserved":
+        assert b.audit().energy_drift <= 2e-14
+
+
+def test_the_body_of_the_paper():
+    a, b = both(BODY, X0, (0.0, 500.05), 0.1)
+    assert_same(a, b)
+    assert b.audit(energy=1e-14).passed
+    assert b.entropy[-1] == pytest.approx(10 * b.energy[0], rel=1e-14)
+
+
+@pytest.mark.parametrize("every", [7, 10_000])
+def test_save_every(every):
+    assert_same(*both(BODY, X0, (0.0, 30.05), 0.1, save_every=every))
+
+
+def test_newton_on_demand():
+    """The module with a Jacobian is made where a step first asks for it, in the middle of a save interval too."""
+    stiff = lt.models.rigid_body(rate=200.0)
+    a, b = both(stiff, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, save_every=3)
+    assert b.stats.newton_iterations > 0
+    assert (a.status.code, np.array_equal(a.t, b.t)) == ("completed", True)
+    assert np.abs(a.x - b.x).max() < 1e-13
+    assert b.audit().passed
+
+
+def test_failures_are_the_same():
+    too_large = lt.LiePoissonSystem(
+        mf.so(3), lambda p: jnp.sum(jnp.sin(40.0 * p)), lt.Quadratic(np.ones(3)), lt.KillingDissipation()
+    )
+    a, b = both(too_large, [0.3, 1.0, -0.2], (0.0, 500.0), 50.0)
+    assert a.status.code == b.status.code == "not_converged"
+    leaves_its_domain = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p * p / jnp.array([10.0, 5.0, 1.0])) + 1e-3 * jnp.sqrt(1.1 - p[0]),
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.5),
+        validate=False,
+    )
+    a, b = both(leaves_its_domain, X0, (0.0, 500.0), 0.1, save_every=7)
+    assert (a.status.code, a.status.step) == ("non_finite", b.status.step)
+    assert str(a.status).split(" near")[0] == str(b.status).split(" near")[0]
+    assert np.abs(a.x - b.x).max() < 1e-12
+
+
+def test_one_iteration_is_not_enough_and_says_so(monkeypatch):
+    monkeypatch.setattr(step_loop, "FIXED_POINT_LIMIT", 1)
+    monkeypatch.setattr(step_loop, "NEWTON_LIMIT", 1)
+    system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
+    solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.1, engine="compiled", on_failure="return")
+    assert solution.status.code == "not_converged"
+
+
+def test_parameters_are_arguments(monkeypatch):
+    """A sweep over inertias and rates compiles once; another pattern of zeros is another program."""
+    loaded = []
+    monkeypatch.setattr(compiled, "load", lambda *a, load=compiled.load: loaded.append(a[0]) or load(*a))
+    for inertia, rate in [((9.0, 4.0, 2.0), 0.3), ((7.0, 3.0, 1.0), 0.4), ((5.0, 4.0, 3.0), 0.5)]:
+        system = lt.models.rigid_body(inertia, rate)
+        a, b = both(system, X0, (0.0, 5.0), 0.1)
+        assert_same(a, b)
+    assert len(loaded) <= 1
+    assert_same(*both(lt.models.rigid_body((9.0, 4.0, 2.0), rate=0.0), X0, (0.0, 5.0), 0.1))
+
+    class Quartic(eqx.Module):
+        strength: jax.Array
+
+        def __call__(self, mu):
+            return 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0])) + self.strength * mu[0] ** 4
+
+    loaded.clear()
+    for strength in (0.1, 0.7):
+        system = lt.LiePoissonSystem(mf.so(3), Quartic(jnp.asarray(strength)), lt.Quadratic(np.ones(3)))
+        assert_same(*both(system, [0.5, 1.0, 0.2], (0.0, 5.0), 0.1), tolerance=1e-12)
+    assert len(loaded) == 1
+
+
+def unsupported():
+    def energy(mu):
+        return jnp.sum(jnp.sort(mu) ** 2 * jnp.array([1.0, 2.0, 3.0]))
+
+    return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), validate=False)
+
+
+def test_what_cannot_be_compiled(monkeypatch):
+    with pytest.raises(lt.LiethermoError, match="JAX primitive"):
+        lt.integrate(unsupported(), [0.5, 1.0, 0.2], (0.0, 1.0), 0.1, engine="compiled")
+    monkeypatch.setattr("liethermo.timeloop.COMPILED_STEPS", 5)
+    with pytest.warns(UserWarning, match=r"JAX primitive.*array engine"):
+        solution = lt.integrate(unsupported(), [0.5, 1.0, 0.2], (0.0, 1.0), 0.1)
+    assert solution.provenance["engine"] == "array"
+
+
+def test_auto_compiles_long_runs(monkeypatch):
+# -- the cache --------------------------------------------------------------------------------------------------
+    monkeypatch.setattr("liethermo.timeloop.COMPILED_STEPS", 5)
+    assert lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"] == "compiled"
+
+
+# -- the cache --------------------------------------------------------------------------------------------------------
+
+RUN = """
+import liethermo as lt
+print(lt.integrate(lt.models.rigid_body(), [0.001, 1.0, 0.001], (0.0, 5.0), 0.1, engine="compiled").x[-1].tolist())
+"""
+
+
+def in_a_process(folder):
+    result = subprocess.run(
+        [sys.executable, "-c", RUN], capture_output=True, text=True, env={**os.environ, "LIETHERMO_CACHE": str(folder)}
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_another_process_finds_the_cache_and_survives_damage(tmp_path):
+    folder = tmp_path / "cache"
+    first = in_a_process(folder)
+    modules = list(folder.glob("liethermo_step_*.py"))
+    assert len(modules) == 1
+    assert list(folder.rglob("*.nbc"))
+    for damaged in [
+        modules[0],
+        *folder.rglob("*.nbi"),
+        *folder.rglob("*.nbc"),
+    ]:  # as a killed process or a bad disk would
+        damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
+    assert in_a_process(folder) == first
+
+
+def test_a_folder_that_cannot_be_used(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert in_a_process(blocked / "cache") == in_a_process(tmp_path / "cache")

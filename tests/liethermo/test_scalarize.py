@@ -1,0 +1,656 @@
+"""Scalar programs from jaxprs: they agree with JAX to rounding, contain no needless operation, and refuse by name.
+
+Rounding is measured, not guessed: a program is run again with every result moved by a few units in its last place, and
+the spread is what rounding can do to it. A branch that rounding can turn (``floor`` of an integer) shows as a wide one.
+"""
+
+import dataclasses
+import math
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jax.extend.core import jaxprs_in_params
+from liethermo.engine.primitives import FUNCTIONS, OPERATIONS, RULES, Instruction
+from liethermo.engine.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize
+from liethermo.integrators import MetriplecticMidpoint, registered_methods
+
+from tests.cases import DISSIPATIONS, EPS, build, state_of
+
+rng = np.random.default_rng(0)
+
+
+def program_of(f, *args, **options) -> Program:
+    return scalarize(jax.make_jaxpr(f)(*map(jnp.asarray, args)), **options)
+
+
+def jax_values(f, *args) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(jax.jit(f)(*args))]
+
+
+def nudged(program: Program, args, seed: int) -> list[np.ndarray]:
+    """The outputs when every instruction's result is off by up to four units in its last place."""
+    noise = np.random.default_rng(seed)
+    values = dict(zip(sum(program.inputs, ()), np.concatenate([np.ravel(x) for x in args]), strict=True))
+    with np.errstate(all="ignore"):
+        for target, op, operands in program.instructions:
+            value = FUNCTIONS[op](*(values[a] if isinstance(a, str) else a for a in operands))
+            values[target] = value * (1.0 + EPS * noise.uniform(-4, 4)) if isinstance(value, np.float64) else value
+    return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
+
+
+def check(program: Program, args, expected: list[np.ndarray], found=None, hidden_nan: bool = False) -> None:
+    """Raise unless a program gives the expected outputs: numbers to rounding, NaN and infinity where they belong.
+
+    ``hidden_nan``: where JAX has NaN a number may stand, as a structural zero times NaN is zero.
+    """
+    found = program.evaluate(*args) if found is None else found
+    assert [a.shape for a in found] == [a.shape for a in expected]
+    runs = [nudged(program, args, seed) for seed in range(6)]
+    for i, (right, got) in enumerate(zip(expected, found, strict=True)):
+        right, got = right.astype(float).ravel(), got.astype(float).ravel()
+        moved = np.array([run[i] for run in runs])
+        steady = (kind(moved) == kind(got)).all(axis=0)
+        with np.errstate(all="ignore"):
+            spread = np.abs(moved - got).max(axis=0)
+            close = np.abs(got - right) <= 8 * spread + 16 * EPS * np.abs(right) + 1e-300
+        bad = ~np.where(np.isfinite(right), close, hidden_nan | (kind(right) == kind(got))) & steady
+        assert not bad.any(), f"output {i}: {got[bad]} is not {right[bad]}, spread {spread[bad]}"
+
+
+def kind(a):
+    """0 for a number, 1 for an infinity, 2 for NaN."""
+    return np.isinf(a) + 2 * np.isnan(a)
+
+
+def agrees(f, *args, **options) -> Program:
+    program = program_of(f, *args)
+    check(program, args, jax_values(f, *args), **options)
+    return program
+
+
+def compiled(program: Program, arrays=None):
+    space = {"np": np, "math": math}
+    exec(program.source(arrays), space)
+    return numba.njit(space["program"], error_model="numpy")
+
+
+# -- every primitive --------------------------------------------------------------------------------------------------
+
+x, y = rng.uniform(0.2, 0.9, (2, 3)), rng.uniform(-2.0, 2.0, (2, 3))
+v, w, c3 = rng.standard_normal(3), rng.standard_normal(5), rng.standard_normal((2, 3, 4))
+square = rng.standard_normal((3, 3))
+spd = square @ square.T + np.eye(3)
+
+
+@jax.custom_vjp
+def twice(a):
+    return 2.0 * a
+
+
+twice.defvjp(lambda a: (2.0 * a, None), lambda _, g: (3.0 * g,))
+
+
+def scatter(operand, updates, mode):
+    numbers = lax.ScatterDimensionNumbers((), (0,), (0,))
+    return lax.scatter_add(operand, np.array([[0], [2], [7], [0]]), updates, numbers, mode=mode)
+
+
+def both(f):
+    """A function and its derivative along a fixed direction."""
+    return lambda *args: jax.jvp(f, args, tuple(jnp.cos(3.0 * a) for a in args))
+
+
+unary = {
+    name: (both(getattr(lax, name)), x)
+    for name in """neg abs sign sqrt rsqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan sinh cosh tanh asinh
+    atanh logistic erf erfc square floor ceil""".split()
+}
+binary = {name: (both(getattr(lax, name)), y, x) for name in "add sub mul div max min atan2 rem".split()}
+compare = {name: (getattr(lax, name), np.round(y), np.round(2 * x)) for name in "eq ne lt le gt ge".split()}
+truth = {
+    name + "_": (lambda a, b, op=name: getattr(lax, f"bitwise_{op}")(a > 0.5, b > 0.0), x, y)
+    for name in ("and", "or", "xor")
+}
+
+CASES = {
+    **unary,
+    **binary,
+    **compare,
+    "and": truth["and_"],
+    "or": truth["or_"],
+    "xor": truth["xor_"],
+    "acosh": (both(lax.acosh), 1.0 + x),
+    "pow": (both(lax.pow), x, y),
+    "pow by a number": (lambda a: [lax.pow(a, p) for p in (-3.0, -1.0, 0.0, 0.5, 2.0, 3.0, 7.0)], x),
+    "integer_pow": (lambda a: [lax.integer_pow(a, n) for n in (-5, -1, 0, 1, 2, 3, 7, 15)], y),
+    "add_any": (jax.grad(lambda a: jnp.sum(a * jnp.sin(a))), x),
+    "not": (lambda a: lax.bitwise_not(a > 0.0), y),
+    "is_finite": (lambda a: jnp.isfinite(jnp.log(a)), y),
+    "clamp": (both(lambda a: lax.clamp(-0.5, a, 0.7)), y),
+    "round": (
+        lambda a: [lax.round(a, r) for r in lax.RoundingMethod],
+        np.array([-2.5, -0.5, 0.5 - EPS / 4, 1.5, 2.51, 1e20]),
+    ),
+    "select_n": (both(lambda a, b: [jnp.where(a > b, a, b), lax.select_n(jnp.int64(2) * (b > 0), a, b, a * b)]), y, x),
+    "convert_element_type": (
+        lambda a: [a.astype(int), (a > 0).astype(float), a.astype(bool), jnp.sum(a > 0) * 1.0],
+        np.array([-2.7, 0.0, 3.9, 1e30, -1e30, np.inf, np.nan]),
+    ),
+    "stop_gradient": (jax.grad(lambda a: jnp.sum(lax.stop_gradient(a) * a)), x),
+    "copy": (lambda a: jnp.array(a, copy=True) + a, x),
+    "name": (lambda a: checkpoint_name(a, "a"), x),
+    "optimization_barrier": (lambda a: lax.optimization_barrier((a, 2.0 * a)), x),
+    "reduce_sum": (lambda a: [a.sum(), a.sum(axis=(0, 2)), a[:0].sum(axis=0)], c3),
+    "reduce_prod": (lambda a: [a.prod(), a.prod(axis=1), a[:0].prod(axis=0)], c3),
+    "reduce_prod, derivative": (both(lambda a: a.prod(axis=1)), c3),
+    "reduce_max": (both(lambda a: [a.max(), a.max(axis=1)]), c3),
+    "reduce_min": (both(lambda a: [a.min(), a.min(axis=0)]), c3),
+    "reduce_and": (lambda a: [jnp.all(a > -1.0, axis=1), jnp.all(a[:0] > 0.0)], c3),
+    "reduce_or": (lambda a: [jnp.any(a > 1.0, axis=0), jnp.any(a[:0] > 0.0)], c3),
+    "argmax": (lambda a: [jnp.argmax(a), jnp.argmax(a, axis=1), jnp.argmax(jnp.log(a), axis=0)], c3),
+    "argmin": (lambda a: [jnp.argmin(a), jnp.argmin(jnp.round(a), axis=2), jnp.argmin(jnp.log(a), axis=1)], c3),
+    "cumsum": (both(lambda a: [jnp.cumsum(a, axis=1), lax.cumsum(a, axis=2, reverse=True)]), c3),
+    "cumprod": (lambda a: [jnp.cumprod(a, axis=0), lax.cumprod(a, axis=1, reverse=True)], c3),
+    "cumprod, derivative": (both(lambda a: jnp.cumprod(a, axis=1)), c3),
+    "cummax": (lambda a: [lax.cummax(a, axis=1), lax.cummax(a, axis=2, reverse=True)], c3),
+    "cummin": (lambda a: lax.cummin(a, axis=1), c3),
+    "dot_general": (
+        lambda a, b: [
+            jnp.einsum("ijk,ijl->ikl", a, a),
+            jnp.einsum("ijk,jk->i", a, a[0]),
+            b @ b.T,
+            jnp.outer(b[0], b[1]),
+            jnp.einsum("ijk,ij->ik", a, b),
+        ],
+        c3,
+        x,
+    ),
+    "broadcast_in_dim": (lambda a: jnp.broadcast_to(a[:, None], (2, 2, 3)), x),
+    "reshape": (lambda a: [a.reshape(3, 2), lax.reshape(a, (3, 2), (1, 0))], x),
+    "squeeze": (lambda a: lax.squeeze(a[:1], (0,)), x),
+    "transpose": (lambda a: a.transpose(2, 0, 1), c3),
+    "rev": (lambda a: lax.rev(a, (0, 2)), c3),
+    "slice": (lambda a: [a[1:], a[:, ::2, 1:3]], c3),
+    "split": (lambda a: jnp.split(a, [1, 3], axis=2), c3),
+    "concatenate": (lambda a, b: jnp.concatenate([a, b, 2.0 * a], axis=1), x, y),
+    "stack": (lambda a, b: [jnp.stack([a, b], axis=i) for i in range(3)], x, y),
+    "unstack": (lambda a: lax.unstack(a, axis=1), c3),
+    "tile": (lambda a: [jnp.tile(a, (2, 1, 3)), jnp.tile(a, 2)], x),
+    "pad": (lambda a: [lax.pad(a, 7.0, c) for c in [((1, 2, 0), (0, 1, 2)), ((-1, 1, 1), (2, -2, 0))]], x),
+    "iota": (lambda a: a * lax.broadcasted_iota(jnp.float64, (2, 3), 1), x),
+    "platform_index": (
+        lambda a: lax.platform_dependent(a, cpu=jnp.sin, cuda=jnp.cos, default=jnp.tan),
+        x,
+    ),
+    "dynamic_slice": (lambda a: [lax.dynamic_slice(a, (i, jnp.int64(1)), (1, 2)) for i in (-1, 0, 5)], x),
+    "dynamic_update_slice": (lambda a, b: [lax.dynamic_update_slice(a, b[:1, :2], (i, 2)) for i in (0, 5)], x, y),
+    "gather": (
+        both(
+            lambda a: [
+                a[np.array([2, 0, 2])],
+                a[:, None][np.array([[1, -1]])],
+                a.at[np.array([1, 9])].get(mode="fill", fill_value=0.5),
+            ]
+        ),
+        v,
+    ),
+    "scatter": (lambda a, b: [a.at[np.array([0, 4])].set(b[:2]), a.at[1:3].set(9.0)], w, v),
+    "scatter-add": (
+        both(lambda a, b: [scatter(a, b, mode) for mode in ("drop", "clip")] + [a.at[np.array([1, 1, 3])].add(b[:3])]),
+        w,
+        rng.standard_normal(4),
+    ),
+    **{
+        f"scatter-{name}": (lambda a, b, method=method: getattr(a.at[np.array([3, 1, 3])], method)(b), w, v)
+        for name, method in {"sub": "subtract", "mul": "multiply", "min": "min", "max": "max"}.items()
+    },
+    "cholesky": (both(lambda a: jnp.linalg.cholesky(jnp.stack([a, 2 * a, -a]))), spd),
+    "triangular_solve": (
+        lambda a, b: [
+            lax.linalg.triangular_solve(
+                a, b if left else b.T, left_side=left, lower=lower, transpose_a=flip, unit_diagonal=unit
+            )
+            for left in (True, False)
+            for lower in (True, False)
+            for flip in (True, False)
+            for unit in (True, False)
+        ],
+        square,
+        rng.standard_normal((3, 2)),
+    ),
+    "custom_linear_solve": (jax.grad(lambda a: mf.matrix_functions.solve(a, spd).sum()), square),
+    "jit": (jax.jit(lambda a: jnp.sin(a)), x),
+    "custom_jvp_call": (jax.nn.softplus, y),
+    "custom_vjp_call": (lambda a: [twice(a), jax.grad(lambda b: twice(b).sum())(a)], x),
+    "remat2": (jax.grad(jax.checkpoint(lambda a: jnp.sin(jnp.sin(a)).sum())), x),
+    "cond": (
+        lambda a: [
+            *(lax.cond(a[0] > s, lambda b: (jnp.sin(b), b), lambda b: (b, 1 / b), a) for s in (-9.0, 9.0)),
+            *(lax.switch(i, [jnp.sin, jnp.cos, jnp.tan], a) for i in (-1, 1, 5)),
+        ],
+        v,
+    ),
+    "scan": (
+        jax.grad(lambda a: jnp.polyval(a, 0.7) + lax.scan(lambda s, b: (s * b, s + b), 1.0, a, reverse=True)[1] @ a),
+        w,
+    ),
+}
+
+NOT_TRACED_HERE = {
+    "expand_dims": "lax writes it as broadcast_in_dim",
+    "copy_p": "the name of copy in some versions of JAX",
+    "pjit": "the name of jit in earlier versions",
+    "call": "only other libraries' transformations make it",
+    "closed_call": "only other libraries' transformations make it",
+    "core_call": "only other libraries' transformations make it",
+    "checkpoint": "the name of remat2 in earlier versions",
+    "remat": "the name of remat2 in earlier versions",
+}
+
+
+def primitives_in(jaxpr) -> set[str]:
+    found = set()
+    for eqn in jaxpr.eqns:
+        found |= {eqn.primitive.name}.union(*map(primitives_in, jaxprs_in_params(eqn.params)))
+    return found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_primitive_agrees(name):
+    f, *args = CASES[name]
+    agrees(f, *args)
+
+
+def test_every_rule_is_tested():
+    traced = set().union(*(primitives_in(jax.make_jaxpr(f)(*args).jaxpr) for f, *args in CASES.values()))
+    assert (set(RULES) | set(CONTROL)) - traced == set(NOT_TRACED_HERE)
+
+
+def test_every_primitive_compiles():
+    """All cases as one numba function: the text means what the interpreter says it does."""
+    cases = list(CASES.values())
+    args = [np.asarray(a) for _, *arguments in cases for a in arguments]
+
+    def everything(*flat):
+        left = list(flat)
+        return [f(*(left.pop(0) for _ in arguments)) for f, *arguments in cases]
+
+    program = program_of(everything, *args)
+    assert set(OPERATIONS) == set(program.operations)
+    flat, out = np.concatenate([a.ravel() for a in args]), np.empty(sum(map(len, program.outputs)))
+    compiled(program)(flat, np.empty(0), out)
+    ends = np.cumsum([len(row) for row in program.outputs])[:-1]
+    found = [a.reshape(shape) for a, shape in zip(np.split(out, ends), program.shapes, strict=True)]
+    check(program, args, program.evaluate(*args), found)
+
+
+SPECIAL = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 3.0, 1e200, -1e200, 1e-200])
+
+
+@pytest.mark.parametrize("name", [*unary, "acosh", "is_finite", "round", "clamp"])
+def test_special_values_of_one_argument(name):
+    f = CASES[name][0] if name in ("round", "clamp", "is_finite") else getattr(lax, name)
+    agrees(f, SPECIAL)
+
+
+@pytest.mark.parametrize("name", [*binary, *compare, "pow"])
+def test_special_values_of_two_arguments(name):
+    agrees(getattr(lax, name), np.repeat(SPECIAL, len(SPECIAL)), np.tile(SPECIAL, len(SPECIAL)))
+
+
+def test_special_values_of_reductions():
+    for f in (jnp.max, jnp.min, jnp.sum, jnp.prod, jnp.argmax, jnp.argmin, jnp.cumsum):
+        agrees(
+            lambda a, f=f: f(a, axis=-1), np.array([[1.0, np.nan, np.inf], [np.inf, 2.0, 3.0], [0.0, -np.inf, np.inf]])
+        )
+
+
+# -- random programs --------------------------------------------------------------------------------------------------
+
+SPARSE = np.zeros((4, 4, 4))
+for a, b, c in [(0, 1, 2), (1, 2, 0), (2, 0, 1), (3, 3, 1)]:
+    SPARSE[a, b, c], SPARSE[b, a, c] = 1.0, -0.5
+
+
+def fit(b, a):
+    """b in the shape of a."""
+    return jnp.resize(b, a.shape)
+
+
+def at_most_4(a):
+    return a[tuple(slice(4) for _ in a.shape)]
+
+
+def along(f):
+    """A function along some axis."""
+    return lambda a, b, k: f(a, k % a.ndim) if a.ndim else a
+
+
+def as_matrix(a):
+    return at_most_4(a.reshape(-1, a.shape[-1] if a.ndim else 1))
+
+
+STEPS = {
+    "add": lambda a, b, k: a + fit(b, a),
+    "sub": lambda a, b, k: a - fit(b, a),
+    "mul": lambda a, b, k: a * fit(b, a),
+    "div": lambda a, b, k: a / fit(b, a),
+    "safe div": lambda a, b, k: a / (1.0 + fit(b, a) ** 2),
+    "scale": lambda a, b, k: (k - 2) * a,
+    "shift": lambda a, b, k: a + (k - 2),
+    "reflect": lambda a, b, k: (k - 2) - a,
+    "invert": lambda a, b, k: (k - 2) / a,
+    "neg": lambda a, b, k: -a,
+    "max": lambda a, b, k: jnp.maximum(a, fit(b, a)),
+    "min": lambda a, b, k: jnp.minimum(a, 0.1 * k),
+    "clip": lambda a, b, k: jnp.clip(a, -1.0, 1.0),
+    "power": lambda a, b, k: a ** (k - 2),
+    "pow": lambda a, b, k: jnp.abs(a) ** fit(b, a),
+    "sqrt": lambda a, b, k: jnp.sqrt(a),
+    "exp": lambda a, b, k: jnp.exp(a),
+    "log": lambda a, b, k: jnp.log(a),
+    "log1p": lambda a, b, k: jnp.log1p(a * a),
+    "sin": lambda a, b, k: jnp.sin(a),
+    "tanh": lambda a, b, k: jnp.tanh(a),
+    "atan2": lambda a, b, k: jnp.arctan2(a, fit(b, a)),
+    "norm": lambda a, b, k: jnp.linalg.norm(a),
+    "where": lambda a, b, k: jnp.where(a > fit(b, a), a, 2.0 * fit(b, a)),
+    "which": lambda a, b, k: jnp.where((a > 0.3) & ~(fit(b, a) > 0.5), jnp.sqrt(a), k),
+    "sign": lambda a, b, k: jnp.sign(a),
+    "floor": lambda a, b, k: jnp.floor(a) + jnp.round(a),
+    "mod": lambda a, b, k: jnp.mod(a, 0.7),
+    "floor_divide": lambda a, b, k: jnp.floor_divide(a, 0.3),
+    "sinc": lambda a, b, k: jnp.sinc(a),
+    "flatten": lambda a, b, k: at_most_4(a.ravel()),
+    "transpose": lambda a, b, k: a.T,
+    "square": lambda a, b, k: jnp.resize(a, (k % 3 + 1, 4)),
+    "reverse": along(jnp.flip),
+    "roll": along(lambda a, axis: jnp.roll(a, 1, axis)),
+    "take": lambda a, b, k: a[k % a.shape[0]] if a.ndim else a,
+    "gather": lambda a, b, k: a[np.array([0, -1, k % a.shape[0]])] if a.ndim else a,
+    "set": lambda a, b, k: a.at[k % a.shape[0]].set(0.3) if a.ndim else a,
+    "add at": lambda a, b, k: a.at[np.array([0, k % a.shape[0], 0])].add(jnp.sum(b)) if a.ndim else a,
+    "dynamic": lambda a, b, k: lax.dynamic_slice_in_dim(a, k - 1, 1) if a.ndim else a,
+    "join": lambda a, b, k: at_most_4(jnp.concatenate([a.ravel()[k % a.size :], b.ravel()])),
+    "stack": lambda a, b, k: jnp.stack([jnp.resize(a, 4), jnp.resize(b, 4)]),
+    "pad": along(lambda a, axis: at_most_4(jnp.pad(a, [(i == axis, 0) for i in range(a.ndim)]))),
+    "trim": along(lambda a, axis: lax.pad(a, 1.5, [((-1, 1, 0) if i == axis else (0, 0, 0)) for i in range(a.ndim)])),
+    "tril": lambda a, b, k: jnp.tril(as_matrix(a), k - 2),
+    "split": along(lambda a, axis: sum(jnp.split(a, a.shape[axis], axis))),
+    "sum": along(lambda a, axis: a.sum(axis)),
+    "mean": lambda a, b, k: a.mean(),
+    "prod": along(lambda a, axis: a.prod(axis)),
+    "largest": along(lambda a, axis: a.max(axis)),
+    "least": lambda a, b, k: a.min(),
+    "argmax": along(lambda a, axis: 1.0 * jnp.argmax(a, axis)),
+    "any": along(lambda a, axis: jnp.any(a > 0.5, axis) * 1.0),
+    "cumsum": along(jnp.cumsum),
+    "cumprod": along(jnp.cumprod),
+    "cummax": along(lax.cummax),
+    "matmul": lambda a, b, k: as_matrix(a) @ jnp.resize(b, (as_matrix(a).shape[1], k % 3 + 1)),
+    "outer": lambda a, b, k: jnp.outer(jnp.resize(a, 3), jnp.resize(b, 4)),
+    "bracket": lambda a, b, k: jnp.einsum("abc,a,b->c", SPARSE, jnp.resize(a, 4), jnp.resize(b, 4)),
+    "batched": lambda a, b, k: jnp.einsum("ia,ib->iab", jnp.resize(a, (2, 2)), jnp.resize(b, (2, 2)))[1],
+    "cholesky": lambda a, b, k: jnp.linalg.cholesky(jnp.outer(jnp.resize(a, 2), jnp.resize(a, 2)) + jnp.eye(2)),
+    "scan": lambda a, b, k: lax.scan(lambda s, t: (s * 0.5 + t, s - t), 1.0, jnp.resize(a, 3))[1],
+    "grad": lambda a, b, k: jax.grad(lambda z: jnp.sum(jnp.sin(z * fit(b, a)) ** 2))(a),
+}
+
+SUMMARIES = {
+    "value": lambda f: f,
+    "grad": lambda f: jax.grad(lambda x, y: jnp.sum(f(x, y)[-1]), argnums=(0, 1)),
+    "jvp": lambda f: lambda x, y: jax.jvp(f, (x, y), (jnp.ones_like(x), jnp.sin(y))),
+    "hessian": lambda f: jax.hessian(lambda x, y: jnp.sum(jnp.sin(f(x, y)[-1]))),
+    "jit": jax.jit,
+    "vmap": lambda f: lambda x, y: jax.vmap(lambda s: f(s * x, y))(jnp.array([0.5, 1.0])),
+}
+
+steps = st.tuples(st.sampled_from(list(STEPS)), st.integers(0, 5), st.integers(0, 5), st.integers(0, 5))
+shapes = st.lists(st.integers(1, 4), max_size=2).map(tuple)
+
+
+@settings(max_examples=60)
+@given(st.lists(steps, min_size=1, max_size=7), st.sampled_from(list(SUMMARIES)), shapes, shapes, st.integers(0, 99))
+def test_random_programs_agree(steps, summary, shape_x, shape_y, seed):
+    def run(x, y):
+        values = [x, y]
+        for name, i, j, k in steps:  # of the newest values
+            values.append(STEPS[name](values[-1 - i % len(values)], values[-1 - j % len(values)], k))
+        return values[2:]
+
+    random = np.random.default_rng(seed)
+    x, y = (random.uniform(-1.5, 1.5, shape) for shape in (shape_x, shape_y))
+    agrees(SUMMARIES[summary](run), x, y, hidden_nan=True)
+
+
+# -- no needless operation --------------------------------------------------------------------------------------------
+
+
+def test_cross_product_is_six_products_and_three_differences():
+    C = mf.so(3).structure_constants
+    program = agrees(lambda a, b: jnp.einsum("abc,a,b->c", C, a, b), v, v[::-1])
+    assert program.operations == {"mul": 6, "sub": 3}
+
+
+@pytest.mark.parametrize(
+    ("f", "operations"),
+    [
+        (lambda a: a * 0.0 + 1.0, {}),
+        (lambda a: 0.0 / a + 1.0 * a - 0.0, {}),
+        (lambda a: a / 1.0 + a * -1.0 * 0.0, {}),
+        (lambda a: jnp.exp(jnp.zeros(3)) * a, {}),
+        (lambda a: -(-a), {}),
+        (lambda a: [-a[0] * a[1] + a[2], a[1] * a[0]], {"mul": 1, "sub": 1}),
+        (lambda a: [a[0] * -2.0 + a[1], 2.0 * a[0]], {"mul": 1, "sub": 1}),
+        (lambda a: [-a[0] / a[1], a[0] / -a[1]], {"div": 1, "neg": 1}),
+        (lambda a: [(a[0] + a[1]) * a[2], a[2] * (a[1] + a[0])], {"add": 1, "mul": 1}),
+        (lambda a: jnp.sin(a)[0] + jnp.cos(a)[1] * jnp.eye(3)[0, 1], {"sin": 1}),
+        (lambda a: a[0] ** 8, {"mul": 3}),
+        (lambda a: jnp.tril(jnp.outer(a, a))[0], {"mul": 1}),
+        (lambda a: jnp.where(jnp.arange(3) > 1, a, 2.0 * a), {"mul": 2}),
+        (lambda a: a[0] - a[0], {"sub": 1}),  # NaN - NaN is not 0
+        (lambda a: a[0] / a[0], {"div": 1}),
+        (lambda a: (a[0] + a[1]) + a[2] - (a[0] + (a[1] + a[2])), {"add": 4, "sub": 1}),  # sums are not reassociated
+    ],
+)
+def test_simplification(f, operations):
+    assert agrees(f, v).operations == operations
+
+
+def test_signs_of_zero_that_could_matter_stay():
+    """atan2 and division tell -0.0 from 0.0, and so does merging."""
+    program = agrees(lambda a: [jnp.arctan2(a, z) for z in (0.0, -0.0)] + [a / z for z in (0.0, -0.0)], np.array([0.5]))
+    assert program.operations == {"atan2": 2, "div": 2}
+
+
+def test_what_is_known_is_computed_beforehand():
+    matrix = np.diag([1.0, 2.0, 3.0])
+    f = lambda A, a: A @ a  # noqa: E731
+    known = [np.where(matrix == 0.0, 0.0, np.nan), None]
+    program = program_of(f, matrix, v, known=known)
+    assert program.operations == {"mul": 3}
+    check(program, [matrix, v], jax_values(f, matrix, v))
+    assert program_of(f, matrix, v).operations == {"mul": 9, "add": 6}
+
+
+# -- the text ---------------------------------------------------------------------------------------------------------
+
+
+def test_text_is_the_same_in_every_process():
+    """Its hash is the key of a cache on disk."""
+    script = """
+import jax, jax.numpy as jnp, manifolds as mf
+from liethermo.engine.scalarize import scalarize
+C = mf.su(2).structure_constants
+f = lambda x, p: jnp.einsum("abc,a,b->c", C, x, jax.grad(lambda y: jnp.sum(jnp.cos(p * y)) * jnp.linalg.norm(y))(x))
+spec = jax.ShapeDtypeStruct((3,), jnp.float64)
+text = scalarize(jax.make_jaxpr(f)(spec, spec)).source(1)
+"""
+    here: dict = {}
+    exec(script, here)
+    command = [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}\n{script}\nprint(text, end='')"]
+    there = subprocess.run(command, env={"PYTHONHASHSEED": "7"}, capture_output=True, text=True, check=True).stdout
+    assert here["text"] == there
+    again: dict = {}
+    exec(script, again)
+    assert again["text"] == there
+
+
+def test_source():
+    program = program_of(lambda x, p: [jnp.stack([p * x[0] - x[1] * p, jnp.inf * p, -(2.0**p)])], np.ones(2), 1.0)
+    assert program.source(1) == (
+        "def program(x, p, out):\n"
+        "    x0_0 = x[0]\n"
+        "    x0_1 = x[1]\n"
+        "    x1_0 = p[0]\n"
+        "    t0 = x0_0 * x1_0\n"
+        "    t1 = x0_1 * x1_0\n"
+        "    t2 = t0 - t1\n"
+        "    t3 = np.inf * x1_0\n"
+        "    t4 = 2.0 ** x1_0\n"
+        "    t5 = -t4\n"
+        "    out[0] = t2\n"
+        "    out[1] = t3\n"
+        "    out[2] = t5\n"
+        "    return\n"
+    )
+
+
+def test_bodies_share_a_loop():
+    """Two programs in one function, the second overwriting its own input."""
+    field = program_of(lambda a: jnp.cross(a, jnp.arange(1.0, 4.0)), v)
+    step = program_of(lambda a, k, h: jnp.where(a > 9.0, a, a + h * k), v, v, 0.1)
+    state, slope = ([f"{name}[{i}]" for i in range(3)] for name in "ak")
+    lines = ["def run(a, k, h, steps):", "    for _ in range(steps):"]
+    lines += [
+        f"        {line}" for line in field.body(state, slope, "f_") + step.body([*state, *slope, "h"], state, "s_")
+    ]
+    space = {"np": np, "math": math}
+    exec("\n".join(lines), space)
+    a, expected = v.copy(), v.copy()
+    numba.njit(space["run"])(a, np.empty(3), 0.1, 5)
+    for _ in range(5):
+        expected = expected + 0.1 * np.cross(expected, np.arange(1.0, 4.0))
+    np.testing.assert_allclose(a, expected, rtol=1e-14)
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("f", "primitive", "reason"),
+    [
+        (lambda a: jnp.sort(a), "sort", ""),
+        (lambda a: jnp.linalg.inv(jnp.outer(a, a)), "lu", ""),
+        (lambda a: lax.while_loop(lambda s: s.sum() < 9.0, lambda s: 2.0 * s, jnp.abs(a)), "while", ""),
+        (lambda a: jnp.float32(a) * 2.0, "convert_element_type", "on float32"),
+        (lambda a: jnp.abs(a + 1j), "convert_element_type", "on complex128[3]"),
+        (
+            lambda a: lax.dynamic_slice(a, (jnp.argmax(a),), (1,)),
+            "dynamic_slice",
+            "with indices known only at run time",
+        ),
+        (lambda a: jnp.argmax(a) // 2, "div", "of integers known only at run time"),
+        (lambda a: lax.reduce_max(a[:0], (0,)), "reduce_max", "of no entries"),
+    ],
+    ids="sort inverse while float32 complex index quotient empty".split(),
+)
+def test_refusal_names_the_primitive_and_the_line(f, primitive, reason):
+    with pytest.raises(UnsupportedPrimitive) as caught:
+        program_of(f, v)
+    error = caught.value
+    assert isinstance(error, lt.errors.LiethermoError)
+    assert (error.primitive, error.reason) == (primitive, reason)
+    assert error.where.startswith("test_scalarize.py:")
+    assert repr(primitive) in str(error)
+    assert error.where in str(error)
+
+
+def test_too_large_a_program_is_refused():
+    with pytest.raises(
+        UnsupportedPrimitive, match=r"'dot_general' within the size limit.*exceeds 1000 scalar"
+    ) as caught:
+        program_of(lambda a: jnp.outer(a, a) @ jnp.sin(jnp.outer(a, a)), np.arange(1.0, 20.0), limit=1000)
+    assert caught.value.primitive == "dot_general"
+
+
+def test_only_doubles_go_in():
+    with pytest.raises(lt.errors.InputError, match="argument 0 .* not of int64"):
+        program_of(lambda a: a, np.arange(3))
+
+
+# -- a control --------------------------------------------------------------------------------------------------------
+
+
+def test_a_corrupted_instruction_is_caught():
+    """Control: any one instruction changed to another operation, the comparison must fail."""
+    f = lambda a, b: [jnp.cross(a, b) * jnp.exp(a), jnp.where(a > b, a / b, b)]  # noqa: E731
+    args = [np.array([0.3, -0.8, 1.9]), np.array([0.1, -1.1, -0.4])]
+    program, expected = agrees(f, *args), jax_values(f, *args)
+    others = {"add": "sub", "sub": "add", "mul": "add", "div": "mul", "exp": "sin", "gt": "lt", "select": "sub"}
+    for i, (target, op, operands) in enumerate(program.instructions):
+        wrong = Instruction(target, others[op], operands[-2:])
+        instructions = (*program.instructions[:i], wrong, *program.instructions[i + 1 :])
+        with pytest.raises(AssertionError, match="is not"):
+            check(dataclasses.replace(program, instructions=instructions), args, expected)
+
+
+# -- the real thing ---------------------------------------------------------------------------------------------------
+
+
+def slopes(system, method):
+    """The right-hand side of a method's stage equations: a function of state and step, and of the system's parameters."""
+    parameters, structure = eqx.partition(system, eqx.is_inexact_array)
+
+    def f(x, low, h, k, parameters):
+        return method.slopes(eqx.combine(parameters, structure), x, low, h, k)
+
+    x = state_of(system.algebra, 1)
+    k = np.tile(np.asarray(system.vector_field(x)), (method.stages, 1))
+    leaves, tree = jax.tree_util.tree_flatten(parameters)
+    return (
+        lambda x, low, h, k, *leaves: f(x, low, h, k, jax.tree_util.tree_unflatten(tree, leaves)),
+        [x, 1e-17 * x, np.array(0.1), k, *map(np.asarray, leaves)],
+    )
+
+
+@pytest.mark.parametrize("case", DISSIPATIONS, ids=lambda case: case.name)
+def test_every_dissipation(case):
+    agrees(*unpack(slopes(build(mf.so(3), case), MetriplecticMidpoint())))
+
+
+@pytest.mark.parametrize("method", list(registered_methods()), ids=str)
+def test_every_method(method):
+    agrees(*unpack(slopes(build(mf.so(3), DISSIPATIONS[0]), method)))
+
+
+def unpack(pair):
+    f, args = pair
+    return f, *args
+
+
+def test_compiled_su3_with_killing_dissipation():
+    g = mf.su(3)
+    system = lt.LiePoissonSystem(g, lt.Quadratic(np.linspace(1, 2, 8)), g.casimirs(2)[0], lt.KillingDissipation(0.1))
+    f, args = slopes(system, MetriplecticMidpoint())
+    program = program_of(f, *args)
+    assert len(program.instructions) < 800  # a dense loop would need some 4000
+    x, p, out = (
+        np.concatenate([np.ravel(a) for a in args[:4]]),
+        np.concatenate([np.ravel(a) for a in args[4:]]),
+        np.empty(8),
+    )
+    compiled(program, 4)(x, p, out)
+    check(program, args, jax_values(f, *args), [out[None]])
