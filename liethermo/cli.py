@@ -82,7 +82,7 @@ def run(
         typer.echo(f"The run stopped early. The trajectory up to t = {solution.t[-1]:g} is kept.")
     figures = _draw(plan, system, solution, folder)
     typer.echo(f"In {folder}{os.sep}: {', '.join([file.name, *figures, spec.name])}")
-    raise typer.Exit(0 if passed else FAILED)
+    raise typer.Exit(0 if passed and solution.status.ok else FAILED)
 
 
 @app.command()

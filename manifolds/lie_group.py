@@ -138,16 +138,7 @@ class MatrixGroup:
         return self.exp(scale * jax.random.normal(key, (*size, self.dim)))
 
     def exp(self, x) -> jax.Array:
-        """Exponential map, from components of the algebra to the group.
-
-        Parameters
-        ----------
-        x : array, shape (..., dim)
-
-        Returns
-        -------
-        array, shape (..., m, m)
-        """
+        """Exponential map, from components of the algebra, shape (..., dim), to the group, shape (..., m, m)."""
         return _compiled(self.exp_map, self.algebra, self._components(x, "x"))
 
     def log(self, g) -> jax.Array:

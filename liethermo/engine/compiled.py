@@ -81,8 +81,8 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves: int, 
         if counts[0] != step_loop.NEEDS_NEWTON:
             break
         stepper.stiff = True
-    numbers = dict(zip(COUNTS, counts, strict=True)) | dict(zip(REALS, reals, strict=True))
-    return State(**arrays, **numbers), (out, np.arange(saves) < (counts[1] - origin) // every)
+    fields: dict[str, Any] = dict(arrays) | dict(zip((*COUNTS, *REALS), (*counts, *reals), strict=True))
+    return State(**fields), (out, np.arange(saves) < (counts[1] - origin) // every)
 
 
 class Stepper:
@@ -117,7 +117,7 @@ class Stepper:
             return jnp.concatenate([jnp.reshape(value, 1) for value in array.values(rebuilt(p), x)])
 
         n, s = self._n, method.stages
-        self._specs = {
+        self._specs: dict[str, tuple[Callable[..., Any], str, bool]] = {
             "slopes": (slopes, "p x low h k", True),
             "jacobian": (misfit, "p x low h k", True),
             "values": (values, "p x", True),

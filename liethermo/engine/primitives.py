@@ -226,7 +226,10 @@ class Builder:
         return self.select(beyond, self.add(whole, self.op("sign", a)), whole)
 
     def all(self, conditions):
-        return reduce(lambda a, b: self.op("and", a, b), conditions, True)
+        result: Scalar = True
+        for condition in conditions:
+            result = self.op("and", result, condition)
+        return result
 
 
 def fold(op: str, *args: Scalar) -> Scalar:
@@ -513,7 +516,9 @@ def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
             return jax.lax.scatter_add(jnp.zeros(x.shape), where, u, **options)
 
         # The transpose of scattering tells each update which entry it goes to; 0 for one that is dropped.
-        (goes_to,) = jax.linear_transpose(scatter, jnp.zeros(updates.shape))(jnp.arange(1.0, x.size + 1).reshape(x.shape))
+        (goes_to,) = jax.linear_transpose(scatter, jnp.zeros(updates.shape))(
+            jnp.arange(1.0, x.size + 1).reshape(x.shape)
+        )
         entries = [0.0, *x.ravel().tolist()]
         for i, u in zip(np.asarray(goes_to, int).flat, updates.flat, strict=True):
             entries[i] = combine(b, entries[i], u) if i else 0.0

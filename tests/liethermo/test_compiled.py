@@ -156,7 +156,7 @@ def test_what_cannot_be_compiled(monkeypatch):
 
 
 def test_auto_compiles_long_runs(monkeypatch):
-# -- the cache --------------------------------------------------------------------------------------------------
+    assert lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"] == "array"
     monkeypatch.setattr("liethermo.timeloop.COMPILED_STEPS", 5)
     assert lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"] == "compiled"
 
