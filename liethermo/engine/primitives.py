@@ -27,13 +27,7 @@ class Instruction(NamedTuple):
     args: tuple[Scalar, ...]
 
 
-OPERATIONS = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
-    "neg": "-{0}",
-    "pow": "{0} ** {1}",
+ELEMENTARY = {
     "abs": "abs({0})",
     "sign": "np.sign({0})",
     "sqrt": "np.sqrt({0})",
@@ -60,21 +54,32 @@ OPERATIONS = {
     "erfc": "np.float64(math.erfc({0}))",
     "floor": "np.floor({0})",
     "ceil": "np.ceil({0})",
-    "trunc": "np.trunc({0})",
-    "rint": "np.rint({0})",
-    "rem": "np.fmod({0}, {1})",
-    "max": "{0} if {0} > {1} or {0} != {0} else {1}",  # like XLA's, NaN if either is
-    "min": "{0} if {0} < {1} or {0} != {0} else {1}",
+    "is_finite": "np.isfinite({0})",
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
     "lt": "{0} < {1}",
     "le": "{0} <= {1}",
     "gt": "{0} > {1}",
     "ge": "{0} >= {1}",
-    "is_finite": "np.isfinite({0})",
     "and": "{0} & {1}",
     "or": "{0} | {1}",
     "xor": "{0} ^ {1}",
+}
+"""Operations that are primitives of the same name, with nothing to simplify."""
+
+OPERATIONS = {
+    **ELEMENTARY,
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "pow": "{0} ** {1}",
+    "rem": "np.fmod({0}, {1})",
+    "trunc": "np.trunc({0})",
+    "rint": "np.rint({0})",
+    "max": "{0} if {0} > {1} or {0} != {0} else {1}",  # like XLA's, NaN if either is
+    "min": "{0} if {0} < {1} or {0} != {0} else {1}",
     "not": "not {0}",
     "select": "{1} if {0} else {2}",
     "float": "np.float64({0})",
@@ -287,7 +292,7 @@ def _numeric(method: str) -> Rule:
     """A method of the builder, on numbers."""
 
     def rule(b, eqn, *arrays):
-        if _dtype(eqn) == bool:
+        if _dtype(eqn).kind == "b":
             raise NotImplementedError("on truth values")
         return elementwise(getattr(b, method), *arrays)
 
@@ -309,13 +314,13 @@ def _alike(b, eqn, *arrays):
 
 
 def _divide(b, eqn, x, y):
-    if np.issubdtype(_dtype(eqn), np.integer):
+    if _dtype(eqn).kind == "i":
         return elementwise(_integer_quotient, x, y)
     return _numeric("div")(b, eqn, x, y)
 
 
 def _remainder(b, eqn, x, y):
-    if np.issubdtype(_dtype(eqn), np.integer):
+    if _dtype(eqn).kind == "i":
         return elementwise(lambda a, n: a - n * _integer_quotient(a, n), x, y)
     return _plain("rem")(b, eqn, x, y)
 
@@ -332,7 +337,7 @@ def _integer_pow(b, eqn, x):
 
 
 def _not(b, eqn, x):
-    if _dtype(eqn) != bool:
+    if _dtype(eqn).kind != "b":
         raise NotImplementedError("on the bits of integers")
     return _plain("not")(b, eqn, x)
 
@@ -347,7 +352,7 @@ def _round(b, eqn, x):
 
 
 def _select(b, eqn, which, *cases):
-    if _dtype(eqn) == bool:
+    if _dtype(eqn).kind == "b":
         return elementwise(b.select, which, cases[1], cases[0])
     chosen = cases[-1]
     for i in reversed(range(len(cases) - 1)):
@@ -356,14 +361,13 @@ def _select(b, eqn, which, *cases):
 
 
 def _convert(b, eqn, x):
-    old, new = _dtype(eqn), np.dtype(eqn.params["new_dtype"])
-    if new == old or (np.issubdtype(old, np.integer) and np.issubdtype(new, np.integer)):
+    conversion = _dtype(eqn).kind + np.dtype(eqn.params["new_dtype"]).kind
+    if conversion in ("ff", "ii", "bb"):
         return x
-    if new == bool:
+    if conversion in ("fb", "ib"):
         return elementwise(lambda a: b.op("ne", a, 0), x)
-    if new == np.float64:
-        return elementwise(lambda a: b.op("float", a), x)
-    return elementwise(lambda a: b.op("int" if old == bool else "truncate", a), x)
+    op = {"if": "float", "bf": "float", "bi": "int", "fi": "truncate"}[conversion]
+    return elementwise(lambda a: b.op(op, a), x)
 
 
 def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> Rule:
@@ -371,7 +375,7 @@ def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> R
         rows, shape = _rows(x, eqn.params["axes"])
         if start is None and not all(rows):
             raise NotImplementedError("of no entries")
-        empty = None if start is None else _dtype(eqn).type(start).item()
+        empty: Scalar = 0.0 if start is None else _dtype(eqn).type(start).item()
         return array([reduce(lambda u, v: combine(b, u, v), row) if row else empty for row in rows], shape)
 
     return rule
@@ -570,47 +574,7 @@ RULES: dict[str, Rule] = {
     "rsqrt": lambda b, eqn, x: elementwise(lambda a: b.div(1.0, b.op("sqrt", a)), x),
     "clamp": _clamp,
     "round": _round,
-    **{
-        name: _plain(name)
-        for name in [
-            "abs",
-            "sign",
-            "sqrt",
-            "cbrt",
-            "exp",
-            "exp2",
-            "expm1",
-            "log",
-            "log1p",
-            "sin",
-            "cos",
-            "tan",
-            "asin",
-            "acos",
-            "atan",
-            "atan2",
-            "sinh",
-            "cosh",
-            "tanh",
-            "asinh",
-            "acosh",
-            "atanh",
-            "erf",
-            "erfc",
-            "floor",
-            "ceil",
-            "is_finite",
-            "eq",
-            "ne",
-            "lt",
-            "le",
-            "gt",
-            "ge",
-            "and",
-            "or",
-            "xor",
-        ]
-    },
+    **{name: _plain(name) for name in ELEMENTARY},
     "not": _not,
     "select_n": _select,
     "convert_element_type": _convert,
@@ -656,11 +620,11 @@ RULES: dict[str, Rule] = {
 }
 """How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.engine.scalarize`."""
 
-PARAMETERS = set(
-    """accuracy axes axis broadcast_dimensions conjugate_a dimension dimension_numbers dimensions dtype fill_value
-    index_dtype indices_are_sorted left_side limit_indices lower mode name new_dtype new_sizes out_sharding padding_config
-    permutation platforms precision preferred_element_type reps reverse rounding_method shape sharding sizes slice_sizes
-    start_indices strides transpose_a unique_indices unit_diagonal update_consts update_jaxpr weak_type y""".split()
-)
-"""Parameters of primitives that the rules heed, or that do not matter here. One that is not among them, if it is set, may
-mean anything: the primitive is refused."""
+PARAMETERS = """
+accuracy axes axis broadcast_dimensions conjugate_a dimension dimension_numbers dimensions dtype fill_value index_dtype
+indices_are_sorted left_side limit_indices lower mode name new_dtype new_sizes out_sharding padding_config permutation
+platforms precision preferred_element_type reps reverse rounding_method shape sharding sizes slice_sizes start_indices
+strides transpose_a unique_indices unit_diagonal update_consts update_jaxpr weak_type y
+"""
+"""Parameters of primitives that the rules heed, or that do not matter here. Another one, if it is set, may mean anything:
+the primitive is refused."""

@@ -1,8 +1,8 @@
 """From a traced JAX function of small arrays to a straight-line program of scalar instructions.
 
 The jaxpr, derivatives included, is unrolled entry by entry. What is known at compile time is computed then, structural
-zeros vanish, equal subexpressions merge and dead ones are dropped, so an ``einsum`` with structure constants becomes the
-few products that it stands for. The result is the same to rounding as JAX's, or there is none.
+zeros vanish, equal subexpressions merge and dead ones are dropped, so an ``einsum`` with structure constants becomes
+the few products that it stands for. The result is the same to rounding as JAX's, or there is none.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
     values.update(zip(jaxpr.invars, arguments, strict=True))
 
     def read(v) -> np.ndarray:
-        return constant(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v]
+        return constant(v.val, getattr(v.aval, "dtype", None)) if isinstance(v, Literal) else values[v]
 
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
@@ -210,7 +210,7 @@ def _check_equation(eqn) -> None:
     """Refuse what the rules were not written for."""
     if eqn.primitive.name in RULES:
         for name, value in eqn.params.items():
-            if name not in PARAMETERS and value is not None:
+            if name not in PARAMETERS.split() and value is not None:
                 raise NotImplementedError(f"with {name}={value}")
     for var in (*eqn.invars, *eqn.outvars):
         if getattr(getattr(var.aval, "dtype", None), "kind", None) not in ("f", "i", "b"):
@@ -285,11 +285,9 @@ def _scan(b, eqn, *arguments):
     return carry + stacked
 
 
+CALLS = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2"
 CONTROL = {
-    **{
-        name: _call
-        for name in """jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2""".split()
-    },
+    **dict.fromkeys(CALLS.split(), _call),
     "custom_linear_solve": _linear_solve,
     "cond": _cond,
     "scan": _scan,
@@ -301,12 +299,12 @@ CONTROL = {
 
 def _live(
     instructions: Sequence[Instruction], results: Sequence[Scalar]
-) -> tuple[tuple[Instruction, ...], dict[str, str]]:
+) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
     """The instructions that results depend on, each as late as its first use allows, and their new names.
 
     Computing a value just before it is used keeps few alive at a time: registers are scarce.
     """
-    defined = {instruction.target: instruction for instruction in instructions}
+    defined: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
     order: list[Instruction] = []
     renamed: dict[Scalar, str] = {}
     for result in results:

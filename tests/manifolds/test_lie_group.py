@@ -64,7 +64,7 @@ def test_exp_lands_in_the_group(G, seed):
         g = G.exp(elements(G, seed, size=size))
         assert g.shape == (BATCH, G.matrix_size, G.matrix_size)
         assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
-    assert np.array_equal(G.exp(np.zeros(G.dim)), G.identity)
+    assert np.array_equal(G.exp(np.zeros((BATCH, G.dim)))[0], G.identity)
 
 
 @given(seed=seeds)
@@ -176,18 +176,15 @@ def test_exp_and_log_equal_scipy(G):
     assert close(G.algebra.hat(G.log(g)), logarithms, "reference")
 
 
-def test_batches_equal_loops(G):
+def test_elements_of_a_batch_do_not_meet(G):
     x, mu = elements(G, 5), duals(G, 5)
     g = G.exp(x)
-    assert close(G.exp(x[2]), g[2], "member")
-    assert close(G.Ad(g[2]), G.Ad(g)[2], "product")
-    assert close(G.Ad_star(g[2], mu), G.Ad_star(np.stack([g[2]] * BATCH), mu), "product")
+    alone = np.stack([g[2]] * BATCH)
+    assert close(G.exp(np.stack([x[2]] * BATCH)), alone, "member")
+    assert close(G.log(alone), np.stack([G.log(g)[2]] * BATCH), "roundtrip")
+    assert close(G.Ad(alone), np.stack([G.Ad(g)[2]] * BATCH), "product")
+    assert close(G.Ad_star(alone, mu)[1], G.Ad_star(np.stack([g[2], g[2], g[0], g[1]]), mu)[1], "product")
     assert G.belongs(g).shape == (BATCH,)
-
-
-def test_gradient_of_exp_at_zero_is_the_basis(G):
-    gradient = jax.jit(jax.grad(lambda x: G.exp(x).real.sum()))(np.zeros(G.dim))
-    assert close(gradient, G.algebra.basis.real.sum(axis=(1, 2)), "derivative")
 
 
 def test_tiny_elements_keep_their_digits(G):
@@ -195,15 +192,6 @@ def test_tiny_elements_keep_their_digits(G):
     X = np.asarray(G.algebra.hat(x))
     off_diagonal = ~np.eye(G.matrix_size, dtype=bool)
     assert close(G.exp(x)[:, off_diagonal], (X + X @ X / 2)[:, off_diagonal], "roundtrip", 1e-9)
-
-
-def test_compiled_programs_make_no_lapack_calls(G):
-    """Two of them in one program can wait for each other forever (see matrix_functions.solve)."""
-
-    def everything(x):
-        return G.Ad(G.inverse(G.exp(G.log(G.exp(x)))))
-
-    assert "lapack" not in jax.jit(everything).lower(elements(G, 9)).as_text()
 
 
 # -- every registered group: the edge of the domain of log ------------------------------------------------------------
@@ -288,13 +276,14 @@ def test_wrong_shapes_and_kinds(G):
 # -- particular groups ------------------------------------------------------------------------------------------------
 
 
-DIFFERENTIATED = [mf.SO(3), mf.SE(3), mf.SU(2), mf.Heisenberg(1), mf.SO(4), mf.SL(2)]
-"""Every closed form, and the general functions for a compact and a noncompact group: the rule of log is one for all."""
+PROGRAMS = [mf.SO(3), mf.SE(3), mf.SU(2), mf.Heisenberg(1), mf.SL(2)]
+"""Every closed form and the general functions: for what depends on the program rather than on the group."""
+each_program = pytest.mark.parametrize("group", PROGRAMS, ids=lambda group: group.name)
 
 
-@pytest.mark.parametrize("group", DIFFERENTIATED, ids=lambda group: group.name)
+@each_program
 def test_derivative_of_log_after_exp_is_the_identity(group):
-    """At zero, next to it and elsewhere; mapped over a batch, so that maps and loops are compared too."""
+    """At zero, next to it and elsewhere; mapped over a batch, so that maps and batches are compared too."""
 
     def one(x, v):
         return jax.jvp(lambda x: group.log(group.exp(x)), (x,), (v,))
@@ -305,6 +294,30 @@ def test_derivative_of_log_after_exp_is_the_identity(group):
         value, derivative = mapped(x, v)
         assert close(value, x, "roundtrip")
         assert close(derivative, v, "derivative")
+    gradient = jax.jit(jax.grad(lambda x: group.exp(x).real.sum()))(np.zeros(group.dim))
+    assert close(gradient, group.algebra.basis.real.sum(axis=(1, 2)), "derivative")
+
+
+@each_program
+def test_batches_equal_loops(group):
+    x, mu = elements(group, 5).reshape(2, 2, -1), duals(group, 5)[0]
+    g = group.exp(x)
+    assert g.shape == (2, 2, group.matrix_size, group.matrix_size)
+    assert close(g[1, 0], group.exp(x[1, 0]), "member")
+    assert close(group.Ad(g)[1, 0], group.Ad(g[1, 0]), "product")
+    assert close(group.Ad_star(g, mu)[1, 0], group.Ad_star(g[1, 0], mu), "product")
+    assert group.belongs(g).shape == (2, 2)
+    assert group.belongs(g[0, 0]).shape == ()
+
+
+@each_program
+def test_compiled_programs_make_no_lapack_calls(group):
+    """Two of them in one program can wait for each other forever (see matrix_functions.solve)."""
+
+    def everything(x):
+        return group.Ad(group.inverse(group.cayley(group.log(group.exp(x)))))
+
+    assert "lapack" not in jax.jit(everything).lower(elements(group, 9)).as_text()
 
 
 def test_reverse_mode_and_second_derivatives():
