@@ -626,5 +626,5 @@ indices_are_sorted left_side limit_indices lower mode name new_dtype new_sizes o
 platforms precision preferred_element_type reps reverse rounding_method shape sharding sizes slice_sizes start_indices
 strides transpose_a unique_indices unit_diagonal update_consts update_jaxpr weak_type y
 """
-"""Parameters of primitives that the rules heed, or that do not matter here. Another one, if it is set, may mean anything:
-the primitive is refused."""
+"""Parameters of primitives that the rules heed, or that do not matter here. Another one, if it is set, may mean
+anything: the primitive is refused."""

@@ -611,7 +611,7 @@ def test_a_corrupted_instruction_is_caught():
 
 
 def slopes(system, method):
-    """The right-hand side of a method's stage equations: with arguments: state and step, then the system's parameters."""
+    """The right-hand side of the stage equations; arguments: state and step, then the parameters."""
     parameters, structure = eqx.partition(system, eqx.is_inexact_array)
 
     def f(x, low, h, k, parameters):

@@ -23,7 +23,7 @@ TOLERANCES = {
     "product": (5e-14, "up to four factors of norm 5 each, noncompact; at most 1.2e-14 seen"),
     "adjoint": (5e-15, "Ad(exp x) - expm(ad x), relative; at most 1e-15 seen"),
     "reference": (1e-14, "relative to SciPy's expm and logm; at most 2e-15 seen"),
-    "derivative": (2e-15, "automatic derivatives against exact ones; at most 5e-16 seen"),
+    "derivative": (8e-15, "automatic derivatives against exact ones, of order one; at most 2e-15 seen"),
     "central_difference": (3e-8, "with step 1e-4; at most 8e-9 seen, h^2/6 times the third derivative"),
     "half_turn": (1e-14, "within 1e-7 of the half turn in SO, SE, SU; at most 2e-15 seen, roundings of pi"),
     "half_turn_condition": (3e-14, "times 1/gap; at most 7e-15 seen, a few roundings of g"),
@@ -282,23 +282,21 @@ each_program = pytest.mark.parametrize("group", PROGRAMS, ids=lambda group: grou
 
 
 @each_program
-def test_derivative_of_log_after_exp_is_the_identity(group):
+def test_gradient_of_log_after_exp_is_that_of_the_identity(group):
     """At zero, next to it and elsewhere; mapped over a batch, so that maps and batches are compared too."""
 
-    def one(x, v):
-        return jax.jvp(lambda x: group.log(group.exp(x)), (x,), (v,))
+    def paired(x, mu):
+        return jnp.dot(mu, group.log(group.exp(x)))
 
-    mapped, v = jax.jit(jax.vmap(one)), elements(group, 6)
+    mapped, mu = jax.jit(jax.vmap(jax.value_and_grad(paired))), duals(group, 6)
     for size in (0.0, 1e-10, 1.0):
         x = elements(group, 7, size=size)
-        value, derivative = mapped(x, v)
-        assert close(value, x, "roundtrip")
-        assert close(derivative, v, "derivative")
-    gradient = jax.jit(jax.grad(lambda x: group.exp(x).real.sum()))(np.zeros(group.dim))
-    assert close(gradient, group.algebra.basis.real.sum(axis=(1, 2)), "derivative")
+        value, gradient = mapped(x, mu)
+        assert close(value, (mu * x).sum(axis=-1), "roundtrip")
+        assert close(gradient, mu, "derivative")
 
 
-@each_program
+@pytest.mark.parametrize("group", [mf.SO(3), mf.SL(2)], ids=lambda group: group.name)
 def test_batches_equal_loops(group):
     x, mu = elements(group, 5).reshape(2, 2, -1), duals(group, 5)[0]
     g = group.exp(x)
@@ -320,7 +318,7 @@ def test_compiled_programs_make_no_lapack_calls(group):
     assert "lapack" not in jax.jit(everything).lower(elements(group, 9)).as_text()
 
 
-def test_reverse_mode_and_second_derivatives():
+def test_second_derivatives():
     group = mf.SO(3)
     x, mu = elements(group, 11)[0], duals(group, 11)[0]
     shift = group.exp(elements(group, 12)[0])
@@ -335,13 +333,6 @@ def test_reverse_mode_and_second_derivatives():
         rates = [(f(at + h * e) - f(at - h * e)) / (2 * h) for e in np.eye(group.dim)]
         assert close(gradient, rates, "central_difference")
         assert close(hessian, hessian.T, "derivative")
-
-
-def test_reverse_mode_of_the_general_functions():
-    group = mf.SL(2)
-    x, mu = elements(group, 11)[0], duals(group, 11)[0]
-    gradient = jax.jit(jax.grad(lambda x: jnp.dot(mu, group.log(group.exp(x)))))
-    assert close(gradient(x), mu, "derivative")
 
 
 @pytest.mark.parametrize("group", [mf.SO(3), mf.SL(2)], ids=lambda group: group.name)
