@@ -55,7 +55,7 @@ def cases():
         yield pytest.param(*case, marks=pytest.mark.slow if i > 1 else (), id="-".join(case))
 
 
-@pytest.mark.parametrize(("algebra", "dissipation", "gradient"), cases())
+@pytest.mark.parametrize(("algebra", "dissipation", "gradient"), list(cases()))
 def test_same_trajectories(algebra, dissipation, gradient):
     g = next(g for g in (mf.so(3), mf.se(3), mf.sl(2), mf.su(3)) if g.name == algebra)
     system = build(g, next(case for case in DISSIPATIONS if case.name == dissipation))
