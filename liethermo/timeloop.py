@@ -125,6 +125,7 @@ class _Run:
         self.written = self.started
         self.times = [span[0]]
         self.states = [np.asarray(x0)[None]]
+        self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
         # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
@@ -142,7 +143,8 @@ class _Run:
     def by_steps(self, bar) -> None:
         """Drive the engine chunk by chunk, to the end, a failure or Ctrl-C."""
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // self.every, _power_of_two(self.steps // self.every)))
-        state, interrupted = array.begin(self.system, self.method, self.states[0][0]), False
+        state, interrupted = self._begin(), False
+        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
         try:
             done = 0
             while done < self.steps and int(state.status) == array.RUNNING:
@@ -158,24 +160,33 @@ class _Run:
             interrupted = True
         self.stats, self.status = _stats(state), self._status(state, interrupted)
 
-    def _advance(self, state, h, saves, every, capacity):
-        before = int(state.step)
-        arguments = (self.system, self.method, state, h, saves, every, capacity)
+    def _begin(self):
+        """The state to start from, by the engine that can run the system."""
+        x = self.states[0][0]
         if self.engine == "compiled":
             try:
-                state, (x, reached) = compiled.advance(*arguments)
+                return compiled.begin(self.system, self.method, x)
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
                 warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=5)
                 self.engine = "array"
-        if self.engine == "array":
-            state, (x, reached) = array.advance(*arguments)
+        return array.begin(self.system, self.method, x)
+
+    def _advance(self, state, h, saves, every, capacity):
+        before = int(state.step)
+        engine = compiled if self.engine == "compiled" else array
+        state, (x, energy, entropy, reached) = engine.advance(
+            self.system, self.method, state, h, saves, every, capacity
+        )
         kept = int(np.asarray(reached).sum())
         states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
+        values = np.stack([np.asarray(energy)[:kept], np.asarray(entropy)[:kept]], axis=1)
         if int(state.step) > before + every * kept:  # it failed between two saves: keep what there is
             states, steps = np.concatenate([states, np.asarray(state.x)[None]]), np.append(steps, int(state.step))
+            values = np.append(values, [[float(state.energy), float(state.entropy)]], axis=0)
         self.states.append(states)
+        self.values.append(values)
         self.times.extend(self._time(n) for n in steps)
         return state
 
@@ -225,12 +236,14 @@ class _Run:
         counts = [*range(0, self.steps, self.every), self.steps]
         times = np.array([self._time(n) for n in counts] + ([self.span[1]] if self.last else []))
         times = np.unique(times)
+        self.values = [self._energies(self.states[0])]
         try:
             x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
         except KeyboardInterrupt:
             self.status = Status("interrupted", "stopped by the user before SciPy returned anything", 0, times[0])
             return
         self.times, self.states = list(times[: len(x)]), [x]
+        self.values = [self._energies(x)]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
         now = self.times[-1]
         bar.update(now)
@@ -240,6 +253,10 @@ class _Run:
         else:
             self.status = Status("completed", f"reached t = {now:g}", len(x) - 1, now)
 
+    def _energies(self, x: np.ndarray) -> np.ndarray:
+        entropy = np.zeros(len(x)) if self.system.entropy is None else np.asarray(self.system.entropy(x))
+        return np.stack([np.asarray(self.system.energy(x)), entropy], axis=1)
+
     # -- the result ---------------------------------------------------------------------------------------------------
 
     def solution(self) -> Solution:
@@ -247,16 +264,14 @@ class _Run:
         system = self.system
         x = np.concatenate(self.states)
         invariants = system.invariants()
-        energy, entropy = np.asarray(system.energy(x)), None
-        if system.entropy is not None:
-            entropy = np.asarray(system.entropy(x))
+        energy, entropy = np.concatenate(self.values).T
         conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(self.method, J))
         wall = time.perf_counter() - self.started
         return Solution(
             t=np.array(self.times),
             x=x,
             energy=energy,
-            entropy=entropy,
+            entropy=None if system.entropy is None else entropy,
             casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),

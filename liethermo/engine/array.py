@@ -87,7 +87,8 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
 
     def fixed_point_goes_on(s: _Iteration):
-        hopeless = (s.made >= 3) & ((s.rate > SLOW) | ~jnp.isfinite(s.update)) & (s.best > PLATEAU * scale(s.k))
+        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
+        hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
         return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
 
     first = jax.lax.while_loop(fixed_point_goes_on, lambda s: s.after(slopes(s.k)), _Iteration.begin(guess))
@@ -146,6 +147,7 @@ class State(eqx.Module):
     smallest_energy: jax.Array
     least_entropy_increment: jax.Array
     largest_energy_increment: jax.Array
+    integral: jax.Array  # over time, of what relaxes: see relaxing()
 
 
 @eqx.filter_jit
@@ -172,6 +174,7 @@ def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
         smallest_energy=energy,
         least_entropy_increment=jnp.asarray(jnp.inf),
         largest_energy_increment=jnp.asarray(-jnp.inf),
+        integral=zero,
     )
 
 
@@ -183,18 +186,13 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
     solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale)
-    # x + low is the state; add the increment with its rounding error caught (Neumaier's two-sum)
-    increment = method.increment(h, solved.k) + low
-    new = x + increment
-    back = new - x
-    new_low = (x - (new - back)) + (increment - back)
-    energy, entropy = values(system, new)
-    finite = jnp.isfinite(jnp.sum(new) + energy + entropy)
-    good = solved.converged & finite
+    new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k)
+    good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
     size = jnp.max(jnp.abs(x))
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
+    mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))
 
     new_state = State(
         x=new,
@@ -214,6 +212,7 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
         smallest_energy=jnp.minimum(state.smallest_energy, energy),
         least_entropy_increment=jnp.minimum(state.least_entropy_increment, entropy - state.entropy),
         largest_energy_increment=jnp.maximum(state.largest_energy_increment, energy - state.energy),
+        integral=state.integral + h * mean,
     )
     failed = eqx.tree_at(lambda s: (s.status, s.residual), state, (failure, residual))
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
@@ -223,7 +222,7 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
 def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
-    Returns the new state and, for each save, the state vector and whether it was reached.
+    Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
     """
 
     def one_save(state: State, index):
@@ -234,12 +233,30 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves, every
 
         state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h), state)
         reached = (state.status == RUNNING) & (index < saves)
-        return state, (state.x, reached)
+        return state, (state.x, state.energy, state.entropy, reached)
 
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
+
+
+def finish(system: System, method: OneStepMethod, x, low, h, k):
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, and a sum that is finite if they are.
+
+    x + low is the state; the increment is added with its rounding error caught (Neumaier's two-sum).
+    """
+    increment = method.increment(h, k) + low
+    new = x + increment
+    back = new - x
+    new_low = (x - (new - back)) + (increment - back)
+    energy, entropy = values(system, new)
+    return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:
     """Energy and entropy at one state, shape (n,); zero in place of an entropy that the system does not have."""
     entropy = jnp.zeros(()) if system.entropy is None else system.entropy.value(x)
     return system.energy.value(x), entropy
+
+
+def relaxing(system: System, energy, entropy):
+    """The one of the two whose approach to equilibrium is timed: the energy under a double bracket, or the entropy."""
+    return energy if system.energy_law == "nonincreasing" else entropy
