@@ -36,34 +36,49 @@ from .errors import (
     SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import DiscreteHerglotz, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
-from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
+from .systems import (
+    ContactSystem,
+    EulerPoincareSystem,
+    EvolutionSystem,
+    Herglotz,
+    LiePoissonSystem,
+    MetriplecticSystem,
+    System,
+    ThermodynamicHerglotz,
+)
 from .timeloop import integrate
 
 __all__ = [
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ContactSystem",
     "ConvergenceError",
     "CoordinateIncrement",
     "DiscreteGradient",
+    "DiscreteHerglotz",
     "Dissipation",
     "DoubleBracket",
     "Energy",
     "EulerPoincareForce",
     "EulerPoincareSystem",
+    "EvolutionSystem",
     "FileError",
     "FourBracket",
     "FrictionOperator",
     "Function",
     "FunctionError",
     "Gonzalez",
+    "Herglotz",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
     "IntegrationError",
     "KillingDissipation",
+    "Kinetic",
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
@@ -71,6 +86,7 @@ __all__ = [
     "MetriplecticSystem",
     "NonFiniteError",
     "OneStepMethod",
+    "Potential",
     "ProjectedMetric",
     "Quadratic",
     "Reference",
@@ -79,6 +95,7 @@ __all__ = [
     "Stats",
     "Status",
     "System",
+    "ThermodynamicHerglotz",
     "integrate",
     "load",
     "models",

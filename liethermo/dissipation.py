@@ -38,13 +38,19 @@ class Dissipation(eqx.Module):
     """
 
     @property
-    def energy_law(self) -> Law:
+    def energy_law(self) -> Law | None:
+        """What the construction guarantees of the energy; None where it guarantees nothing."""
         return "conserved"
 
     @property
     def entropy_law(self) -> Law | None:
         """What the construction guarantees of the entropy; None where it guarantees nothing."""
         return "nondecreasing"
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
+        return True
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -83,14 +89,18 @@ class Several(Dissipation):
     parts: tuple[Dissipation, ...]
 
     @property
-    def energy_law(self) -> Law:
+    def energy_law(self) -> Law | None:
         laws = {part.energy_law for part in self.parts}
-        return "nonincreasing" if "nonincreasing" in laws else "conserved"
+        return None if None in laws else "nonincreasing" if "nonincreasing" in laws else "conserved"
 
     @property
     def entropy_law(self) -> Law | None:
         laws = {part.entropy_law for part in self.parts} - {"conserved"}
         return "conserved" if not laws else ("nondecreasing" if laws == {"nondecreasing"} else None)
+
+    @property
+    def symmetric(self) -> bool:
+        return all(part.symmetric for part in self.parts)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:

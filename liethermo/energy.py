@@ -1,13 +1,15 @@
 """Energies and entropies: functions of the state as sums of terms, quadratic or general.
 
 The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
-midpoint is one already; a general term gets a correction of its own [EQUATIONS: "Sums of energies"].
+midpoint is one already; a general term gets a correction of its own, along its own coordinates where it is told them
+(:meth:`Energy.on`) [EQUATIONS: "Sums of energies"].
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -18,9 +20,15 @@ import manifolds as mf
 
 from .errors import FunctionError, InputError
 
+if TYPE_CHECKING:
+    from .gradients import DiscreteGradient
+
+COORDINATE_TOLERANCE = 1e-10
+"""How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
+
 
 class Energy(eqx.Module):
-    """A real function of the state with a gradient; energies add with ``+``.
+    """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
 
     Calling one evaluates it: shape (..., n) to shape (...).
     """
@@ -38,6 +46,24 @@ class Energy(eqx.Module):
         """The summands, none of them a sum itself."""
         return (self,)
 
+    def discrete_gradient(self, scheme: DiscreteGradient, x, d, low) -> jax.Array:
+        """The discrete gradient of one term by a scheme, shape (n,): from x + low to x + low + d."""
+        return scheme.general(self, x, d, low)
+
+    def on(self, coordinates: Sequence[int] | Callable) -> Energy:
+        """This energy as a function of some coordinates of a larger state, ``x -> self(y)`` with ``y = coordinates(x)``.
+
+        Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions
+        puts no correction into momenta, one of distances keeps the momentum maps that distances are invariant under.
+
+        Parameters
+        ----------
+        coordinates : sequence of int, or function from x, shape (n,), to y, shape (m,)
+            Indices into the state, or a map at most quadratic in x (checked where a system is built).
+        """
+        pulled = tuple(Pullback(term, coordinates) for term in self.terms)
+        return pulled[0] if len(pulled) == 1 else Sum(pulled)
+
     def __call__(self, x) -> jax.Array:
         return jnp.vectorize(self.value, signature="(n)->()")(jnp.asarray(x, dtype=jnp.float64))
 
@@ -45,6 +71,15 @@ class Energy(eqx.Module):
         return Sum((*self.terms, *as_energy(other, "a term of a sum").terms))
 
     __radd__ = __add__
+
+    def __neg__(self) -> Energy:
+        return Negative(self)
+
+    def __sub__(self, other) -> Energy:
+        return self + -as_energy(other, "a term of a sum")
+
+    def __rsub__(self, other) -> Energy:
+        return -self + other
 
 
 class Quadratic(Energy):
@@ -85,6 +120,12 @@ class Quadratic(Energy):
     def gradient(self, x) -> jax.Array:
         return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
 
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        return scheme.quadratic(self, x, d, low)
+
+    def __neg__(self) -> Energy:
+        return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
+
 
 class Function(Energy):
     """An energy given by a plain function from a JAX array, shape (n,), to a scalar; differentiated by JAX.
@@ -98,6 +139,59 @@ class Function(Energy):
         return jnp.asarray(self.function(x))
 
 
+class Pullback(Energy):
+    """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
+
+    For such a map ``y' - y = Dpi(z) d`` with z the midpoint, exactly, so ``Dpi(z)^T`` takes discrete gradients in y to
+    discrete gradients in x [Gonzalez 1996].
+    """
+
+    term: Energy
+    indices: tuple[int, ...] = eqx.field(static=True)
+    function: Callable | None
+
+    def __init__(self, term: Energy, coordinates: Sequence[int] | Callable):
+        self.term = term
+        self.function = coordinates if callable(coordinates) else None
+        self.indices = () if callable(coordinates) else tuple(map(int, coordinates))
+
+    def of(self, x) -> jax.Array:
+        """The coordinates y of a state, shape (m,)."""
+        return x[np.array(self.indices, dtype=int)] if self.function is None else self.function(x)
+
+    def value(self, x) -> jax.Array:
+        return self.term.value(self.of(x))
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        low = jnp.zeros_like(x) + low
+        kept = jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
+        middle = x + (low + 0.5 * d)
+        step = jax.jvp(self.of, (middle,), (d,))[1]
+        (back,) = jax.vjp(self.of, middle)[1](scheme(self.term, self.of(x), step, kept))
+        return back
+
+    def __neg__(self) -> Energy:
+        return Pullback(-self.term, self.indices if self.function is None else self.function)
+
+
+class Negative(Energy):
+    """Minus a term."""
+
+    term: Energy
+
+    def value(self, x) -> jax.Array:
+        return -self.term.value(x)
+
+    def gradient(self, x) -> jax.Array:
+        return -self.term.gradient(x)
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        return -self.term.discrete_gradient(scheme, x, d, low)
+
+    def __neg__(self) -> Energy:
+        return self.term
+
+
 class Sum(Energy):
     """A sum of energies."""
 
@@ -106,6 +200,9 @@ class Sum(Energy):
     @property
     def terms(self) -> tuple[Energy, ...]:
         return self.summands
+
+    def __neg__(self) -> Energy:
+        return Sum(tuple(-term for term in self.summands))
 
     def value(self, x) -> jax.Array:
         return sum((term.value(x) for term in self.summands[1:]), self.summands[0].value(x))
@@ -140,7 +237,10 @@ def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
 
 
 def check_scalar(energy: Energy, dim: int, role: str) -> None:
-    """Raise unless the energy maps a state of this dimension to one real number."""
+    """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has."""
+    for term in energy.terms:
+        if isinstance(term, Pullback):
+            _check_coordinates(term, dim, role)
     state = jax.ShapeDtypeStruct((dim,), jnp.float64)
     try:
         result = jax.eval_shape(energy.value, state)
@@ -155,3 +255,31 @@ def check_scalar(energy: Energy, dim: int, role: str) -> None:
         )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
+
+
+def is_traced(tree) -> bool:
+    """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
+
+
+def _check_coordinates(term: Pullback, dim: int, role: str) -> None:
+    if term.function is None:
+        outside = [i for i in term.indices if not -dim <= i < dim]
+        if outside:  # JAX would read the last component instead
+            raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
+        return
+    if is_traced(term):
+        return
+    x, d = np.random.default_rng(0).standard_normal((2, dim))
+    try:
+        step = jax.jvp(term.of, (x + d / 2,), (d,))[1]
+        size = float(jnp.max(jnp.abs(term.of(x)) + jnp.abs(term.of(x + d)), initial=1.0))
+        defect = float(jnp.max(jnp.abs(term.of(x + d) - term.of(x) - step), initial=0.0))
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
+    if not defect <= COORDINATE_TOLERANCE * size:
+        raise InputError(
+            f"the coordinates of a term of {role} are not a quadratic function of the state: they miss "
+            f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * size:.1g}), which would "
+            "cost the exactness of the energy. Let the term take, say, the square of a distance and root it itself"
+        )

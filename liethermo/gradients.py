@@ -38,7 +38,8 @@ three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even 
 class DiscreteGradient(eqx.Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
-    A sum of energies is treated term by term: discrete gradients add. ``low`` is what rounding has kept from x
+    A sum of energies is treated term by term: discrete gradients add, and each term knows which of the methods below is
+    its own (:meth:`liethermo.Energy.discrete_gradient`). ``low`` is what rounding has kept from x
     (compensated summation): points along the step are ``x + (low + c d)``, so that a step far below the rounding of
     x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
     """
@@ -49,10 +50,7 @@ class DiscreteGradient(eqx.Module):
         return 2
 
     def __call__(self, energy: Energy, x, d, low=0.0) -> jax.Array:
-        parts = [
-            self.quadratic(term, x, d, low) if isinstance(term, Quadratic) else self.general(term, x, d, low)
-            for term in energy.terms
-        ]
+        parts = [term.discrete_gradient(self, x, d, low) for term in energy.terms]
         return sum(parts[1:], parts[0])
 
     def quadratic(self, term: Quadratic, x, d, low) -> jax.Array:
