@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .engine import array, compiled
+from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
@@ -255,7 +256,7 @@ class _Run:
             x=x,
             energy=energy,
             entropy=None if system.entropy is None else entropy,
-            casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
+            casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=laws_of(system, self.method, invariants),
@@ -303,6 +304,10 @@ def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
     return Laws(system.energy_law, system.entropy_law, conserved)
+
+
+def _value(function, x):
+    return function.value(x)
 
 
 def _keeps(method, function) -> bool:

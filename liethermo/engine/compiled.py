@@ -234,7 +234,9 @@ class Stepper:
     def _text(self, newton: bool) -> str:
         lanes, n, m = self.lanes, self._shapes["X"][0], self._shapes["MATRIX"][0]
         lines = ["import math", "", "import numpy as np", "from numba import njit as compiled", ""]
-        lines += ["njit = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
+        lines += ["entry = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
+        # inlined, the programs keep their values in registers; with Newton's method there are too many calls for that
+        lines += [f"njit = compiled(error_model='numpy', nogil=True, forceinline={not newton})"]
         lines += [f"N, M, LANES, NEWTON = {n}, {m}, {lanes}, {newton}"]
         lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS.split()]
         lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]
