@@ -22,6 +22,7 @@ from .dissipation import (
     ProjectedMetric,
 )
 from .energy import Energy, Function, Quadratic
+from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
     CasimirError,
@@ -63,6 +64,7 @@ __all__ = [
     "Dissipation",
     "DoubleBracket",
     "Energy",
+    "Ensemble",
     "EulerPoincareForce",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -96,6 +98,7 @@ __all__ = [
     "Status",
     "System",
     "ThermodynamicHerglotz",
+    "ensemble",
     "integrate",
     "load",
     "models",

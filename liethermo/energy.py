@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import real_array
 
 from .errors import FunctionError, InputError
 
@@ -97,16 +98,17 @@ class Quadratic(Energy):
     c: jax.Array
 
     def __init__(self, A, b=None, c=0.0):
-        self.A = jnp.asarray(A, dtype=jnp.float64)
-        self.b = None if b is None else jnp.asarray(b, dtype=jnp.float64)
-        self.c = jnp.asarray(c, dtype=jnp.float64)
+        self.A = real_array(A)
+        self.b = None if b is None else real_array(b)
+        self.c = real_array(c)
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
             raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:
             raise InputError(f"b has shape {self.A.shape[:1]} beside this A, not {self.b.shape}")
         if self.A.ndim == 2 and not isinstance(self.A, jax.core.Tracer):
-            asymmetry = float(jnp.max(jnp.abs(self.A - self.A.T)))
-            if asymmetry > 1e-12 * float(jnp.max(jnp.abs(self.A))):
+            matrix = np.asarray(self.A)
+            asymmetry = float(np.abs(matrix - matrix.T).max())
+            if asymmetry > 1e-12 * float(np.abs(matrix).max()):
                 raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
 
     def linear_part(self, x) -> jax.Array:
