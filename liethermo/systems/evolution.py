@@ -132,7 +132,7 @@ class ContactSystem(OnContactManifold):
         return decay(self, x)
 
 
-# -- shared with the Lagrangian side ------------------------------------------------------------------------------------
+# -- shared with the Lagrangian side ----------------------------------------------------------------------------------
 
 
 def canonical(dim: int) -> mf.Cosymplectic:

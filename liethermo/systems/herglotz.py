@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -38,7 +38,7 @@ class OnVelocities(OnContactManifold):
     @property
     def contact(self) -> mf.LagrangianContact:
         """The contact structure ``eta_L = dS - L_v dq`` [SML §3.1]."""
-        return self.poisson.contact
+        return cast(mf.LagrangianContact, self.poisson.contact)
 
     def _prepare(self, lagrangian, dim: int | None) -> tuple[mf.Cosymplectic, int, Energy]:
         """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
@@ -125,7 +125,7 @@ class Herglotz(OnVelocities):
         return decay(self, x)
 
 
-# -- the energy E_L -----------------------------------------------------------------------------------------------------
+# -- the energy E_L ---------------------------------------------------------------------------------------------------
 
 
 def _energy(L: Energy, dim: int) -> Energy:
@@ -161,7 +161,7 @@ class _LegendreEnergy(Energy):
         return jnp.dot(x[n : 2 * n], self.lagrangian.gradient(x)[n : 2 * n]) - self.lagrangian.value(x)
 
 
-# -- the Hamiltonian ----------------------------------------------------------------------------------------------------
+# -- the Hamiltonian --------------------------------------------------------------------------------------------------
 
 
 def _hamiltonian(L: Energy, dim: int) -> Energy:

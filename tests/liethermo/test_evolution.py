@@ -1,4 +1,4 @@
-"""Evolution fields: both laws at every step, the closed forms of the paper, and the plain contact fields beside them."""
+"""Evolution fields: both laws at every step, the closed form of the paper, and the plain contact fields beside them."""
 
 import equinox as eqx
 import jax
@@ -57,16 +57,23 @@ def assert_both_laws(solution):
     assert solution.stats.least_entropy_increment >= -allowed
 
 
-# -- the field ----------------------------------------------------------------------------------------------------------
+# -- the field --------------------------------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def both_fields(energy, x):
+    evolution, contact = lt.EvolutionSystem(energy, 5, validate=False), lt.ContactSystem(energy, 5, validate=False)
+    M = mf.CanonicalContact(2)
+    return (
+        evolution.vector_field(x) - M.evolution_vector_field(energy.value)(x),
+        contact.vector_field(x) - M.hamiltonian_vector_field(energy.value)(x),
+    )
 
 
 @given(seed=seeds)
 def test_the_fields_are_those_of_the_contact_structure(seed):
-    energy, x = bumpy_energy(seed, True), random_state(seed)
-    evolution, contact = lt.EvolutionSystem(energy, 5, validate=False), lt.ContactSystem(energy, 5, validate=False)
-    M = mf.CanonicalContact(2)
-    assert np.allclose(evolution.vector_field(x), M.evolution_vector_field(energy.value)(x), rtol=0, atol=1e-13)
-    assert np.allclose(contact.vector_field(x), M.hamiltonian_vector_field(energy.value)(x), rtol=0, atol=1e-13)
+    for difference in both_fields(bumpy_energy(seed, True), random_state(seed)):
+        assert np.abs(difference).max() < 1e-13
 
 
 def test_the_linearly_damped_system():
@@ -98,10 +105,10 @@ def test_the_report():
     assert "falls" not in row.note
 
 
-# -- both laws at every step ----------------------------------------------------------------------------------------------
+# -- both laws at every step ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bent", [False, True], ids=["G", "G(q)"])
+@pytest.mark.parametrize("bent", [pytest.param(False, marks=pytest.mark.slow, id="G"), pytest.param(True, id="G(q)")])
 @given(seed=seeds, h=st.floats(0.01, 1.0))
 def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
     """SML §6.1 asks for a quadratic V; here any V, and a metric that depends on q."""
@@ -114,7 +121,8 @@ def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
     assert solution.entropy[-1] >= solution.entropy[0]
 
 
-@pytest.mark.parametrize("name", [name for name in GRADIENTS if name != "gonzalez"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GRADIENTS)
 def test_both_laws_with_every_discrete_gradient(name):
     """Diagonal G, for which the coordinate increment as printed is a midpoint gradient too."""
     energy = lt.Kinetic([1.0, 0.5]) + lt.Potential(Bumpy(jnp.array([2.0, -1.0, 1.5]), jnp.ones(2)))
@@ -125,16 +133,18 @@ def test_both_laws_with_every_discrete_gradient(name):
 
 
 def test_the_same_energy_as_one_plain_function():
-    """Control: not told what is kinetic, the scheme loses the second law and keeps the first."""
-    energy = lt.Kinetic([0.02]) + lt.Potential(lambda q, S: jnp.cos(3.0 * q[0] + 2.0 * S) + 0.2 * S)
-    x0, h = [0.5, 0.3, 0.1], 1.5
-    told = lt.integrate(lt.EvolutionSystem(energy, 3), x0, (0.0, 200 * h), h)
-    plain = lt.EvolutionSystem(lambda x: energy.value(x), 3)
-    untold = lt.integrate(plain, x0, (0.0, 200 * h), h)
-    assert_both_laws(told)
+    """Control: not told what is kinetic, the scheme keeps the first law and loses the second, in coarse steps."""
+
+    def V(q, S):
+        return 0.5 * jnp.cos(7.0 * q[0] + 0.4 * q[1] + 0.3 * S) + 0.1 * jnp.sum(q**4) + 0.002 * S + 0.5 * q[0]
+
+    energy, x0, h = lt.Kinetic([3.5, 1e-3]) + lt.Potential(V), [0.0, 0.0, 0.2, 0.3, 0.0], 0.7
+    plain = lt.EvolutionSystem(lambda x: energy.value(x), 5)
     assert plain.entropy_law is None
+    told, untold = (lt.integrate(s, x0, (0.0, 4 * h), h) for s in (lt.EvolutionSystem(energy, 5), plain))
+    assert_both_laws(told)
     assert untold.audit().energy_drift <= tolerance("energy")
-    assert untold.stats.least_entropy_increment < -1e-5
+    assert untold.stats.least_entropy_increment < -0.05
     assert "no law promised" in str(untold.audit())
 
 
@@ -142,12 +152,10 @@ def test_a_lorentzian_metric_promises_nothing():
     """SML §7: the second law fails for such metrics, except along time-like curves."""
     system = lt.EvolutionSystem(lt.Kinetic([1.0, -1.0]) + lt.Potential(lambda q, S: 0.1 * S + q @ q), 5)
     assert system.entropy_law is None
-    solution = lt.integrate(system, [0.0, 0.0, 0.2, 1.0, 0.0], (0.0, 5.0), 0.05)
-    assert solution.audit().passed
-    assert solution.stats.least_entropy_increment < -1e-2
+    assert float(system.entropy_production([0.0, 0.0, 0.2, 1.0, 0.0])) == pytest.approx(0.04 - 1.0)
 
 
-# -- the closed forms of the paper ----------------------------------------------------------------------------------------
+# -- the closed forms of the paper ------------------------------------------------------------------------------------
 
 
 def closed_form_39(q, p, S, h, gamma):
@@ -176,34 +184,41 @@ def test_39(engine):
 
 
 def test_observed_order():
-    system, x0 = lt.EvolutionSystem(bumpy_energy(3, True), 5), 0.5 * random_state(3)
+    system, x0 = lt.EvolutionSystem(bumpy_energy(3, True), 5, validate=False), 0.5 * random_state(3)
     exact = lt.integrate(system, x0, (0.0, 2.0), 2.0, lt.Reference(rtol=1e-13)).x[-1]
-    errors = [np.abs(lt.integrate(system, x0, (0.0, 2.0), 2.0 / n).x[-1] - exact).max() for n in (40, 80, 160, 320)]
+    errors = []
+    for n in (40, 80, 160, 320):
+        errors.append(np.abs(lt.integrate(system, x0, (0.0, 2.0), 2.0 / n, save_every=n // 40).x[-1] - exact).max())
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert min(errors) > 1e-10
     assert (np.abs(slopes - 2.0) < 0.2).all(), (errors, slopes)
 
 
+@pytest.mark.slow
 def test_both_engines():
-    system, x0 = lt.EvolutionSystem(bumpy_energy(5, True), 5), random_state(5)
-    array, compiled = (lt.integrate(system, x0, (0.0, 5.0), 0.05, engine=engine) for engine in ("array", "compiled"))
+    system, x0 = lt.EvolutionSystem(bumpy_energy(5, True), 5, validate=False), random_state(5)
+    array, compiled = (lt.integrate(system, x0, (0.0, 2.0), 0.05, engine=engine) for engine in ("array", "compiled"))
     assert np.abs(array.x - compiled.x).max() < 1e-12
     assert_both_laws(compiled)
 
 
-# -- the plain contact field ----------------------------------------------------------------------------------------------
+# -- the plain contact field ------------------------------------------------------------------------------------------
+
+
+def contact_run(a_S, b, steps):
+    energy = lt.Kinetic([1.0]) + lt.Potential(Bumpy(jnp.array([2.0, a_S]), jnp.array([b])))
+    system = lt.ContactSystem(energy, 3, validate=False)
+    return energy, system, lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 1.0), 1.0 / steps, save_every=steps // 10)
 
 
 def test_the_contact_field_keeps_its_law_exactly():
     """``H' = -R(H) H`` becomes ``H(x') - H(x) = -h (dgrad H)_S H(z)``, to rounding, at every step."""
-    energy, h = bumpy_energy(8, True), 0.05
-    system = lt.ContactSystem(energy, 5)
-    solution = lt.integrate(system, random_state(8), (0.0, 100 * h), h)
-    gradient = eqx.filter_jit(jax.vmap(lambda x, d: lt.Gonzalez()(energy, x, d)))
+    energy, system, solution = contact_run(1.5, 1.0, 10)
     x, d = solution.x[:-1], np.diff(solution.x, axis=0)
-    predicted = -h * np.asarray(gradient(x, d))[:, -1] * np.asarray(energy(x + d / 2))
-    assert np.ptp(solution.energy) > 1.0
-    assert np.abs(np.diff(solution.energy) - predicted).max() < 1e-12
+    gradient = eqx.filter_jit(jax.vmap(lambda x, d: lt.Gonzalez()(energy, x, d)))
+    predicted = -0.1 * np.asarray(gradient(x, d))[:, -1] * np.asarray(energy(x + d / 2))
+    assert np.ptp(solution.energy) > 0.2
+    assert np.abs(np.diff(solution.energy) - predicted).max() < 1e-14
     assert "dH/dt = -R(H) H" in str(system.check())
     assert solution.entropy is None
     audit = solution.audit()
@@ -211,18 +226,17 @@ def test_the_contact_field_keeps_its_law_exactly():
     assert [row.note for row in audit.rows if row.law == "energy drift"] == ["no law promised"]
 
 
-def test_the_contact_oscillator_loses_its_energy_exponentially():
-    """H_S = gamma constant: ``H(t) = H(0) exp(-gamma t)``, while the evolution field keeps it."""
-    system = lt.ContactSystem(OSCILLATOR.energy, 3)
+def test_a_contact_field_at_constant_temperature_loses_its_energy_exponentially():
+    """H_S = 1: ``H(t) = H(0) exp(-t)``, to second order."""
     errors = []
-    for h in (0.1, 0.05, 0.025):
-        solution = lt.integrate(system, [0.0, 10.0, 0.0], (0.0, 20.0), h)
-        errors.append(np.abs(solution.energy - 50.0 * np.exp(-GAMMA * solution.t)).max())
+    for steps in (10, 20, 40):
+        solution = contact_run(0.0, 0.0, steps)[2]
+        errors.append(np.abs(solution.energy - solution.energy[0] * np.exp(-solution.t)).max())
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (np.abs(slopes - 2.0) < 0.2).all(), errors
 
 
-# -- what is refused --------------------------------------------------------------------------------------------------------
+# -- what is refused --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [1, 2, 4, 3.0, True, None])

@@ -82,8 +82,8 @@ def test_invariances_of_coordinates_are_kept():
 
     def sum_and_torque(energy):
         force = np.asarray(discrete(lt.Gonzalez(), energy, x, d)[0]).reshape(2, 2)
-        middle = (x + d / 2).reshape(2, 2)
-        return np.abs(force.sum(axis=0)).max(), abs(np.linalg.det([middle[0], force[0]]) + np.linalg.det([middle[1], force[1]]))
+        torques = [np.linalg.det(pair) for pair in zip((x + d / 2).reshape(2, 2), force, strict=True)]
+        return np.abs(force.sum(axis=0)).max(), abs(sum(torques))
 
     root, (x, d) = lt.Function(lambda y: jnp.sqrt(y[0])), np.random.default_rng(1).standard_normal((2, 4))
     assert max(sum_and_torque(root.on(squared))) < 1e-14
@@ -104,7 +104,8 @@ def test_arithmetic():
     for term in TERMS.values():
         assert float((-term)(x)) == -float(term(x))
         assert np.array_equal((-term).gradient(x), -term.gradient(x))
-        assert float((-(-term))(x)) == float(term(x))
+        opposite = -term
+        assert float((-opposite)(x)) == float(term(x))
         assert float((bumpy - term)(x)) == pytest.approx(float(bumpy(x) - term(x)), rel=1e-14)
     assert isinstance(-lt.Quadratic(np.ones(3)), lt.Quadratic)
 
