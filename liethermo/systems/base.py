@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar
+from ..energy import Energy, as_energy, check_scalar, recognised
 from ..engine.interpret import at_points
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
@@ -53,8 +53,10 @@ class System(eqx.Module):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
         self.momentum_maps = {name: as_energy(J, f"momentum map {name!r}") for name, J in momentum_maps.items()}
         check_scalar(self.energy, dim, "the energy")
+        self.energy = recognised(self.energy, dim)
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
+            self.entropy = recognised(self.entropy, dim)
         for name, J in self.momentum_maps.items():
             check_scalar(J, dim, f"momentum map {name!r}")
         if dissipation is not None and not isinstance(dissipation, Dissipation):
