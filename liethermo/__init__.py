@@ -37,7 +37,7 @@ from .errors import (
     SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
 from .timeloop import integrate
@@ -69,6 +69,7 @@ __all__ = [
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
+    "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticSystem",
     "NonFiniteError",

@@ -105,6 +105,8 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
+    if isinstance(method, OneStepMethod):
+        method.check(system)
     table = Timetable(t_span, step, save_every)
     run = _Run(system, method, system.state(x0), table, save_to, engine)
     with _Progress((table.start, table.end), progress) as bar:
@@ -144,9 +146,10 @@ class _Run:
         capacity = max(
             1, min(CHUNK_SAVES, CHUNK_STEPS // (self.table.every or 1), _power_of_two(len(self.table.counts) - 1))
         )
-        state, interrupted = self._begin(), False
-        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
+        state, interrupted = None, False
+        self.values = [self._energies(self.states[0])]
         try:
+            state = self._begin()
             for h, saves, every in self.table.calls(saves=capacity):
                 state = self._advance(state, h, saves, every, capacity)
                 bar.update(self.times[-1])
@@ -155,6 +158,9 @@ class _Run:
                 self._checkpoint(state)
         except KeyboardInterrupt:
             interrupted = True
+        if state is None:
+            self.status = Status("interrupted", "stopped by the user before the first step", 0, self.table.start)
+            return
         self.stats, self.status = _stats(state), self._status(state, interrupted)
 
     def _begin(self):
@@ -244,8 +250,7 @@ class _Run:
             self.status = Status("completed", f"reached t = {now:g}", len(x) - 1, now)
 
     def _energies(self, x: np.ndarray) -> np.ndarray:
-        entropy = np.zeros(len(x)) if self.system.entropy is None else np.asarray(self.system.entropy(x))
-        return np.stack([np.asarray(self.system.energy(x)), entropy], axis=1)
+        return np.stack(at_points(array.values, self.system, x), axis=1)
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
