@@ -193,7 +193,7 @@ def _stage_gradients(term: Energy, x, low, h, k, A, b) -> jax.Array:
         smooth = (5 / 18) * jnp.dot(left + right - 2.0 * mean, d)
         spread = jnp.linalg.norm(left - right)
     else:
-        smooth, spread = 0.0, jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
+        smooth, spread = jnp.zeros(()), jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
     before, after = _values(term, jnp.stack([x, x + (low + d)]))
     defect = (after - before) - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     square = jnp.dot(b, jnp.sum(k * k, axis=1))

@@ -11,7 +11,7 @@ MOST_STAGES = 8
 
 
 class Gauss(NamedTuple):
-    """The Gauss method of s stages on [0, 1], order 2s [Hairer, Lubich & Wanner, Geometric Numerical Integration, II.1].
+    """The Gauss method of s stages on [0, 1], order 2s [Hairer, Lubich & Wanner 2006, II.1].
 
     Attributes
     ----------
