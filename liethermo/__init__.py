@@ -37,7 +37,14 @@ from .errors import (
     SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import DiscreteHerglotz, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import (
+    DiscreteHerglotz,
+    MetriplecticGauss,
+    MetriplecticMidpoint,
+    OneStepMethod,
+    Reference,
+    registered_methods,
+)
 from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .systems import (
@@ -84,6 +91,7 @@ __all__ = [
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
+    "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticSystem",
     "NonFiniteError",

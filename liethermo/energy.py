@@ -19,6 +19,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import real_array
 
+from .engine.interpret import at_points, polynomial_degree
 from .errors import FunctionError, InputError
 
 if TYPE_CHECKING:
@@ -47,12 +48,21 @@ class Energy(eqx.Module):
         """The summands, none of them a sum itself."""
         return (self,)
 
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
+        return False
+
     def discrete_gradient(self, scheme: DiscreteGradient, x, d, low) -> jax.Array:
-        """The discrete gradient of one term by a scheme, shape (n,): from x + low to x + low + d."""
-        return scheme.general(self, x, d, low)
+        """The discrete gradient of one term by a scheme, shape (n,), from x + low to x + low + d."""
+        return scheme.quadratic(self, x, d, low) if self.is_quadratic else scheme.general(self, x, d, low)
+
+    def stage_gradients(self, scheme: Callable, x, low, h, k, A, b) -> jax.Array:
+        """That of one term at the stages of a collocation method, shape (s, n); see gradients.stage_gradients."""
+        return scheme(self, x, low, h, k, A, b)
 
     def on(self, coordinates: Sequence[int] | Callable) -> Energy:
-        """This energy as a function of some coordinates of a larger state, ``x -> self(y)`` with ``y = coordinates(x)``.
+        """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
 
         Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions
         puts no correction into momenta, one of distances keeps the momentum maps that distances are invariant under.
@@ -111,6 +121,10 @@ class Quadratic(Energy):
             if asymmetry > 1e-12 * float(np.abs(matrix).max()):
                 raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
 
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
     def linear_part(self, x) -> jax.Array:
         """``A x``."""
         return self.A * x if self.A.ndim == 1 else self.A @ x
@@ -121,9 +135,6 @@ class Quadratic(Energy):
 
     def gradient(self, x) -> jax.Array:
         return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
-
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        return scheme.quadratic(self, x, d, low)
 
     def __neg__(self) -> Energy:
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
@@ -136,6 +147,11 @@ class Function(Energy):
     """
 
     function: Callable
+    quadratic: bool = eqx.field(static=True, default=False)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.quadratic
 
     def value(self, x) -> jax.Array:
         return jnp.asarray(self.function(x))
@@ -157,6 +173,10 @@ class Pullback(Energy):
         self.function = coordinates if callable(coordinates) else None
         self.indices = () if callable(coordinates) else tuple(map(int, coordinates))
 
+    @property
+    def is_quadratic(self) -> bool:
+        return self.function is None and self.term.is_quadratic
+
     def of(self, x) -> jax.Array:
         """The coordinates y of a state, shape (m,)."""
         return x[np.array(self.indices, dtype=int)] if self.function is None else self.function(x)
@@ -165,12 +185,27 @@ class Pullback(Energy):
         return self.term.value(self.of(x))
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        step, back = self._moved(x + (low + 0.5 * d), d)
+        return back(self.term.discrete_gradient(scheme, self.of(x), step, self._kept(x, low)))
+
+    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
+        u = x + (low + h * (A @ k))
+        slopes, back = self._moved(u, k)
+        # One stage is a discrete gradient along the chord in y; of more, their order asks for the coordinates of u_i.
+        stages = None if len(b) == 1 else jax.vmap(self.of)(u)
+        return back(scheme(self.term, self.of(x), self._kept(x, low), h, slopes, A, b, stages=stages))
+
+    def _moved(self, x, d) -> tuple[jax.Array, Callable]:
+        """``Dpi(x) d`` at one or more points, and the function ``Dpi(x)^T`` of covectors."""
+        if x.ndim > 1:
+            moved = jax.vmap(lambda x, d: jax.jvp(self.of, (x,), (d,))[1])(x, d)
+            return moved, lambda covectors: jax.vmap(lambda x, g: jax.vjp(self.of, x)[1](g)[0])(x, covectors)
+        return jax.jvp(self.of, (x,), (d,))[1], lambda covector: jax.vjp(self.of, x)[1](covector)[0]
+
+    def _kept(self, x, low) -> jax.Array:
+        """What rounding has kept from y, ``pi(x + low) - pi(x)``."""
         low = jnp.zeros_like(x) + low
-        kept = jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
-        middle = x + (low + 0.5 * d)
-        step = jax.jvp(self.of, (middle,), (d,))[1]
-        (back,) = jax.vjp(self.of, middle)[1](scheme(self.term, self.of(x), step, kept))
-        return back
+        return jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
 
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.indices if self.function is None else self.function)
@@ -181,6 +216,10 @@ class Negative(Energy):
 
     term: Energy
 
+    @property
+    def is_quadratic(self) -> bool:
+        return self.term.is_quadratic
+
     def value(self, x) -> jax.Array:
         return -self.term.value(x)
 
@@ -189,6 +228,9 @@ class Negative(Energy):
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         return -self.term.discrete_gradient(scheme, x, d, low)
+
+    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
+        return -self.term.stage_gradients(scheme, x, low, h, k, A, b)
 
     def __neg__(self) -> Energy:
         return self.term
@@ -202,6 +244,10 @@ class Sum(Energy):
     @property
     def terms(self) -> tuple[Energy, ...]:
         return self.summands
+
+    @property
+    def is_quadratic(self) -> bool:
+        return all(term.is_quadratic for term in self.summands)
 
     def __neg__(self) -> Energy:
         return Sum(tuple(-term for term in self.summands))
@@ -238,6 +284,24 @@ def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
     return Quadratic(A, b if b.any() else None, c)
 
 
+def recognised(energy: Energy, dim: int) -> Energy:
+    """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
+    if isinstance(energy, Sum):
+        return Sum(tuple(recognised(term, dim) for term in energy.summands))
+    if isinstance(energy, Negative):
+        return Negative(recognised(energy.term, dim))
+    if isinstance(energy, Pullback):
+        (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
+    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
+        return Function(energy.function, quadratic=True)
+    return energy
+
+
+def _value(energy: Energy, x):
+    return energy.value(x)
+
+
 def check_scalar(energy: Energy, dim: int, role: str) -> None:
     """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has."""
     for term in energy.terms:
@@ -272,16 +336,25 @@ def _check_coordinates(term: Pullback, dim: int, role: str) -> None:
         return
     if is_traced(term):
         return
-    x, d = np.random.default_rng(0).standard_normal((2, dim))
     try:
-        step = jax.jvp(term.of, (x + d / 2,), (d,))[1]
-        size = float(jnp.max(jnp.abs(term.of(x)) + jnp.abs(term.of(x + d)), initial=1.0))
-        defect = float(jnp.max(jnp.abs(term.of(x + d) - term.of(x) - step), initial=0.0))
+        start, end, step = at_points(_chord, term, np.random.default_rng(0).standard_normal((1, 2 * dim)))
     except (TypeError, ValueError, IndexError) as error:
         raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
+    if start.ndim != 2:
+        raise FunctionError(
+            f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"
+        )
+    size = max(1.0, float(np.abs(start).max() + np.abs(end).max()))
+    defect = float(np.abs(end - start - step).max())
     if not defect <= COORDINATE_TOLERANCE * size:
         raise InputError(
             f"the coordinates of a term of {role} are not a quadratic function of the state: they miss "
             f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * size:.1g}), which would "
             "cost the exactness of the energy. Let the term take, say, the square of a distance and root it itself"
         )
+
+
+def _chord(term: Pullback, ends):
+    """The coordinates of two random states, and their difference as a quadratic map would have it."""
+    x, d = jnp.split(ends, 2)
+    return term.of(x), term.of(x + d), jax.jvp(term.of, (x + 0.5 * d,), (d,))[1]

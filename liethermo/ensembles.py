@@ -199,6 +199,7 @@ def ensemble(
     states = np.broadcast_to(states, (size, states.shape[1]))
     times = Timetable(t_span, step, save_every if outputs == "trajectory" else None)
     family.check(states)
+    method.check(member)
     record = _Record(size, member, times, outputs)
 
     small = member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .energy import Energy, Function, Pullback, Quadratic, is_traced
+from .engine.interpret import at_points
 
 
 class Kinetic(Energy):
     """``p . G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v . G(q) v / 2`` of (q, v, S) [SML 28].
 
-    G is the inverse of the metric (of the mass matrix) in a Hamiltonian, the metric itself in a Lagrangian. Whatever the scheme its discrete gradient by p is ``(G(q) + G(q')) (p + p') / 4``: a semidefinite matrix times the
-    mean of p, which is what keeps the entropy of an evolution field from falling at any step.
+    G is the inverse of the metric (of the mass matrix) in a Hamiltonian, the metric itself in a Lagrangian. In every
+    scheme its discrete gradient by p is a mean of G times a mean of p: ``(G(q) + G(q')) (p + p') / 4`` for discrete
+    gradients, ``G(q_i) p_i`` at the stages of a collocation method; what corrects it goes along q alone. For a
+    semidefinite G this keeps the entropy of an evolution field from falling at any step.
 
     Parameters
     ----------
@@ -26,6 +30,10 @@ class Kinetic(Energy):
 
     def __init__(self, G):
         self.G = G if callable(G) else Quadratic(G).A  # checked there
+
+    @property
+    def is_quadratic(self) -> bool:
+        return not callable(self.G)
 
     def at(self, q) -> jax.Array:
         """``G(q)``, shape (n, n) or (n,)."""
@@ -41,14 +49,17 @@ class Kinetic(Energy):
         if not callable(self.G):
             return jnp.concatenate([jnp.zeros_like(q), _apply(self.G, middle), nothing])
         first, last = p + low_p, p + (low_p + dp)
-        G = [self.at(q + low_q), self.at(q + (low_q + dq))]
-        by_p = 0.5 * (_apply(G[0], middle) + _apply(G[1], middle))
 
         def mean(q):  # over both ends in p, of the kinetic energy at q
-            return 0.25 * (jnp.dot(first, _apply(self.at(q), first)) + jnp.dot(last, _apply(self.at(q), last)))
+            G = self.at(q)
+            return 0.25 * (jnp.dot(first, _apply(G, first)) + jnp.dot(last, _apply(G, last)))
 
-        by_q = scheme.general(Function(mean), q, dq, low_q)
-        return jnp.concatenate([by_q, by_p, nothing])
+        by_p = 0.5 * (_apply(self.at(q + low_q), middle) + _apply(self.at(q + (low_q + dq)), middle))
+        return jnp.concatenate([scheme.general(Function(mean), q, dq, low_q), by_p, nothing])
+
+    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
+        n = len(x) // 2
+        return scheme(self, x, low, h, k, A, b, along=np.arange(len(x)) < n)
 
 
 class Potential(Pullback):
@@ -63,18 +74,21 @@ class Potential(Pullback):
         super().__init__(Function(_Apart(V)), _without_momenta)
 
 
-class _Apart(Function):
+class _Apart(eqx.Module):
     """V(q, S) as a function of one array."""
 
-    def value(self, x):
-        return jnp.asarray(self.function(x[:-1], x[-1]))
+    V: Callable
+
+    def __call__(self, y):
+        return self.V(y[:-1], y[-1])
 
 
 def is_mechanical(energy: Energy, dim: int) -> bool:
     """Whether H is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite [SML 28], and each term known to be of that kind.
 
     Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes that of a
-    quadratic term at the midpoint. A plain function of the whole state is not known to be anything.
+    quadratic term at the midpoint. A plain function of the whole state is not known to be of any kind, unless it is
+    quadratic.
     """
     if is_traced(energy):
         return False
@@ -82,29 +96,42 @@ def is_mechanical(energy: Energy, dim: int) -> bool:
     return all(_is_kinetic(term, points) or is_free_of_momenta(term, points) for term in energy.terms)
 
 
-def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
-    n = points.shape[1] // 2
-    if isinstance(term, Kinetic):
-        return all(_is_semidefinite(np.asarray(term.at(q))) for q in points[:, :n])
-    if not isinstance(term, Quadratic):
-        return False
-    A = np.diag(term.A) if term.A.ndim == 1 else np.asarray(term.A)
-    rows, linear = A[n : 2 * n], None if term.b is None else np.asarray(term.b)[n : 2 * n]
-    mixed = np.delete(rows, np.s_[n : 2 * n], axis=1)
-    return not mixed.any() and (linear is None or not linear.any()) and _is_semidefinite(rows[:, n : 2 * n])
-
-
 def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
     """Whether a term is known not to depend on p (or v), from the derivative of its coordinates at some states."""
+    return isinstance(term, Pullback) and not at_points(_coordinates_by_momenta, term, points).any()
+
+
+def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
+    """Whether it is a semidefinite form in p, whatever else it is in q and S; without mixed terms."""
     n = points.shape[1] // 2
-    if not isinstance(term, Pullback):
+    if isinstance(term, Kinetic):
+        return _is_semidefinite(at_points(_metric, term, points))
+    if not term.is_quadratic:
         return False
-    return not any(np.asarray(jax.jacfwd(term.of)(x))[:, n : 2 * n].any() for x in points)
+    slope, hessian = at_points(_by_momenta, term, np.zeros_like(points[:1]))
+    mixed = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
+    return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n])
 
 
 def _is_semidefinite(G: np.ndarray) -> bool:
-    eigenvalues = G if G.ndim == 1 else np.linalg.eigvalsh(G)
+    """Of matrices, shape (..., n, n)."""
+    eigenvalues = np.linalg.eigvalsh(G)
     return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
+
+
+def _metric(term: Kinetic, x):
+    G = term.at(_halves(x)[0])
+    return jnp.diag(G) if G.ndim == 1 else G
+
+
+def _by_momenta(term: Energy, x):
+    n = len(x) // 2
+    return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
+
+
+def _coordinates_by_momenta(term: Pullback, x):
+    n = len(x) // 2
+    return jax.jacfwd(term.of)(x)[:, n : 2 * n]
 
 
 def _halves(x):

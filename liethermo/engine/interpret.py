@@ -6,6 +6,7 @@ takes milliseconds. What is too large for that, or cannot be unrolled, is compil
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -38,13 +39,23 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
     return jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
 
 
-def depends(function: Callable, model: Any, dim: int) -> bool:
-    """Whether ``function(model, x)`` is more than a constant, as far as its unrolled form shows: False is a proof."""
+def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
+    """Degree of ``function(model, x)`` as a polynomial in x, shape (dim,), for any parameters; an upper bound.
+
+    Infinity where it is not written as a polynomial. The arrays of the model are the parameters.
+    """
+    dynamic, static = eqx.partition(model, eqx.is_inexact_array)
+    leaves, structure = jax.tree_util.tree_flatten(dynamic)
+    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
+    closed = jax.make_jaxpr(
+        lambda arrays, x: function(eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static), x)
+    )(shapes, jax.ShapeDtypeStruct((dim,), np.float64))
+    if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
+        return math.inf  # a function that closes over what is being traced
     try:
-        program, _ = _unrolled(function, model, (dim,))
+        return scalarize(closed, limit=LIMIT).degree(len(leaves))
     except UnsupportedPrimitive:
-        return True
-    return any(type(a) is str for entries in program.outputs for a in entries)
+        return math.inf
 
 
 def _unrolled(function: Callable, model: Any, shape: tuple[int, ...]) -> tuple[Program, Any]:

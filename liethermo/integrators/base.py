@@ -54,6 +54,9 @@ class OneStepMethod(eqx.Module):
     def increment(self, h, k) -> jax.Array:
         """``x' - x``, shape (n,), from the solved slopes."""
 
+    def check(self, system: System) -> None:
+        """Raise InputError where the method cannot be used on a system; called when a run starts."""
+
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""
         return jnp.tile(system.vector_field(x), (self.stages, 1))

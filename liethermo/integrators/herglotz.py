@@ -24,9 +24,9 @@ class DiscreteHerglotz(OneStepMethod):
     ``p_1 = D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1). The discrete Lagrangian alone makes the step;
     the system only says what energy and entropy are recorded.
 
-    Nothing is kept exactly, neither the energy nor the sign of the entropy production. Order 1, since (40) and (41) take
-    the entropy at the start of the step; where L does not depend on S, a variational integrator of the order of L_d.
-    One equation of the size of q a step, solved by Newton's method; explicit where L_d is quadratic in q_2.
+    Nothing is kept exactly, neither the energy nor the sign of the entropy production. Order 1, since (40) and (41)
+    take the entropy at the start of the step; where L does not depend on S, a variational integrator of the order of
+    L_d. One equation of the size of q a step, solved by Newton's method; explicit where L_d is quadratic in q_2.
 
     Parameters
     ----------
@@ -64,9 +64,12 @@ class DiscreteHerglotz(OneStepMethod):
         p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q0, q1, jnp.asarray(S0, dtype=jnp.float64), h)
         return jnp.concatenate([q1, p1, (S0 + jnp.dot(q1 - q0, p1))[None]])
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+    def check(self, system: System) -> None:
+        """Raise InputError unless the state is a (q, p, S)."""
         if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {type(system).__name__}")
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
         n, start = len(x) // 2, x + low
         q, p, S = start[:n], start[n : 2 * n], start[2 * n]
 

@@ -14,7 +14,7 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar
+from ..energy import Energy, as_energy, check_scalar, recognised
 from ..engine.interpret import at_points
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
@@ -56,8 +56,10 @@ class System(eqx.Module):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
         self.momentum_maps = {name: as_energy(J, f"momentum map {name!r}") for name, J in momentum_maps.items()}
         check_scalar(self.energy, dim, "the energy")
+        self.energy = recognised(self.energy, dim)
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
+            self.entropy = recognised(self.entropy, dim)
         for name, J in self.momentum_maps.items():
             check_scalar(J, dim, f"momentum map {name!r}")
         if dissipation is not None and not isinstance(dissipation, Dissipation):
@@ -128,9 +130,21 @@ class System(eqx.Module):
         it too, and a Casimir only if the dissipation does: that is found out at random points.
         """
         found = {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)} | self._casimirs()
-        constant = _conserved(self, tuple(found.values()))
+        constant = self.conserves(tuple(found.values()))
         claimed = {name: (J, True) for name, J in self.momentum_maps.items()}
         return claimed | {name: (f, kept) for (name, f), kept in zip(found.items(), constant, strict=True)}
+
+    def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
+        """Whether each function is constant along the vector field, at random points inside its domain."""
+        if not functions:
+            return []
+        points = np.random.default_rng(0).standard_normal((8, self.dim))
+        rates, sizes = at_points(_rates_of_change, (self, functions), points)
+        inside = np.isfinite(rates)
+        return [
+            bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
+            for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
+        ]
 
     def _casimirs(self) -> dict[str, Energy]:
         """Casimirs of the Poisson structure worth recording."""
@@ -211,19 +225,6 @@ class System(eqx.Module):
         if self.entropy is None:
             raise InputError("this system has no entropy")
         return self.entropy
-
-
-def _conserved(system: System, functions: tuple[Energy, ...]) -> list[bool]:
-    """Whether each function is constant along the vector field, at random points inside its domain."""
-    if not functions:
-        return []
-    points = np.random.default_rng(0).standard_normal((8, system.dim))
-    rates, sizes = at_points(_rates_of_change, (system, functions), points)
-    inside = np.isfinite(rates)
-    return [
-        bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
-        for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
-    ]
 
 
 def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):

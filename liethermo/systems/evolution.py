@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import manifolds as mf
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, Quadratic, as_energy, check_scalar
+from ..energy import Energy, Quadratic, as_energy, check_scalar, recognised
 from ..errors import InputError
 from ..mechanics import is_mechanical
 from .base import System
@@ -21,8 +21,8 @@ class LiouvilleFriction(Dissipation):
     """The thermodynamic part of an evolution field, ``{., H}_Delta`` of the single-generator form [SML 6, 30].
 
     On T*Q x R it is ``p' = -p H_S, S' = p . H_p``: friction proportional to the temperature H_S, and the heat it makes.
-    It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3], which
-    is known of ``H = p . G(q) p / 2 + V(q, S)`` in terms of that form: then its discretisation cannot fall either.
+    It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3], as is
+    known of ``H = p . G(q) p / 2 + V(q, S)``, given in terms of that form: then it cannot fall in a discretisation.
     """
 
     nondecreasing: bool = eqx.field(static=True, default=False)
@@ -72,9 +72,10 @@ class EvolutionSystem(OnContactManifold):
     is tangent to the kernel of ``eta = dS - p dq``, which is the first law. The second holds where
     ``Delta_Q H = p . H_p >= 0``; :meth:`check` reports its sign at points.
 
-    For ``H = lt.Kinetic(G) + lt.Potential(V)``, that is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite, it holds and
-    the metriplectic midpoint scheme keeps it exactly: ``S' - S = h p . G p >= 0`` at every step, for every V and h.
-    Written as one plain function the same H has its energy kept as exactly, but its entropy only to O(h^3) a step.
+    For ``H = lt.Kinetic(G) + lt.Potential(V)``, that is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite, it holds, and
+    the metriplectic schemes keep it exactly: ``S' - S = h sum b_i p_i . G p_i >= 0`` at every step, for every V and h
+    (not with the coordinate increment as printed, unless G is diagonal). Of the same H written as one plain function
+    they keep the energy as exactly, but the entropy may fall where a step is coarse.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ class EvolutionSystem(OnContactManifold):
     def __init__(self, energy, dim: int, momentum_maps=(), validate: bool = True):
         energy, structure = as_energy(energy, "the energy"), canonical(dim)
         check_scalar(energy, dim, "the energy")
-        friction = LiouvilleFriction(is_mechanical(energy, dim))
+        friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim))
         self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
 
     def temperature(self, x) -> jax.Array:
@@ -144,7 +145,7 @@ def degrees_of_freedom(dim: int) -> int:
     """n of a state with 2n + 1 components (q, p, S)."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(
-            f"dim counts the components of the state (q, p, S): 2n + 1 for n degrees of freedom, 3 at least, not {dim!r}"
+            f"dim counts the components of a state (q, p, S): 2n + 1 for n degrees of freedom, 3 at least, not {dim!r}"
         )
     return dim // 2
 

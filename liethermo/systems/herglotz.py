@@ -13,7 +13,8 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import inverse
 
-from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced
+from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..engine.interpret import at_points
 from ..errors import InputError
 from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
 from .euler_poincare import inverse_gradient
@@ -42,13 +43,14 @@ class OnVelocities(OnContactManifold):
 
     def _prepare(self, lagrangian, dim: int | None) -> tuple[mf.Cosymplectic, int, Energy]:
         """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
-        self.lagrangian = L = as_energy(lagrangian, "the Lagrangian")
+        L = as_energy(lagrangian, "the Lagrangian")
         if dim is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
         if dim is None:
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
         n = degrees_of_freedom(dim)
         check_scalar(L, dim, "the Lagrangian")
+        self.lagrangian = L = recognised(L, dim)
         contact = mf.LagrangianContact(L.value, n)
         _need_regular(contact)
         return mf.Cosymplectic(contact), dim, _energy(L, dim)
@@ -65,8 +67,8 @@ class ThermodynamicHerglotz(OnVelocities):
     ``eta_L = dS - L_v dq`` and of the energy ``E_L = v . L_v - L``, which it conserves; its Legendre transform is the
     :class:`EvolutionSystem` of ``H = E_L o FL^-1``. The temperature is ``T = -L_S``.
 
-    For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the metriplectic midpoint scheme lets the entropy fall at
-    no step, as it does there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
+    For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the entropy falls at no step of the metriplectic schemes,
+    as it does there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
 
     Parameters
     ----------
@@ -208,7 +210,7 @@ def _inverse_metric(G):
 
 
 class LegendreTransform(Energy):
-    """``H(q, p, S) = p . v - L(q, v, S)`` at the v with ``L_v = p``, found by damped Newton; NaN where it finds none."""
+    """``H(q, p, S) = p . v - L(q, v, S)`` at the v with ``L_v = p``, by damped Newton; NaN where it finds none."""
 
     lagrangian: Energy
 
@@ -241,9 +243,13 @@ def _need_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
     points = np.random.default_rng(0).standard_normal((4, contact.dim))
-    singular = np.linalg.svd(np.asarray(jax.vmap(contact.hessian)(points)), compute_uv=False)
+    singular = np.linalg.svd(at_points(_hessian, contact, points), compute_uv=False)
     if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
             "does not determine the velocity"
         )
+
+
+def _hessian(contact: mf.LagrangianContact, x):
+    return contact.hessian(x)
