@@ -21,8 +21,8 @@ class LiouvilleFriction(Dissipation):
     """The thermodynamic part of an evolution field, ``{., H}_Delta`` of the single-generator form [SML 6, 30].
 
     On T*Q x R it is ``p' = -p H_S, S' = p . H_p``: friction proportional to the temperature H_S, and the heat it makes.
-    It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3], as is
-    known of ``H = p . G(q) p / 2 + V(q, S)``, given in terms of that form: then it cannot fall in a discretisation.
+    It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3]; this
+    is known of ``H = p . G(q) p / 2 + V(q, S)`` given in terms of that form, and then holds in a discretisation too.
     """
 
     nondecreasing: bool = eqx.field(static=True, default=False)

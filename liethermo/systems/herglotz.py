@@ -67,8 +67,8 @@ class ThermodynamicHerglotz(OnVelocities):
     ``eta_L = dS - L_v dq`` and of the energy ``E_L = v . L_v - L``, which it conserves; its Legendre transform is the
     :class:`EvolutionSystem` of ``H = E_L o FL^-1``. The temperature is ``T = -L_S``.
 
-    For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the entropy falls at no step of the metriplectic schemes,
-    as it does there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
+    For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the entropy falls at no step of the metriplectic
+    schemes, as there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
 
     Parameters
     ----------
@@ -177,19 +177,18 @@ def _hamiltonian(L: Energy, dim: int) -> Energy:
     return LegendreTransform(L)
 
 
+@eqx.filter_jit
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
+    """``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
     dim = L.A.shape[0]
-    n, zero = dim // 2, jnp.zeros(dim)
-    A = jnp.diag(L.A) if L.A.ndim == 1 else L.A
-    b = zero if L.b is None else L.b
-    W, still = inverse(A[n : 2 * n, n : 2 * n]), np.delete(np.arange(dim), np.s_[n : 2 * n])
-
-    def H(x):
-        r, shifted = x[still], x[n : 2 * n] - A[n : 2 * n][:, still] @ x[still] - b[n : 2 * n]
-        return 0.5 * shifted @ W @ shifted - 0.5 * r @ A[still][:, still] @ r - b[still] @ r - L.c
-
-    hessian = jax.hessian(H)(zero)
-    return Quadratic(0.5 * (hessian + hessian.T), jax.grad(H)(zero), H(zero))
+    moving, still = np.split(np.roll(np.arange(dim), -(dim // 2)), [dim // 2])
+    A, b = jnp.diag(L.A) if L.A.ndim == 1 else L.A, jnp.zeros(dim) if L.b is None else L.b
+    inverted = inverse(A[np.ix_(moving, moving)])
+    shift = jnp.zeros((dim // 2, dim)).at[:, moving].set(jnp.eye(dim // 2)).at[:, still].set(-A[np.ix_(moving, still)])
+    rest = jnp.zeros((dim, dim)).at[np.ix_(still, still)].set(A[np.ix_(still, still)])
+    raised = 0.5 * (inverted + inverted.T) @ shift
+    c = b[moving]
+    return Quadratic(shift.T @ raised - rest, -c @ raised - b.at[moving].set(0.0), 0.5 * c @ inverted @ c - L.c)
 
 
 class _InverseMetric(eqx.Module):

@@ -99,7 +99,7 @@ def test_the_report():
     assert "entropy falls there" in row.note
     points = np.random.default_rng(0).standard_normal((16, 3))
     assert row.residual == pytest.approx((points[:, 1] ** 2 + points[:, 1] * np.sin(points[:, 2])).min(), abs=1e-13)
-    rising = lt.EvolutionSystem(lambda x: 0.5 * x[1] ** 2 + x[2], 3)  # not known, but found to produce entropy
+    rising = lt.EvolutionSystem(lambda x: 0.5 * x[1] ** 4 + x[2], 3)  # not known, but found to produce entropy
     (row,) = [row for row in rising.check().rows if row.axiom == "min Delta_Q H"]
     assert row.residual >= 0
     assert "falls" not in row.note
@@ -114,7 +114,7 @@ def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
     """SML §6.1 asks for a quadratic V; here any V, and a metric that depends on q."""
     system = lt.EvolutionSystem(bumpy_energy(seed, bent), 5, validate=False)
     assert system.entropy_law == "nondecreasing"
-    solution = lt.integrate(system, random_state(seed), (0.0, 40 * h), h, on_failure="return")
+    solution = lt.integrate(system, random_state(seed), (0.0, 40 * h), h, on_failure="return", engine="array")
     if solution.stats.steps:
         assert_both_laws(solution)
     assert solution.status.ok or (h > 0.2 and solution.status.message)
@@ -141,7 +141,9 @@ def test_the_same_energy_as_one_plain_function():
     energy, x0, h = lt.Kinetic([3.5, 1e-3]) + lt.Potential(V), [0.0, 0.0, 0.2, 0.3, 0.0], 0.7
     plain = lt.EvolutionSystem(lambda x: energy.value(x), 5)
     assert plain.entropy_law is None
-    told, untold = (lt.integrate(s, x0, (0.0, 4 * h), h) for s in (lt.EvolutionSystem(energy, 5), plain))
+    told, untold = (
+        lt.integrate(s, x0, (0.0, 4 * h), h, engine="array") for s in (lt.EvolutionSystem(energy, 5), plain)
+    )
     assert_both_laws(told)
     assert untold.audit().energy_drift <= tolerance("energy")
     assert untold.stats.least_entropy_increment < -0.05
@@ -188,10 +190,31 @@ def test_observed_order():
     exact = lt.integrate(system, x0, (0.0, 2.0), 2.0, lt.Reference(rtol=1e-13)).x[-1]
     errors = []
     for n in (40, 80, 160, 320):
-        errors.append(np.abs(lt.integrate(system, x0, (0.0, 2.0), 2.0 / n, save_every=n // 40).x[-1] - exact).max())
+        errors.append(
+            np.abs(
+                lt.integrate(system, x0, (0.0, 2.0), 2.0 / n, save_every=n // 40, engine="array").x[-1] - exact
+            ).max()
+        )
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert min(errors) > 1e-10
     assert (np.abs(slopes - 2.0) < 0.2).all(), (errors, slopes)
+
+
+@pytest.mark.parametrize(("stages", "coarsest"), [(2, 80), pytest.param(3, 40, marks=pytest.mark.slow)])
+def test_gauss(stages, coarsest):
+    """Order 2s with both laws exact: V is corrected along q and S, the kinetic energy along q."""
+    energy = lt.Kinetic(lambda q: 1.5 + jnp.sin(q)) + lt.Potential(Bumpy(jnp.array([2.0, 1.5]), jnp.array([1.0])))
+    system, x0, method = lt.EvolutionSystem(energy, 3), [0.3, 1.0, 0.2], lt.MetriplecticGauss(stages)
+    exact, errors = lt.integrate(system, x0, (0.0, 4.0), 4.0, lt.Reference(rtol=1e-13)).x[-1], []
+    for n in (coarsest, 2 * coarsest, 4 * coarsest):
+        solution = lt.integrate(system, x0, (0.0, 4.0), 4.0 / n, method, save_every=n // 10, engine="array")
+        errors.append(np.abs(solution.x[-1] - exact).max())
+        assert solution.stats.least_entropy_increment >= 0.0
+        if n == coarsest:
+            assert_both_laws(solution)
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert min(errors) > 2e-12
+    assert (np.abs(slopes - 2 * stages) < 0.2).all(), (errors, slopes)
 
 
 @pytest.mark.slow
@@ -208,7 +231,11 @@ def test_both_engines():
 def contact_run(a_S, b, steps):
     energy = lt.Kinetic([1.0]) + lt.Potential(Bumpy(jnp.array([2.0, a_S]), jnp.array([b])))
     system = lt.ContactSystem(energy, 3, validate=False)
-    return energy, system, lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 1.0), 1.0 / steps, save_every=steps // 10)
+    return (
+        energy,
+        system,
+        lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 1.0), 1.0 / steps, save_every=steps // 10, engine="array"),
+    )
 
 
 def test_the_contact_field_keeps_its_law_exactly():
