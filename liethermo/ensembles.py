@@ -202,7 +202,7 @@ def ensemble(
     method.check(member)
     record = _Record(size, member, times, outputs)
 
-    small = member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
+    small = member.unrollable and member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
     chosen = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
     if chosen == "compiled":
         try:

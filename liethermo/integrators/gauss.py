@@ -15,7 +15,7 @@ from ..engine.interpret import at_points
 from ..errors import InputError
 from ..gradients import stage_gradients
 from ..systems import System
-from .base import OneStepMethod, register
+from .base import OneStepMethod, collocation_error, register
 from .tableaus import MOST_STAGES, beyond, gauss
 
 
@@ -115,6 +115,9 @@ class MetriplecticGauss(OneStepMethod):
             return part.force(system, u, dH, dS, own)
         off = _projector((dH, *dC))
         return off(part.force(system, u, dH, off(dS), own))
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        return collocation_error(system, x, low, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return h * (gauss(self.number).b @ k)

@@ -37,6 +37,12 @@ def beyond(stages: int) -> np.ndarray:
     return _lagrange(stages, 1 + _extended(stages)[2]).astype(np.float64)
 
 
+@functools.cache
+def at_start(stages: int) -> np.ndarray:
+    """Weights w with ``u'(0) = w @ k``, u the collocation polynomial."""
+    return _lagrange(stages, np.zeros((), dtype=np.longdouble)).astype(np.float64)
+
+
 def integrated(stages: int, theta) -> np.ndarray:
     """Weights w(theta), shape (..., s), with ``u(theta) = x + h w @ k`` the collocation polynomial at t + theta h."""
     nodes = 2 * np.asarray(theta, dtype=np.float64) - 1
