@@ -55,5 +55,5 @@ for i, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
     axes.plot(times, record[:, i], ".", color=colour, markersize=3, alpha=0.6)
     axes.plot(times, momenta(found)[:, i], color=colour, label=f"$\\Pi_{i + 1}$")
 axes.set(xlabel="time", ylabel="momentum", title="Record (dots) and fitted motion (lines)")
-axes.legend(ncol=3, loc="upper right")
+axes.legend(ncol=3, loc="lower right")
 plt.show()
