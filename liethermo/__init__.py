@@ -40,9 +40,9 @@ from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
-from .stepwise import Adaptive, Relaxed
+from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
-from .timeloop import integrate, suggest_step
+from .timeloop import integrate
 
 __all__ = [
     "Adaptive",

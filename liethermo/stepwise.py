@@ -6,6 +6,7 @@ they hold for every step size.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,9 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from .engine.array import RUNNING, error_of_step
+from .engine import array
 from .engine.interpret import evaluator
 from .errors import FunctionError, InputError
+from .integrators import MetriplecticMidpoint, OneStepMethod
 from .integrators.tableaus import integrated
 from .systems import System
 
@@ -244,11 +246,11 @@ def run(
                     control.reject(error, h)
                     if control.h < UNDERFLOW * (end - span[0]):
                         outcome.underflow = control.h
-                        outcome.state = new if int(new.status) != RUNNING else state
+                        outcome.state = new if int(new.status) != array.RUNNING else state
                         return outcome
                     continue
                 control.accept(error, h)
-            if int(new.status) != RUNNING:
+            if int(new.status) != array.RUNNING:
                 outcome.state = new
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0
@@ -283,11 +285,11 @@ def _fitted(control: Control, t: float, stop: float) -> tuple[float, bool]:
 
 def _error(system, method, state, new, h: float, step: Adaptive) -> float:
     """The estimated local error as a fraction of what is allowed; infinity where the step could not be taken."""
-    if int(new.status) != RUNNING:
+    if int(new.status) != array.RUNNING:
         return math.inf
     size = max(float(np.abs(state.x).max()), float(np.abs(new.x).max()))
     allowed = step.atol + step.rtol * size
-    found = float(error_of_step(system, method, state.x, state.low, h, new.k))
+    found = float(array.error_of_step(system, method, state.x, state.low, h, new.k))
     return found / allowed if allowed > 0.0 else math.inf
 
 
@@ -309,3 +311,60 @@ def _located(event: Event, state, new, h: float, before: float, after: float) ->
     if after == 0.0:
         return 1.0
     return float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
+
+
+def stops_of(save_at, start: float, end: float) -> np.ndarray:
+    """The times at which steps have to end, the end of the span among them."""
+    if save_at is None:
+        return np.array([end])
+    times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
+    if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
+        raise InputError(f"save_at is a list of times, not {save_at!r}")
+    if times.min() < start or times.max() > end:
+        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
+    return np.unique([*times, end])
+
+
+def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None) -> float:
+    """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
+
+    The smallest that adaptive steps take in their first thirty, after they have settled, rounded down to two digits.
+
+    Parameters
+    ----------
+    system : System
+    x0 : array, shape (n,)
+    rtol : float
+    method : OneStepMethod
+        ``MetriplecticMidpoint()`` by default.
+
+    Raises
+    ------
+    InputError
+        Where nothing moves at x0, so that any step will do.
+    """
+    method = MetriplecticMidpoint() if method is None else method
+    x = np.asarray(system.state(x0))
+    speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
+    if not speed > 0.0:
+        raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
+    taken: list[float] = []
+
+    def keep(t, reached, h, before, after):
+        taken.append(h)
+        if len(taken) == 30:
+            raise _EnoughError
+
+    span = (0.0, 1e6 * max(size, 1e-300) / speed)
+    with contextlib.suppress(_EnoughError):
+        state = array.begin(system, method, x)
+        run(system, method, array, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+    if len(taken) < 2:
+        raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
+    h = min(taken[len(taken) // 2 :])
+    digits = 1 - math.floor(math.log10(h))
+    return math.floor(h * 10.0**digits) / 10.0**digits
+
+
+class _EnoughError(Exception):
+    """Ends a run that has served its purpose."""

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime
-import math
 import os
-import sys
 import time
 import warnings
 from collections.abc import Callable
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +20,12 @@ from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
+from .progress import Progress
 from .solution import Laws, Solution, Stats, Status
-from .stepwise import Adaptive, Dense, Event, Relaxed
+from .stepwise import Adaptive, Dense, Event, Relaxed, stops_of
 from .stepwise import run as run_stepwise
 from .systems import System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 SMALL_DIM = 8
 """Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
@@ -131,7 +126,7 @@ def integrate(
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
     run = _Run(system, method, system.state(x0), table, save_to, engine)
-    with _Progress((table.start, table.end), progress) as bar:
+    with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
         else:
@@ -196,7 +191,7 @@ class _Run:
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
         start, end, every = self.table.start, self.table.end, self.table.every or 1
-        stops, event = _stops(save_at, start, end), None if until is None else Event(until, self.system)
+        stops, event = stops_of(save_at, start, end), None if until is None else Event(until, self.system)
         self.step, pieces, last = step, [], None
 
         def keep(t, reached, h, before, after):
@@ -387,63 +382,6 @@ class _Run:
 # -- helpers --------------------------------------------------------------------------------------------------------
 
 
-def _stops(save_at, start: float, end: float) -> np.ndarray:
-    """The times at which steps have to end, the end of the span among them."""
-    if save_at is None:
-        return np.array([end])
-    times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
-    if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
-        raise InputError(f"save_at is a list of times, not {save_at!r}")
-    if times.min() < start or times.max() > end:
-        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
-    return np.unique([*times, end])
-
-
-def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None) -> float:
-    """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
-
-    The smallest that adaptive steps take in their first thirty, after they have settled, rounded down to two digits.
-
-    Parameters
-    ----------
-    system : System
-    x0 : array, shape (n,)
-    rtol : float
-    method : OneStepMethod
-        ``MetriplecticMidpoint()`` by default.
-
-    Raises
-    ------
-    InputError
-        Where nothing moves at x0, so that any step will do.
-    """
-    method = MetriplecticMidpoint() if method is None else method
-    x = np.asarray(system.state(x0))
-    speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
-    if not speed > 0.0:
-        raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
-    taken: list[float] = []
-
-    def keep(t, reached, h, before, after):
-        taken.append(h)
-        if len(taken) == 30:
-            raise _EnoughError
-
-    engine, span = array, (0.0, 1e6 * max(size, 1e-300) / speed)
-    with contextlib.suppress(_EnoughError):
-        state = engine.begin(system, method, jnp.asarray(x))
-        run_stepwise(system, method, engine, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
-    if len(taken) < 2:
-        raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
-    h = min(taken[len(taken) // 2 :])
-    digits = 1 - math.floor(math.log10(h))
-    return math.floor(h * 10.0**digits) / 10.0**digits
-
-
-class _EnoughError(Exception):
-    """Ends a run that has served its purpose."""
-
-
 def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
     if given not in choices:
         *others, last = map(repr, choices)
@@ -493,31 +431,3 @@ def _version() -> str:
         return metadata.version("liethermo")
     except metadata.PackageNotFoundError:
         return "(not installed)"
-
-
-class _Progress:
-    """A progress bar on the standard error, shown only where someone is there to see it."""
-
-    def __init__(self, span: tuple[float, float], wanted: bool | None):
-        self.span = span
-        self.bar: Progress | None = None
-        self.wanted = sys.stderr.isatty() if wanted is None else wanted
-
-    def __enter__(self):
-        if self.wanted:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-            columns = (TextColumn("t = {task.fields[t]:.4g}"), BarColumn(), TimeRemainingColumn())
-            self.bar = bar = Progress(*columns, console=Console(stderr=True, force_terminal=True), transient=True)
-            bar.start()
-            self.task = bar.add_task("", total=self.span[1] - self.span[0], t=self.span[0])
-        return self
-
-    def update(self, t: float) -> None:
-        if self.bar is not None:
-            self.bar.update(self.task, completed=t - self.span[0], t=t)
-
-    def __exit__(self, *_):
-        if self.bar is not None:
-            self.bar.stop()

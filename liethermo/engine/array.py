@@ -166,7 +166,7 @@ class State(eqx.Module):
 
 
 @eqx.filter_jit
-def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
+def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
     energy, entropy = values(system, x)
