@@ -165,10 +165,9 @@ class _Run:
 
     def by_steps(self, bar) -> None:
         """Drive the engine call by call, to the end, a failure or Ctrl-C."""
-        # few distinct capacities, so few compilations
-        capacity = max(
-            1, min(CHUNK_SAVES, CHUNK_STEPS // (self.table.every or 1), _power_of_two(len(self.table.counts) - 1))
-        )
+        every = self.table.every or 1
+        saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
+        capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
         state, interrupted = None, False
         self.values = [self._energies(self.states[0])]
         try:
