@@ -15,7 +15,7 @@ EPS = float(np.finfo(float).eps)
 DIGITS = 60
 
 
-# -- the oracle: Lagrange interpolation in powers of t, at the roots of d^s/dt^s [t^s (t - 1)^s] ------------------------
+# -- the oracle: Lagrange interpolation in powers of t, at the roots of d^s/dt^s [t^s (t - 1)^s] -----------------------
 
 
 def value(polynomial, t):
