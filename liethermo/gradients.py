@@ -15,6 +15,7 @@ shut out where it is rounding noise, by a gate that is continuous, scale free, a
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -23,6 +24,9 @@ import numpy as np
 
 from .energy import Energy
 from .errors import InputError
+
+if TYPE_CHECKING:
+    from .integrators.tableaus import Finer
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -160,13 +164,14 @@ def discrete_gradient(choice: str | DiscreteGradient) -> DiscreteGradient:
 
 SPREAD = 1e-3
 """Relative variation of the gradient over a step above which the defect of collocation is used. Below it the
-quadrature is exact to 1e-19 of what H varies by; above it the noise of the defect is below 1e-11 of the gradient."""
+quadrature is exact to 1e-19 of what H varies by, on lengths ten times shorter too (with ``finer`` nodes for one and
+two stages); above it the noise of the defect is below 1e-11 of the gradient."""
 
 HARMLESS = 1e-10
 """Largest share of the gradient that a correction made of rounding noise may have."""
 
 
-def stage_gradients(energy: Energy, x, low, h, k, A, b) -> jax.Array:
+def stage_gradients(energy: Energy, x, low, h, k, A, b, finer: Finer | None = None) -> jax.Array:
     """Discrete gradients at the stages of a collocation method, shape (s, n) [EQUATIONS §4, "Metriplectic Gauss"].
 
     ``grad H(u_i) + alpha k_i`` at ``u_i = x + h sum_j A_ij k_j``, with the one alpha for which
@@ -178,22 +183,27 @@ def stage_gradients(energy: Energy, x, low, h, k, A, b) -> jax.Array:
         The state is x + low.
     k : array, shape (s, n)
     A, b : array, shapes (s, s) and (s,)
+    finer : Finer, optional
+        A better quadrature along the collocation polynomial, for methods of few stages. An energy with a part that
+        varies on lengths far below those seen in its gradient drifts without it, at steps where the defect is shut out:
+        two nodes missed 5e-15 of H in each of a hundred steps.
     """
-    parts = [_stage_gradients(term, x, low, h, k, A, b) for term in energy.terms]
+    parts = [_stage_gradients(term, x, low, h, k, A, b, finer) for term in energy.terms]
     return sum(parts[1:], parts[0])
 
 
-def _stage_gradients(term: Energy, x, low, h, k, A, b) -> jax.Array:
+def _stage_gradients(term: Energy, x, low, h, k, A, b, finer: Finer | None) -> jax.Array:
     gradients = jax.vmap(term.gradient)(x + (low + h * (A @ k)))
     if term.is_quadratic:
         return gradients
     d, mean = h * (b @ k), b @ gradients
-    if len(b) == 1:  # one node predicts too little: two more, and the prediction of the three
-        left, right = jax.vmap(lambda c: term.gradient(x + (low + c * d)))(_NODES_3[::2])
-        smooth = (5 / 18) * jnp.dot(left + right - 2.0 * mean, d)
-        spread = jnp.linalg.norm(left - right)
-    else:
-        smooth, spread = jnp.zeros(()), jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
+    spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
+    smooth = jnp.zeros(())
+    if finer is not None:
+        between = jax.vmap(lambda a: term.gradient(x + (low + h * (a @ k))))(finer.A)
+        rates = jnp.sum(between * (finer.slopes @ k), axis=1)
+        smooth = h * (jnp.dot(finer.b, rates) + jnp.dot(finer.change, jnp.sum(gradients * k, axis=1)))
+        spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
     before, after = _values(term, jnp.stack([x, x + (low + d)]))
     defect = (after - before) - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     square = jnp.dot(b, jnp.sum(k * k, axis=1))

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from liethermo.integrators.tableaus import MOST_STAGES, beyond, gauss, integrated
+from liethermo.integrators.tableaus import MOST_STAGES, beyond, finer, gauss, integrated
 
 STAGES = range(1, MOST_STAGES + 1)
 EPS = float(np.finfo(float).eps)
@@ -190,3 +190,18 @@ def test_integrated_integrates_a_polynomial(stages):
 def test_tableaus_are_computed_once():
     assert gauss(3) is gauss(3)
     assert all(a.dtype == np.float64 for a in (*gauss(3), beyond(3), integrated(3, 0.3)))
+
+
+@pytest.mark.parametrize(("stages", "degree"), [(1, 5), (2, 7)])
+def test_finer_quadrature(stages, degree):
+    """The Kronrod rule, through the collocation polynomial: exact to its degree, and not beyond."""
+    c, rule = gauss(stages).c, finer(stages)
+    theta = rule.A @ np.ones(stages)  # slopes of 1 take the polynomial to the node itself
+    for power in range(degree + 2):
+        error = abs(rule.b @ theta**power + (gauss(stages).b + rule.change) @ c**power - 1 / (power + 1))
+        assert (error <= 2 * EPS) if power <= degree else (error > 1e-5)
+    slopes = np.random.default_rng(0).standard_normal(stages)
+    line = np.polynomial.Polynomial.fit(c, slopes, stages - 1)
+    assert np.abs(rule.slopes @ slopes - line(theta)).max() <= 20 * EPS
+    assert np.abs(rule.A @ slopes - line.integ()(theta) + line.integ()(0.0)).max() <= 20 * EPS
+    assert finer(3) is None
