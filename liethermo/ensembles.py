@@ -330,7 +330,8 @@ def _run_array(family: Family, method, states: np.ndarray, times: Timetable, rec
         state = before = _begin_all(family.form, parameters, axes, method, jnp.asarray(states[chosen]))
         try:
             for h, saves, every in times.calls(CHUNK_STEPS):
-                state, kept = _advance_all(family.form, parameters, axes, method, state, h, saves, every)
+                numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
+                state, kept = _advance_all(family.form, parameters, axes, method, state, *numbers)
                 saved.append(np.concatenate([kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])], axis=-1))
         except KeyboardInterrupt:
             interrupted = True
