@@ -36,6 +36,7 @@ from .errors import (
     NonFiniteError,
     SpecError,
 )
+from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .integrators import (
     DiscreteHerglotz,
@@ -47,6 +48,7 @@ from .integrators import (
 )
 from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
+from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
     ContactSystem,
     EulerPoincareSystem,
@@ -60,6 +62,7 @@ from .systems import (
 from .timeloop import integrate
 
 __all__ = [
+    "Adaptive",
     "Audit",
     "AxiomError",
     "CasimirError",
@@ -100,6 +103,7 @@ __all__ = [
     "ProjectedMetric",
     "Quadratic",
     "Reference",
+    "Relaxed",
     "Solution",
     "SpecError",
     "Stats",
@@ -107,11 +111,13 @@ __all__ = [
     "System",
     "ThermodynamicHerglotz",
     "ensemble",
+    "flow",
     "integrate",
     "load",
     "models",
     "plot",
     "registered_methods",
+    "suggest_step",
 ]
 
 

@@ -23,7 +23,7 @@ from .engine.interpret import at_points, polynomial_degree
 from .errors import FunctionError, InputError
 
 if TYPE_CHECKING:
-    from .gradients import DiscreteGradient
+    from .gradients import DiscreteGradient, Path
 
 COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
@@ -57,9 +57,9 @@ class Energy(eqx.Module):
         """The discrete gradient of one term by a scheme, shape (n,), from x + low to x + low + d."""
         return scheme.quadratic(self, x, d, low) if self.is_quadratic else scheme.general(self, x, d, low)
 
-    def stage_gradients(self, scheme: Callable, x, low, h, k, A, b) -> jax.Array:
-        """That of one term at the stages of a collocation method, shape (s, n); see gradients.stage_gradients."""
-        return scheme(self, x, low, h, k, A, b)
+    def stage_gradients(self, scheme: Callable, path: Path) -> jax.Array:
+        """Those of one term at the stages of a collocation method, shape (s, n)."""
+        return scheme(self, path)
 
     def on(self, coordinates: Sequence[int] | Callable) -> Energy:
         """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
@@ -185,27 +185,15 @@ class Pullback(Energy):
         return self.term.value(self.of(x))
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        step, back = self._moved(x + (low + 0.5 * d), d)
-        return back(self.term.discrete_gradient(scheme, self.of(x), step, self._kept(x, low)))
-
-    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
-        u = x + (low + h * (A @ k))
-        slopes, back = self._moved(u, k)
-        # One stage is a discrete gradient along the chord in y; of more, their order asks for the coordinates of u_i.
-        stages = None if len(b) == 1 else jax.vmap(self.of)(u)
-        return back(scheme(self.term, self.of(x), self._kept(x, low), h, slopes, A, b, stages=stages))
-
-    def _moved(self, x, d) -> tuple[jax.Array, Callable]:
-        """``Dpi(x) d`` at one or more points, and the function ``Dpi(x)^T`` of covectors."""
-        if x.ndim > 1:
-            moved = jax.vmap(lambda x, d: jax.jvp(self.of, (x,), (d,))[1])(x, d)
-            return moved, lambda covectors: jax.vmap(lambda x, g: jax.vjp(self.of, x)[1](g)[0])(x, covectors)
-        return jax.jvp(self.of, (x,), (d,))[1], lambda covector: jax.vjp(self.of, x)[1](covector)[0]
-
-    def _kept(self, x, low) -> jax.Array:
-        """What rounding has kept from y, ``pi(x + low) - pi(x)``."""
         low = jnp.zeros_like(x) + low
-        return jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
+        middle, kept = x + (low + 0.5 * d), jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
+        step = jax.jvp(self.of, (middle,), (d,))[1]
+        (back,) = jax.vjp(self.of, middle)[1](self.term.discrete_gradient(scheme, self.of(x), step, kept))
+        return back
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        path, back = path.through(self.of)
+        return back(self.term.stage_gradients(scheme, path))
 
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.indices if self.function is None else self.function)
@@ -229,8 +217,8 @@ class Negative(Energy):
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         return -self.term.discrete_gradient(scheme, x, d, low)
 
-    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
-        return -self.term.stage_gradients(scheme, x, low, h, k, A, b)
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        return -self.term.stage_gradients(scheme, path)
 
     def __neg__(self) -> Energy:
         return self.term

@@ -202,7 +202,7 @@ def ensemble(
     method.check(member)
     record = _Record(size, member, times, outputs)
 
-    small = member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
+    small = member.unrollable and member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
     chosen = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
     if chosen == "compiled":
         try:
@@ -224,7 +224,7 @@ class _Record:
     """What is kept of each trajectory, filled in part by part."""
 
     def __init__(self, size: int, system: System, times: Timetable, outputs: str):
-        self.system, self.times, self.outputs = system, times, outputs
+        self.system, self.times, self.outputs, self.counts = system, times, outputs, times.counts
         names = "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale"
         names += " relaxation_time residual"
         self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in names.split()}
@@ -234,7 +234,7 @@ class _Record:
         if outputs == "final":
             self.x = np.full((size, system.dim), np.nan)
         elif outputs == "trajectory":
-            self.path = np.full((size, len(times.counts), system.dim + 2), np.nan)
+            self.path = np.full((size, len(self.counts), system.dim + 2), np.nan)
 
     def put(self, chosen: slice, before: dict[str, np.ndarray], after: dict[str, np.ndarray], saved) -> None:
         """The outcome of some trajectories: fields of :class:`.engine.array.State`, and the saves."""
@@ -261,8 +261,8 @@ class _Record:
             if saved:
                 states = np.concatenate(saved, axis=1)
                 self.path[chosen, 1 : 1 + states.shape[1]] = states
-            reached = np.searchsorted(self.times.counts, steps, side="right")
-            self.path[chosen][np.arange(len(self.times.counts)) >= reached[:, None]] = np.nan
+            reached = np.searchsorted(self.counts, steps, side="right")
+            self.path[chosen][np.arange(len(self.counts)) >= reached[:, None]] = np.nan
 
     def result(self, laws: Laws, engine: str, wall_time: float) -> Ensemble:
         x, energy, entropy, t = self.x, self.rows.pop("energy"), self.rows.pop("entropy"), self.times.times[-1:]
@@ -330,7 +330,8 @@ def _run_array(family: Family, method, states: np.ndarray, times: Timetable, rec
         state = before = _begin_all(family.form, parameters, axes, method, jnp.asarray(states[chosen]))
         try:
             for h, saves, every in times.calls(CHUNK_STEPS):
-                state, kept = _advance_all(family.form, parameters, axes, method, state, h, saves, every)
+                numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
+                state, kept = _advance_all(family.form, parameters, axes, method, state, *numbers)
                 saved.append(np.concatenate([kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])], axis=-1))
         except KeyboardInterrupt:
             interrupted = True

@@ -57,9 +57,9 @@ class Kinetic(Energy):
         by_p = 0.5 * (_apply(self.at(q + low_q), middle) + _apply(self.at(q + (low_q + dq)), middle))
         return jnp.concatenate([scheme.general(Function(mean), q, dq, low_q), by_p, nothing])
 
-    def stage_gradients(self, scheme, x, low, h, k, A, b) -> jax.Array:
-        n = len(x) // 2
-        return scheme(self, x, low, h, k, A, b, along=np.arange(len(x)) < n)
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        size = len(path.start)
+        return scheme(self, path, along=np.arange(size) < size // 2)
 
 
 class Potential(Pullback):

@@ -33,8 +33,6 @@ class Timetable:
         Size of the shorter last step; 0 where there is none.
     full, steps : int
         How many full steps there are, and steps in all.
-    counts : ndarray of int
-        Steps after which states are kept, 0 (the start) and the last among them.
 
     Raises
     ------
@@ -54,13 +52,16 @@ class Timetable:
         if self.last <= 1e-12 * (self.end - self.start):
             self.last = 0.0
         self.steps = self.full + (self.last > 0.0)
-        regular = range(0, self.full + 1, every) if every is not None else [0]
-        kept = [*regular, self.full] if every is not None else [*regular]
-        self.counts = np.unique([*kept, self.steps])
 
     def time(self, step: int) -> float:
         """The time after so many steps."""
         return self.end if step >= self.steps else self.start + step * self.h
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Steps after which states are kept, 0 (the start) and the last among them."""
+        kept = np.array([0]) if self.every is None else np.arange(0, self.full + 1, self.every)
+        return np.unique([*kept, *([] if self.every is None else [self.full]), self.steps])
 
     @property
     def times(self) -> np.ndarray:

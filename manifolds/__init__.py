@@ -28,6 +28,7 @@ from .contact import (  # noqa: E402
     ContactForm,
     ContactStructure,
     Cosymplectic,
+    ExtendedPhaseSpace,
     LagrangianContact,
     SplitContact,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "ContactStructure",
     "Cosymplectic",
     "DomainError",
+    "ExtendedPhaseSpace",
     "Heisenberg",
     "JacobiError",
     "LagrangianContact",

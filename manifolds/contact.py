@@ -7,12 +7,15 @@ Coordinates are (q, p, S) on T*Q x R and (q, v, S) on TQ x R. A two-form or bive
 
 from __future__ import annotations
 
+import functools
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ._arrays import real_components
 from .errors import ParameterError, ShapeError
@@ -321,3 +324,67 @@ class Cosymplectic(PoissonStructure):
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.contact.cosymplectic_sharp(x, alpha)
+
+
+class Places(NamedTuple):
+    """Where things are in a state of several (q_a, p_a, S_a): indices of all q, all p and all S, and whose each q is."""
+
+    q: np.ndarray
+    p: np.ndarray
+    S: np.ndarray
+    owner: np.ndarray
+
+
+class ExtendedPhaseSpace(PoissonStructure):
+    """``T*R^n_1 x R x … x T*R^n_N x R``, coordinates (q_1, p_1, S_1, q_2, …): canonical in all (q, p) [SML §5].
+
+    Every S_a is a Casimir function. An n_a of 0 leaves S_a alone.
+    """
+
+    degrees_of_freedom: tuple[int, ...] = eqx.field(static=True)
+
+    def __check_init__(self):
+        numbers = self.degrees_of_freedom
+        if not (isinstance(numbers, tuple) and numbers and all(isinstance(n, int) and n >= 0 for n in numbers)):
+            raise ParameterError(f"degrees of freedom are a tuple of integers >= 0, not {numbers!r}")
+
+    @property
+    def dim(self) -> int:
+        return 2 * sum(self.degrees_of_freedom) + len(self.degrees_of_freedom)
+
+    @property
+    def places(self) -> Places:
+        """Indices into a state."""
+        return _places(self.degrees_of_freedom)
+
+    def tensor(self, x) -> jax.Array:
+        del x  # constant
+        return jnp.asarray(np.eye(self.dim)[self._conjugate] * self._sign[:, None])
+
+    def sharp(self, x, alpha) -> jax.Array:
+        del x
+        return self._sign * alpha[self._conjugate]
+
+    @property
+    def _conjugate(self) -> np.ndarray:
+        q, p, S, _ = self.places
+        partner = np.empty(self.dim, dtype=int)
+        partner[q], partner[p], partner[S] = p, q, S
+        return partner
+
+    @property
+    def _sign(self) -> np.ndarray:
+        q, p, _, _ = self.places
+        sign = np.zeros(self.dim)
+        sign[q], sign[p] = 1.0, -1.0
+        return sign
+
+
+@functools.lru_cache(maxsize=64)
+def _places(degrees_of_freedom: tuple[int, ...]) -> Places:
+    n = np.array(degrees_of_freedom)
+    ends = np.cumsum(2 * n + 1)
+    owner = np.repeat(np.arange(len(n)), n)
+    within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    q = (ends - (2 * n + 1))[owner] + within
+    return Places(q, q + n[owner], ends - 1, owner)

@@ -166,7 +166,7 @@ class State(eqx.Module):
 
 
 @eqx.filter_jit
-def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
+def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
     energy, entropy = values(system, x)
@@ -257,6 +257,26 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
         return state, (state.x, state.energy, state.entropy, reached)
 
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
+
+
+def stepping(system: System, method: OneStepMethod) -> Callable:
+    """The function (state, h) -> state after one step, or as it was with the status of a failure."""
+    return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
+
+
+@eqx.filter_jit
+def _one_step(system, method, state, h):
+    return take_step(system, method, state, h)
+
+
+def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
+    """The method's estimate of its local error, a number; for both engines."""
+    return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
+
+
+@eqx.filter_jit
+def _error(system, method, x, low, h, k):
+    return method.error(system, x, low, h, k)
 
 
 STEERED = 4 * EPS

@@ -31,12 +31,16 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
     model : pytree
     points : array, shape (m, n)
     """
-    points = np.asarray(points, dtype=np.float64)
+    return evaluator(function, model, np.shape(points)[1])(points)
+
+
+def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
+    """The map from points, shape (m, dim), to :func:`at_points` there, unrolled once."""
     try:
-        program, structure = _unrolled(function, model, points.shape[1:])
+        program, structure = _unrolled(function, model, (dim,))
     except UnsupportedPrimitive:
-        return jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
-    return jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
+        return lambda points: jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
+    return lambda points: jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
 
 
 def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
@@ -58,10 +62,41 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
         return math.inf
 
 
+_known: dict[Any, tuple[Program, Any]] = {}
+
+KNOWN = 256
+"""Unrolled functions held in memory."""
+
+
 def _unrolled(function: Callable, model: Any, shape: tuple[int, ...]) -> tuple[Program, Any]:
-    point = jax.ShapeDtypeStruct(shape, jnp.float64)
-    closed, found = jax.make_jaxpr(lambda x: function(model, x), return_shape=True)(point)
-    return scalarize(closed, limit=LIMIT), jax.tree_util.tree_structure(found)
+    """The program, and the structure of its results; the same model, array by array, is unrolled once."""
+    key = _identity(function, model, shape)
+    if key is not None and key in _known:
+        return _known[key]
+    closed, found = jax.make_jaxpr(lambda x: function(model, x), return_shape=True)(
+        jax.ShapeDtypeStruct(shape, np.float64)
+    )
+    unrolled = scalarize(closed, limit=LIMIT), jax.tree_util.tree_structure(found)
+    if key is not None:
+        while len(_known) >= KNOWN:
+            del _known[next(iter(_known))]
+        _known[key] = unrolled
+    return unrolled
+
+
+def _identity(function: Callable, model: Any, shape: tuple[int, ...]) -> Any:
+    """A key that tells models apart by the values of arrays and the identity of functions; None where there is none."""
+    leaves, structure = jax.tree_util.tree_flatten(model)
+    try:
+        parts = tuple(
+            (leaf.shape, np.asarray(leaf).tobytes()) if isinstance(leaf, jax.Array | np.ndarray | np.generic) else leaf
+            for leaf in leaves
+        )
+        key = (function, structure, parts, shape)
+        hash(key)
+    except (TypeError, jax.errors.JAXTypeError):  # something unhashable, or traced
+        return None
+    return key
 
 
 @eqx.filter_jit

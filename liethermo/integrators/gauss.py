@@ -15,8 +15,8 @@ from ..engine.interpret import at_points
 from ..errors import InputError
 from ..gradients import stage_gradients
 from ..systems import System
-from .base import OneStepMethod, register
-from .tableaus import MOST_STAGES, beyond, gauss
+from .base import OneStepMethod, collocation_error, register
+from .tableaus import MOST_STAGES, beyond, finer, gauss
 
 
 class MetriplecticGauss(OneStepMethod):
@@ -30,7 +30,8 @@ class MetriplecticGauss(OneStepMethod):
 
     for every smooth H, S and C and every step. Order 2s: alpha is O(h^{2s}) [Hairer, Lubich & Wanner, II.1]. Quadratic
     Casimirs and linear invariants are kept by collocation itself. One implicit equation of s times the size of the
-    state; an iteration costs s gradients of H and S, and two values of each that is not quadratic.
+    state; an iteration costs s gradients of H and S and, of each that is not
+    quadratic, two values, and s + 1 gradients more for one and two stages.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ class MetriplecticGauss(OneStepMethod):
         A, b, _ = gauss(self.number)
 
         def gradients(energy):
-            return stage_gradients(energy, x, low, h, k, A, b)
+            return stage_gradients(energy, x, low, h, k, A, b, finer(self.number))
 
         u = x + (low + h * (A @ k))
         dH = gradients(system.energy)
@@ -115,6 +116,9 @@ class MetriplecticGauss(OneStepMethod):
             return part.force(system, u, dH, dS, own)
         off = _projector((dH, *dC))
         return off(part.force(system, u, dH, off(dS), own))
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        return collocation_error(system, x, low, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return h * (gauss(self.number).b @ k)

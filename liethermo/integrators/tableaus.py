@@ -37,11 +37,49 @@ def beyond(stages: int) -> np.ndarray:
     return _lagrange(stages, 1 + _extended(stages)[2]).astype(np.float64)
 
 
+@functools.cache
+def at_start(stages: int) -> np.ndarray:
+    """Weights w with ``u'(0) = w @ k``, u the collocation polynomial."""
+    return _lagrange(stages, np.zeros((), dtype=np.longdouble)).astype(np.float64)
+
+
 def integrated(stages: int, theta) -> np.ndarray:
     """Weights w(theta), shape (..., s), with ``u(theta) = x + h w @ k`` the collocation polynomial at t + theta h."""
     nodes = 2 * np.asarray(theta, dtype=np.float64) - 1
     values = _legendre(stages, nodes)
     return _integrals(values) @ _coefficients(stages).astype(np.float64)
+
+
+class Finer(NamedTuple):
+    """Further nodes between those of a Gauss rule, which make it a Kronrod rule.
+
+    Attributes
+    ----------
+    A, slopes : ndarray, shape (s + 1, s)
+        ``x + h A @ k`` and ``slopes @ k`` are the collocation polynomial and its slope at the further nodes.
+    b, change : ndarray, shapes (s + 1,) and (s,)
+        Their weights, and what is added to those of the Gauss nodes.
+    """
+
+    A: np.ndarray
+    slopes: np.ndarray
+    b: np.ndarray
+    change: np.ndarray
+
+
+@functools.cache
+def finer(stages: int) -> Finer | None:
+    """The Kronrod rules of 1 + 2 nodes, degree 5, and of 2 + 3, degree 7; more stages need none."""
+    if stages > 2:
+        return None
+    if stages == 1:
+        offsets, b, change = [-((3 / 5) ** 0.5), (3 / 5) ** 0.5], [5 / 18, 5 / 18], [-5 / 9]
+    else:
+        offsets, b = [-((6 / 7) ** 0.5), 0.0, (6 / 7) ** 0.5], [49 / 495, 14 / 45, 49 / 495]
+        change = [-14 / 55, -14 / 55]
+    theta = (1 + np.array(offsets)) / 2
+    slopes = _lagrange(stages, theta).astype(np.float64)
+    return Finer(integrated(stages, theta), slopes, np.array(b), np.array(change))
 
 
 def _extended(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

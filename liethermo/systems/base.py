@@ -76,6 +76,11 @@ class System(eqx.Module):
         if validate and not _has_tracers(self):
             self._validate()
 
+    @property
+    def unrollable(self) -> bool:
+        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
+        return True
+
     # -- dynamics -------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:

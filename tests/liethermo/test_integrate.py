@@ -200,7 +200,7 @@ def test_the_reference_method_reports_failure_too():
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_ctrl_c_returns_what_exists(engine):
     lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine=engine)  # nothing is left to compile
-    threading.Timer(2.0, lambda: signal.raise_signal(signal.SIGINT)).start()
+    threading.Timer(4.0, lambda: signal.raise_signal(signal.SIGINT)).start()
     solution = lt.integrate(BODY, X0, (0.0, 1e9), 0.1, save_every=1000, engine=engine)
     assert solution.status.code == "interrupted"
     assert "stopped by the user" in str(solution.status)
