@@ -50,12 +50,14 @@ from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
+    ComposedSystem,
     ContactSystem,
     EulerPoincareSystem,
     EvolutionSystem,
     Herglotz,
     LiePoissonSystem,
     MetriplecticSystem,
+    Subsystem,
     System,
     ThermodynamicHerglotz,
 )
@@ -66,6 +68,7 @@ __all__ = [
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ComposedSystem",
     "ContactSystem",
     "ConvergenceError",
     "CoordinateIncrement",
@@ -108,6 +111,7 @@ __all__ = [
     "SpecError",
     "Stats",
     "Status",
+    "Subsystem",
     "System",
     "ThermodynamicHerglotz",
     "ensemble",

@@ -61,7 +61,7 @@ class Energy(eqx.Module):
         """Those of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
 
-    def on(self, coordinates: Sequence[int] | Callable) -> Energy:
+    def on(self, coordinates: Sequence[int] | np.ndarray | Callable) -> Energy:
         """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
 
         Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions
@@ -168,7 +168,7 @@ class Pullback(Energy):
     indices: tuple[int, ...] = eqx.field(static=True)
     function: Callable | None
 
-    def __init__(self, term: Energy, coordinates: Sequence[int] | Callable):
+    def __init__(self, term: Energy, coordinates: Sequence[int] | np.ndarray | Callable):
         self.term = term
         self.function = coordinates if callable(coordinates) else None
         self.indices = () if callable(coordinates) else tuple(map(int, coordinates))

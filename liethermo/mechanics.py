@@ -97,8 +97,14 @@ def is_mechanical(energy: Energy, dim: int) -> bool:
 
 
 def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
-    """Whether a term is known not to depend on p (or v), from the derivative of its coordinates at some states."""
-    return isinstance(term, Pullback) and not at_points(_coordinates_by_momenta, term, points).any()
+    """Whether a term is known not to depend on p (or v)."""
+    n = points.shape[1] // 2
+    return is_free_of(term, points, np.arange(n, 2 * n))
+
+
+def is_free_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
+    """Whether a term is known not to depend on some components, from its coordinates' derivatives at some states."""
+    return isinstance(term, Pullback) and not at_points(_jacobian, term, points)[:, :, components].any()
 
 
 def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
@@ -129,9 +135,8 @@ def _by_momenta(term: Energy, x):
     return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
 
 
-def _coordinates_by_momenta(term: Pullback, x):
-    n = len(x) // 2
-    return jax.jacfwd(term.of)(x)[:, n : 2 * n]
+def _jacobian(term: Pullback, x):
+    return jax.jacfwd(term.of)(x)
 
 
 def _halves(x):

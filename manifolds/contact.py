@@ -327,7 +327,7 @@ class Cosymplectic(PoissonStructure):
 
 
 class Places(NamedTuple):
-    """Where things are in a state of several (q_a, p_a, S_a): indices of all q, all p and all S, and whose each q is."""
+    """Where things are in a state of several (q_a, p_a, S_a): indices of all q, p and S, and whose each q is."""
 
     q: np.ndarray
     p: np.ndarray

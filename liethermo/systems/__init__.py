@@ -1,6 +1,7 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
 from .base import System
+from .composed import ComposedSystem, Subsystem
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
@@ -8,6 +9,7 @@ from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
 
 __all__ = [
+    "ComposedSystem",
     "ContactSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -15,6 +17,7 @@ __all__ = [
     "Legendre",
     "LiePoissonSystem",
     "MetriplecticSystem",
+    "Subsystem",
     "System",
     "ThermodynamicHerglotz",
 ]

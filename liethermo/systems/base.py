@@ -46,6 +46,8 @@ class System(eqx.Module):
     dim: int = eqx.field(static=True)
 
     production_name: ClassVar[str] = "dS/dt"
+    domain: ClassVar[str] = ""
+    """What a state of the system has to have beyond finite components, in words."""
 
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
@@ -200,6 +202,11 @@ class System(eqx.Module):
             ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
         """
         return check_system(self, points, samples, seed, scale)
+
+    def outside(self, x) -> str:
+        """Why a state lies outside the domain of the system, in words; empty where it does not."""
+        del x
+        return ""
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
