@@ -27,8 +27,8 @@ class Subsystem(eqx.Module):
 
     Parameters
     ----------
-    energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy
-        With ``lt.Kinetic`` and ``lt.Potential`` as terms where that is its form.
+    energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy; or None
+        With ``lt.Kinetic`` and ``lt.Potential`` as terms where that is its form; None where it is all in the coupling.
     dim : int
         2n + 1 components; 1 for a body at rest, whose state is S alone.
     friction : optional
@@ -48,7 +48,7 @@ class Subsystem(eqx.Module):
         if isinstance(dim, bool) or not isinstance(dim, int) or dim < 1 or dim % 2 == 0:
             raise InputError(f"dim counts the components of a state (q, p, S): 2n + 1, and 1 for S alone, not {dim!r}")
         self.dim, self.name = dim, name
-        energy = as_energy(energy, "the energy of a subsystem")
+        energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
         check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}")
         self.energy = recognised(energy, dim)
         self.friction = _checked_friction(friction, dim, name or "a subsystem")
@@ -291,10 +291,10 @@ def _checked_friction(friction, dim: int, name: str):
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
     part = parts(graph, len(names))
     if part.max() > 0:
-        groups = [" and ".join(np.array(names)[part == i][:3]) + (", …" * (np.sum(part == i) > 3)) for i in (0, 1)]
+        examples = [" and ".join(np.array(names)[part == i][:2]) for i in (0, 1)]
         raise InputError(
-            f"the conductance falls into {part.max() + 1} parts that exchange no heat: {groups[0]}; {groups[1]}. "
-            "If that is meant, say connected=False"
+            f"the conductance falls into {part.max() + 1} parts that exchange no heat, such as that of {examples[0]} "
+            f"and that of {examples[1]}. If that is meant, say connected=False"
         )
 
 
