@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.graph import Edges
 from liethermo.thermal import HeatConduction
 from tests.cases import tolerance
 
@@ -154,20 +155,6 @@ def test_both_laws_or_a_reason(seed, h):
     assert solution.status.ok or (h > 0.1 and solution.status.message)
 
 
-def test_two_particles_for_500_steps():
-    """SML Example 6, Figs. 3 and 4: both laws, and the analytic equilibrium and relaxation."""
-    system = particles()
-    solution = lt.integrate(system, np.log([273.15, 300.0]), (0.0, 50.0), 0.1, engine="array")
-    assert solution.stats.steps == 500
-    assert_both_laws(solution)
-    T = np.asarray(system.temperatures(solution.x))
-    assert np.abs(T[-1] - (273.15 + 300.0) / 2).max() < 1e-12 * 300
-    assert solution.entropy[-1] == pytest.approx(2 * np.log(286.575), rel=1e-15)
-    exact = 286.575 + np.outer(np.exp(-2 * solution.t), [-13.425, 13.425])  # T' is linear for c exp(S/c)
-    assert np.abs(T - exact).max() < 2e-2
-    assert (np.diff(solution.entropy[:50]) > 0).all()
-
-
 def test_observed_order_of_two_particles():
     """Against the exact relaxation ``T_b - T_a = (T_b - T_a)(0) exp(-k (1/c_a + 1/c_b) t)``."""
     c = np.array([1.0, 3.0])
@@ -185,7 +172,7 @@ def test_observed_order_of_two_particles():
 def test_the_entropy_of_a_step():
     """``S' - S = h k (T_a - T_b)^2 / (T_a T_b)`` in discrete temperatures, for an H far from quadratic [Lemma 6.2]."""
     system, x, h = particles((0.3, 0.5), 2.0), np.array([-0.2, 0.4]), 0.2
-    solution = lt.integrate(system, x, (0.0, 10 * h), h, engine="array")
+    solution = lt.integrate(system, x, (0.0, 20 * h), h, engine="array")
     discrete = eqx.filter_jit(jax.vmap(lambda x, d: lt.Gonzalez()(system.energy, x, d)))
     T = np.asarray(discrete(solution.x[:-1], np.diff(solution.x, axis=0)))
     predicted = 2.0 * h * (T[:, 0] - T[:, 1]) ** 2 / T.prod(axis=1)
@@ -220,19 +207,17 @@ def test_both_engines():
 # -- controls that must fail ------------------------------------------------------------------------------------------
 
 
-class AtTheStart(HeatConduction):
-    """Control: Fourier factors of the temperatures at the midpoint, not of the discrete ones."""
+class ConstantFactor(HeatConduction):
+    """Control: the skew tensor with a constant in place of the Fourier factor, the Poisson tensor of SML §5."""
 
     def force(self, system, x, dH, dS, dL):
-        S = system.poisson.places.S
-        T, discrete = system.energy.gradient(x)[S], dH[S]
+        T = dH[S := system.poisson.places.S]
         i, j = np.array(self.first), np.array(self.second)
-        factor = self.conductance * (1 / T[i] - 1 / T[j])
-        return jnp.zeros_like(x).at[S[i]].add(factor * discrete[j]).at[S[j]].add(-factor * discrete[i])
+        return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
 
-class NotSkew(HeatConduction):
-    """Control: heat of the discrete temperatures, divided by those at the midpoint."""
+class AtTheMidpoint(HeatConduction):
+    """Control: the heat of the discrete temperatures, divided by those at the midpoint."""
 
     def force(self, system, x, dH, dS, dL):
         S = system.poisson.places.S
@@ -240,22 +225,18 @@ class NotSkew(HeatConduction):
         return super().force(system, x, dH, dS, dL) * jnp.ones_like(x).at[S].set(dH[S] / T)
 
 
-@pytest.mark.parametrize(("conduction", "energy", "entropy"), [(AtTheStart, True, False), (NotSkew, False, True)])
-def test_temperatures_that_are_not_the_discrete_ones(conduction, energy, entropy):
-    """The first keeps the energy by skewness, but entropy falls where the two kinds of temperature are ordered
-    differently; the second keeps that order, and loses the energy."""
-    stiff = particles((0.05, 1.0), 1.0)
-    wrong = eqx.tree_at(lambda s: s.dissipation, stiff, conduction(edges_of(stiff)))
-    x0, h = np.array([0.05 * np.log(6.0), 1.0 * np.log(1.2)]), 0.3
-    for system, both in (stiff, True), (wrong, False):
-        solution = lt.integrate(system, x0, (0.0, 40 * h), h, engine="array")
-        assert (solution.audit().energy_drift < 1e-14) is (both or energy)
-        assert (solution.stats.least_entropy_increment >= -1e-15) is (both or entropy)
-
-
-def edges_of(system):
-    part = system.dissipation
-    return lt.graph.Edges(np.array(part.first), np.array(part.second), part.conductance)
+@pytest.mark.parametrize(
+    ("conduction", "energy", "entropy"), [(ConstantFactor, True, False), (AtTheMidpoint, False, True)]
+)
+def test_conduction_that_keeps_one_law_alone(conduction, energy, entropy):
+    """Skewness without Fourier's factor keeps the energy only, its sign without skewness the entropy only."""
+    right = particles(conductance=0.3)
+    part = right.dissipation
+    graph = Edges(np.array(part.first), np.array(part.second), part.conductance)
+    wrong = eqx.tree_at(lambda s: s.dissipation, right, conduction(graph))
+    solution = lt.integrate(wrong, np.log([2.0, 4.0]), (0.0, 5.0), 0.1, engine="array")
+    assert (solution.audit().energy_drift < 1e-14) is energy
+    assert (solution.stats.least_entropy_increment >= -1e-15) is entropy
 
 
 # -- what is refused --------------------------------------------------------------------------------------------------
@@ -338,7 +319,7 @@ def test_temperatures_that_are_not_positive():
     with pytest.raises(lt.InputError, match=r"cannot start.*temperature of odd is -0.5.*positive"):
         lt.integrate(system, [0.1, -0.5], (0.0, 1.0), 0.1)
     assert "outside the domain" in str(system.check())
-    solution = lt.integrate(system, [-8.0, 0.3], (0.0, 40.0), 20.0, on_failure="return", engine="array")
+    solution = lt.integrate(system, [-3.0, 0.3], (0.0, 40.0), 4.0, on_failure="return", engine="array")
     assert not solution.status.ok
     assert "positive" in solution.status.message
 

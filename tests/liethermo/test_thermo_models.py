@@ -76,6 +76,8 @@ def test_figures_3_and_4():
     """273.15 and 300: temperatures as in the picture, equal at the end; entropy from 11.3138 to 11.3160."""
     system = lt.models.thermo_particles()
     solution = run(system, np.log([273.15, 300.0]), 50.0, 0.1)
+    assert solution.stats.steps == 500
+    assert (np.diff(solution.entropy[:50]) > 0).all()
     T = np.asarray(system.temperatures(solution.x))
     exact = thermo_particles_solution(solution.t, [273.15, 300.0])
     assert np.abs(T - exact).max() == pytest.approx(0.0165, rel=0.02)
