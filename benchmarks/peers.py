@@ -62,6 +62,12 @@ def scipy(tolerance: float, x0, t_end: float, rate: float) -> Run:
     return Run(lambda: solve()[-1], solve)
 
 
+def scipy_loop(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
+    """The states at the end from all of the x0s, one after another."""
+    runs = [scipy(tolerance, x0, t_end, rate) for x0 in x0s]
+    return lambda: np.array([run.end() for run in runs])
+
+
 @functools.cache
 def _scipy_field(rate: float) -> Callable:
     compiled = numba.njit(body_field)
