@@ -22,6 +22,7 @@ from .dissipation import (
     ProjectedMetric,
 )
 from .energy import Energy, Function, Quadratic
+from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
     CasimirError,
@@ -51,6 +52,7 @@ __all__ = [
     "Dissipation",
     "DoubleBracket",
     "Energy",
+    "Ensemble",
     "EulerPoincareForce",
     "EulerPoincareSystem",
     "FileError",
@@ -79,6 +81,7 @@ __all__ = [
     "Stats",
     "Status",
     "System",
+    "ensemble",
     "integrate",
     "load",
     "models",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import math
 import os
 import sys
 import time
@@ -22,15 +21,10 @@ from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
 from .solution import Laws, Solution, Stats, Status
 from .systems import System
+from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
-
-CHUNK_SAVES = 1024
-"""Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
-
-CHUNK_STEPS = 100_000
-"""Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
 
 COMPILED_STEPS = 200_000
 """Steps from which "auto" compiles: the array engine would take longer for them than the compiler does."""
@@ -100,11 +94,15 @@ def integrate(
     method = MetriplecticMidpoint() if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticMidpoint(), not {method!r}")
-    _check(system, t_span, step, save_every, engine, on_failure)
-    x = system.state(x0)
-    span = (float(t_span[0]), float(t_span[1]))
-    run = _Run(system, method, x, span, float(step), save_every, save_to, engine)
-    with _Progress(span, progress) as bar:
+    if not isinstance(system, System):
+        raise InputError(
+            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
+        )
+    check_choice("engine", engine, ("auto", "array", "compiled"))
+    check_choice("on_failure", on_failure, ("raise", "return"))
+    table = Timetable(t_span, step, save_every)
+    run = _Run(system, method, system.state(x0), table, save_to, engine)
+    with _Progress((table.start, table.end), progress) as bar:
         (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
     solution = run.solution()
     if save_to is not None:
@@ -119,43 +117,36 @@ def integrate(
 class _Run:
     """A run under way: what has been saved, and how it stands."""
 
-    def __init__(self, system, method, x0, span, h, every, save_to, engine):
-        self.system, self.method, self.span, self.h, self.every = system, method, span, h, every
+    def __init__(self, system, method, x0, table: Timetable, save_to, engine):
+        self.system, self.method, self.table = system, method, table
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
-        self.times = [span[0]]
+        self.times = [table.start]
         self.states = [np.asarray(x0)[None]]
         self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
-        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
-        steps = (span[1] - span[0]) / h
-        self.steps = math.floor(steps * (1 + 1e-12))
-        self.last = span[1] - (span[0] + self.steps * h)
-        if self.last <= 1e-12 * (span[1] - span[0]):
-            self.last = 0.0
-        long = self.steps >= COMPILED_STEPS and system.dim <= COMPILED_DIM
+        long = table.steps >= COMPILED_STEPS and system.dim <= COMPILED_DIM
         self.engine = "compiled" if engine == "compiled" or (engine == "auto" and long) else "array"
         self.fallback = engine == "auto"
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
     def by_steps(self, bar) -> None:
-        """Drive the engine chunk by chunk, to the end, a failure or Ctrl-C."""
-        capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // self.every, _power_of_two(self.steps // self.every)))
+        """Drive the engine call by call, to the end, a failure or Ctrl-C."""
+        # few distinct capacities, so few compilations
+        capacity = max(
+            1, min(CHUNK_SAVES, CHUNK_STEPS // (self.table.every or 1), _power_of_two(len(self.table.counts) - 1))
+        )
         state, interrupted = self._begin(), False
         self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
         try:
-            done = 0
-            while done < self.steps and int(state.status) == array.RUNNING:
-                left = self.steps - done
-                saves, every = (min(capacity, left // self.every), self.every) if left >= self.every else (1, left)
-                state = self._advance(state, self.h, saves, every, capacity)
-                done = int(state.step)
+            for h, saves, every in self.table.calls(saves=capacity):
+                state = self._advance(state, h, saves, every, capacity)
                 bar.update(self.times[-1])
+                if int(state.status) != array.RUNNING:
+                    break
                 self._checkpoint(state)
-            if int(state.status) == array.RUNNING and self.last > 0.0:
-                state = self._advance(state, self.last, 1, 1, capacity)
         except KeyboardInterrupt:
             interrupted = True
         self.stats, self.status = _stats(state), self._status(state, interrupted)
@@ -169,7 +160,7 @@ class _Run:
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
-                warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=5)
+                warn_of_fallback(error, stacklevel=6)
                 self.engine = "array"
         return array.begin(self.system, self.method, x)
 
@@ -187,22 +178,17 @@ class _Run:
             values = np.append(values, [[float(state.energy), float(state.entropy)]], axis=0)
         self.states.append(states)
         self.values.append(values)
-        self.times.extend(self._time(n) for n in steps)
+        self.times.extend(self.table.time(int(n)) for n in steps)
         return state
-
-    def _time(self, step: int) -> float:
-        if step > self.steps or (step == self.steps and not self.last):
-            return self.span[1]
-        return self.span[0] + step * self.h
 
     def _status(self, state, interrupted: bool) -> Status:
         code, step, residual = int(state.status), int(state.step), float(state.residual)
-        now = self._time(step)
+        now = self.table.time(step)
         if interrupted:
             return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
         if code == array.RUNNING:
             return Status("completed", f"reached t = {now:g} in {step} steps", step, now, residual)
-        h = self.last if step >= self.steps else self.h
+        h = self.table.last if step >= self.table.full else self.table.h
         where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
         if code == array.NOT_CONVERGED:
             message = (
@@ -219,7 +205,7 @@ class _Run:
 
     def _culprit(self, state) -> str:
         """Which function is not finite just ahead of the last good state."""
-        ahead = jnp.asarray(state.x) + self.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+        ahead = jnp.asarray(state.x) + self.table.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
         system = self.system
         suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}
         if system.entropy is not None:
@@ -233,9 +219,7 @@ class _Run:
 
     def by_scipy(self, bar) -> None:
         """One call of the reference solver, its output at the times a fixed step would have."""
-        counts = [*range(0, self.steps, self.every), self.steps]
-        times = np.array([self._time(n) for n in counts] + ([self.span[1]] if self.last else []))
-        times = np.unique(times)
+        times = self.table.times
         self.values = [self._energies(self.states[0])]
         try:
             x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
@@ -265,7 +249,6 @@ class _Run:
         x = np.concatenate(self.states)
         invariants = system.invariants()
         energy, entropy = np.concatenate(self.values).T
-        conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(self.method, J))
         wall = time.perf_counter() - self.started
         return Solution(
             t=np.array(self.times),
@@ -275,7 +258,7 @@ class _Run:
             casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=Laws(system.energy_law, system.entropy_law, conserved),
+            laws=laws_of(system, self.method, invariants),
             provenance=self._provenance(),
         )
 
@@ -293,9 +276,9 @@ class _Run:
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "method": str(self.method),
             "engine": None if isinstance(self.method, Reference) else self.engine,
-            "step": self.h,
-            "t_span": list(self.span),
-            "save_every": self.every,
+            "step": self.table.h,
+            "t_span": [self.table.start, self.table.end],
+            "save_every": self.table.every,
             "x0": np.asarray(self.states[0][0]).tolist(),
             "system": type(self.system).__name__,
             "algebra": None if algebra is None else algebra.name,
@@ -306,31 +289,20 @@ class _Run:
 # -- helpers --------------------------------------------------------------------------------------------------------
 
 
-def _check(system, t_span, step, save_every, engine, on_failure) -> None:
-    if not isinstance(system, System):
-        raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
-        )
-    try:
-        start, end = (float(t) for t in t_span)
-    except (TypeError, ValueError):
-        raise InputError(f"t_span must be two numbers (start, end), not {t_span!r}") from None
-    if not (math.isfinite(start) and math.isfinite(end) and end > start):
-        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g})")
-    try:
-        h = float(step)
-    except (TypeError, ValueError):
-        raise InputError(f"step must be a number, not {step!r}") from None
-    if not (math.isfinite(h) and h > 0.0):
-        raise InputError(f"step must be positive and finite, not {h:g}: time runs forwards, since entropy grows")
-    if start + h == start or end + h == end:
-        raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
-    if isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1:
-        raise InputError(f"save_every must be a positive integer, not {save_every!r}")
-    if engine not in ("auto", "array", "compiled"):
-        raise InputError(f"engine must be 'auto', 'array' or 'compiled', not {engine!r}")
-    if on_failure not in ("raise", "return"):
-        raise InputError(f"on_failure must be 'raise' or 'return', not {on_failure!r}")
+def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
+    if given not in choices:
+        *others, last = map(repr, choices)
+        raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+
+
+def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
+    warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
+
+
+def laws_of(system: System, method, invariants) -> Laws:
+    """What the system promises and, of its invariants, what the method keeps."""
+    conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
+    return Laws(system.energy_law, system.entropy_law, conserved)
 
 
 def _keeps(method, function) -> bool:

@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds import matrix_functions
+
 from ..integrators import OneStepMethod
 from ..systems import System
 
@@ -105,11 +107,11 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        factors = jax.scipy.linalg.lu_factor(jax.jacfwd(flat)(s.k.ravel()))
+        inverse = _inverse(jax.jacfwd(flat)(s.k.ravel()))
 
         def reuse(carry):
             inner, _ = carry
-            step = jax.scipy.linalg.lu_solve(factors, flat(inner.k.ravel())).reshape(guess.shape)
+            step = (inverse @ flat(inner.k.ravel())).reshape(guess.shape)
             return inner.after(inner.k - step), inner.made + 1 - s.made
 
         def goes_on(carry):
@@ -125,6 +127,18 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
+
+
+@jax.custom_batching.custom_vmap
+def _inverse(matrix):
+    """For Newton's method, which corrects what an inverse loses."""
+    return jnp.linalg.inv(matrix)
+
+
+@_inverse.def_vmap
+def _inverses(axis_size, batched, matrices):
+    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrix_functions.solve
+    return matrix_functions.inverse(matrices), True
 
 
 class State(eqx.Module):
@@ -218,13 +232,17 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 
-@eqx.filter_jit
 def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
     Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
     """
+    h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
+    return _advance(system, method, state, h, saves, every, capacity)
 
+
+@eqx.filter_jit
+def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     def one_save(state: State, index):
         target = state.step + every
 

@@ -17,7 +17,9 @@ import math
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -89,30 +91,25 @@ class Stepper:
 
     Parameters
     ----------
-    system : System
-        One of that form.
+    form : Form
+    parameters : array, shape (p,)
+        Those of one system of that form. Zeros among them hold for all, unless they vary.
     method : OneStepMethod
     lanes : int
         Trajectories that advance together, a block.
-    varies : array of bool, optional
-        Which parameters are each trajectory's own; none by default.
+    varies : array of bool, shape (p,)
+        Which parameters are each trajectory's own.
     """
 
-    def __init__(self, system: System, method: OneStepMethod, lanes: int = 1, varies: np.ndarray | None = None):
+    def __init__(self, form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int, varies: np.ndarray):
         self.lanes = lanes
+        system, rebuilt = form.build(parameters), form.build
         self._stiff = False  # whether some step has asked for Newton's method: the loop then has it from the start
         self._loops: dict[bool, Callable] = {}
+        self._lock = threading.Lock()
         self._relaxing = int(system.energy_law != "nonincreasing")
-        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-        leaves, structure = jax.tree_util.tree_flatten(dynamic)
-        ends = np.cumsum([np.size(leaf) for leaf in leaves])
-        parameters = parameters_of(dynamic)
-        self._varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
-        self._known = np.where((parameters == 0.0) & ~self._varies, 0.0, np.nan)
-
-        def rebuilt(p):
-            parts = [p[end - np.size(a) : end].reshape(np.shape(a)) for a, end in zip(leaves, ends, strict=True)]
-            return eqx.combine(jax.tree_util.tree_unflatten(structure, parts), static)
+        self._varies = varies
+        self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
 
         def prepare(x, k, before):
             return method.predict(k, before), jnp.max(jnp.abs(x))
@@ -224,9 +221,10 @@ class Stepper:
 
     def _loop(self, newton: bool) -> Callable:
         """The function ``advance`` of the module, compiled or found compiled."""
-        if newton not in self._loops:
-            self._loops[newton] = load(self._text(newton), self._try_out).advance
-        return self._loops[newton]
+        with self._lock:
+            if newton not in self._loops:
+                self._loops[newton] = load(self._text(newton), self._try_out).advance
+            return self._loops[newton]
 
     def _try_out(self, module: ModuleType) -> None:
         """Take no step, which compiles the loop or finds it compiled."""
@@ -277,33 +275,71 @@ class _Piece(NamedTuple):
 EMPTY = 9.0
 """Status of a lane without a trajectory."""
 
+
+@dataclass(frozen=True)
+class Form:
+    """What systems have in common that differ in their parameters.
+
+    Attributes
+    ----------
+    key : hashable
+        The same for the same form.
+    shapes : tuple of shapes
+        Of the parameters, which are arrays.
+    rebuild : function from a list of arrays to a System
+    """
+
+    key: Any
+    shapes: tuple[tuple[int, ...], ...]
+    rebuild: Callable[[list], System] = field(compare=False)
+
+    @classmethod
+    def of(cls, system: System) -> Form:
+        """The form of a system, its parameters being the arrays among its leaves: its functions count by identity."""
+        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+        leaves, structure = jax.tree_util.tree_flatten(dynamic)
+        functions, outline = jax.tree_util.tree_flatten(static)
+        return cls(
+            (outline, tuple(functions)),
+            tuple(np.shape(leaf) for leaf in leaves),
+            lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
+        )
+
+    def build(self, p) -> System:
+        """The system with the parameters p, shape (p,), all arrays one after another."""
+        ends = list(itertools.accumulate(map(math.prod, self.shapes)))
+        arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
+        return self.rebuild(arrays)
+
+
 _steppers: dict[Any, Stepper] = {}
 
+STEPPERS = 256
+"""Forms whose loops are held in memory."""
 
-def stepper_for(
-    system: System, method: OneStepMethod, lanes: int = 1, varies: np.ndarray | None = None
-) -> tuple[Stepper, np.ndarray]:
-    """The stepper for systems of this form, and the parameters of this one.
 
-    The form is the structure of the system (its functions by identity) and which of its parameters are zero: a diagonal
-    matrix makes a shorter program.
+def stepper_of(
+    form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int = 1, varies: np.ndarray | None = None
+) -> Stepper:
+    """The stepper for systems of a form.
+
+    Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
     """
-    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-    parameters = parameters_of(dynamic)
-    functions, structure = jax.tree_util.tree_flatten(static)
-    shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(dynamic))
-    known = parameters == 0.0 if varies is None else (parameters == 0.0) & ~varies
-    own = None if varies is None else varies.tobytes()
-    key = (structure, tuple(functions), shapes, known.tobytes(), method, lanes, own)
+    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    known = (parameters == 0.0) & ~varies
+    key = (form.key, form.shapes, known.tobytes(), method, lanes, varies.tobytes())
     if key not in _steppers:
-        _steppers[key] = Stepper(system, method, lanes, varies)
-    return _steppers[key], parameters
+        while len(_steppers) >= STEPPERS:
+            del _steppers[next(iter(_steppers))]
+        _steppers[key] = Stepper(form, parameters, method, lanes, varies)
+    return _steppers[key]
 
 
-def parameters_of(dynamic) -> np.ndarray:
-    """All arrays among the leaves of a system, one after another."""
-    leaves = [np.asarray(leaf, dtype=np.float64).ravel() for leaf in jax.tree_util.tree_leaves(dynamic)]
-    return np.concatenate([np.zeros(0), *leaves])
+def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndarray]:
+    """The stepper for one trajectory of a system, and the system's parameters."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
+    parameters = np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
+    return stepper_of(Form.of(system), parameters, method), parameters
 
 
 def _template() -> str:

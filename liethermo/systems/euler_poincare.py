@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, EulerPoincareForce
 from ..energy import Energy, Quadratic, as_energy, check_scalar
@@ -129,7 +130,7 @@ def _inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
 
     def refine(carry):
         xi, r, _, k = carry
-        step = jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), r)
+        step = solve(jax.hessian(lagrangian.value)(xi), r[:, None])[:, 0]
 
         def shorten(state):
             t, _ = state
@@ -162,4 +163,4 @@ def _inverse_gradient_jvp(primals, tangents):
     if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):
         _, moved = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
         change = change - moved
-    return xi, jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), change)
+    return xi, solve(jax.hessian(lagrangian.value)(xi), change[:, None])[:, 0]
