@@ -36,8 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start = time.perf_counter()
         report = importlib.import_module(f"{__package__}.measurements.{name}").run(options.quick)
         report.save(options.out / f"{name}.json", name=name, quick=options.quick, **about)
-        parts = [report.markdown(), targets_table(report.targets).markdown() if report.targets else ""]
-        print("\n".join(parts), f"\n({time.perf_counter() - start:.0f} s)\n", flush=True)
+        print(report.markdown())
+        if report.targets:
+            print(targets_table(report.targets).markdown())
+        warning = "; quick: the figures mean nothing" if options.quick else ""
+        print(f"\n({time.perf_counter() - start:.0f} s{warning})\n", flush=True)
     if options.page:
         page.write(options.out, options.page)
 

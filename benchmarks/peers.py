@@ -97,9 +97,14 @@ def diffrax(solver: str, tolerance: float, x0, t_end: float, rate: float) -> Run
 
 def diffrax_ensemble(solver: str, tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """The states at the end from all of the x0s, under ``vmap``."""
-    jax = module("jax")
-    ends = jax.jit(jax.vmap(_diffrax_end(solver, t_end, rate), in_axes=(0, None)))
+    ends = _diffrax_ends(solver, t_end, rate)
     return lambda: np.asarray(ends(x0s, tolerance))
+
+
+@functools.cache
+def _diffrax_ends(solver: str, t_end: float, rate: float) -> Callable:
+    jax = module("jax")
+    return jax.jit(jax.vmap(_diffrax_end(solver, t_end, rate), in_axes=(0, None)))
 
 
 @functools.cache

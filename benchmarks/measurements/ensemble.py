@@ -23,7 +23,7 @@ RATE, T_END = 1.0, 10.0
 SAMPLE = 32
 """Bodies whose errors are taken; the worst counts."""
 
-TOLERANCES = tuple(10.0 ** (-n / 2) for n in range(2, 25))
+TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 52))
 
 SCIPY, C, COMPILED = "SciPy DOP853, one by one", "C with SIMD", "compiled engine"
 

@@ -83,7 +83,7 @@ def _fastest(series: dict[str, list[list[float]]]) -> Table:
         [name, *(min((seconds for error, seconds in points if error <= wanted), default=None) for wanted in WANTED)]
         for name, points in series.items()
     ]
-    columns = {"": "text"} | {f"{wanted:.0e}": "seconds" for wanted in WANTED}
+    columns = {"": "text"} | {f"≤ {wanted:.0e}": "seconds" for wanted in WANTED}
     return Table("The least time in which an error was reached, over the settings tried.", columns, rows)
 
 
