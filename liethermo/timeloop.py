@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .engine import array, compiled
+from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
@@ -26,11 +27,14 @@ from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-COMPILED_STEPS = 200_000
-"""Steps from which "auto" compiles: the array engine would take longer for them than the compiler does."""
+SMALL_DIM = 8
+"""Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
+
+COMPILED_STEPS = 20_000
+"""Steps from which it is worth compiling for some seconds more."""
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
@@ -69,8 +73,9 @@ def integrate(
         Keep every so-manieth state, and the last; the laws are followed at every step all the same.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
-        more, after some seconds of compiling the first time. "auto" compiles for runs that are long enough to repay
-        it, and falls back, with a warning, where the system uses what cannot be compiled.
+        more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
+        components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
+        uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -126,8 +131,9 @@ class _Run:
         self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
-        long = table.steps >= COMPILED_STEPS and system.dim <= COMPILED_DIM
-        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and long) else "array"
+        wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
+        small = system.dim <= wanted and jax.default_backend() == "cpu"
+        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
         self.fallback = engine == "auto"
 
     # -- the library's own methods ----------------------------------------------------------------------------------
@@ -255,7 +261,7 @@ class _Run:
             x=x,
             energy=energy,
             entropy=None if system.entropy is None else entropy,
-            casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
+            casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=laws_of(system, self.method, invariants),
@@ -305,12 +311,13 @@ def laws_of(system: System, method, invariants) -> Laws:
     return Laws(system.energy_law, system.entropy_law, conserved)
 
 
+def _value(function, x):
+    return function.value(x)
+
+
 def _keeps(method, function) -> bool:
     """Whether the method keeps a function exactly that the system conserves."""
-    from .energy import Quadratic
-
-    quadratic = all(isinstance(term, Quadratic) for term in function.terms)
-    return quadratic and "quadratic_invariants" in method.preserves
+    return function.is_quadratic and "quadratic_invariants" in method.preserves
 
 
 def _stats(state: array.State) -> Stats:

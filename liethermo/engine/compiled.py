@@ -52,6 +52,7 @@ NUMBERS = {
     "least_entropy_increment": "LEAST_RISE",
     "largest_energy_increment": "LARGEST_GAIN",
     "integral": "INTEGRAL",
+    "first_energy": "FIRST_ENERGY",
 }
 """The fields of :class:`.array.State`, and the rows that hold them in the step loop."""
 
@@ -122,8 +123,8 @@ class Stepper:
             misfit = lambda v: method.slopes(rebuilt(p), x, low, h[0], v.reshape(k.shape)).ravel() - v  # noqa: E731
             return jax.jacfwd(misfit)(k.ravel())
 
-        def finish(p, x, low, h, k):
-            return array.finish(rebuilt(p), method, x, low, h[0], k)
+        def finish(p, x, low, h, k, first_energy):
+            return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])
 
         def start(p, x):
             return method.start(rebuilt(p), x), *array.values(rebuilt(p), x)
@@ -134,7 +135,7 @@ class Stepper:
         self._shapes |= dict.fromkeys(("K", "BEFORE", "GUESS", "NEW"), (method.stages, n))
         self._shapes |= {"P": parameters.shape, "MATRIX": (m, m)}
 
-        step = "P X LOW H GUESS"
+        step, end = "P X LOW H GUESS", "P X LOW H GUESS FIRST_ENERGY"
         # What an iteration needs and does not change is computed once a step.
         fixed, changing = self._traced(iterate, step).split([step.split().index("GUESS")])
         self._shapes["FIXED"] = fixed.shapes[0]
@@ -144,7 +145,7 @@ class Stepper:
                 _Piece(fixed, step, "FIXED"),
             ],
             "iterate": [_Piece(changing, f"{step} FIXED", "NEW UPDATE SLOPE")],
-            "finish": [_Piece(self._traced(finish, step), step, "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK")],
+            "finish": [_Piece(self._traced(finish, end), end, "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK")],
         }
         self._start = self._traced(start, "P X")
         self._jacobian = lambda: _Piece(self._traced(jacobian, step), step, "MATRIX")
@@ -169,7 +170,8 @@ class Stepper:
         own = np.broadcast_to(parameters, (len(x), len(self._varies)))
         k, energy, entropy = self._start.evaluate(own, x, batch=True)
         fields: dict[str, Any] = dict.fromkeys(NUMBERS, 0.0) | {"x": x, "low": 0.0, "k": k, "before": k}
-        fields |= {"energy": energy, "entropy": entropy, "smallest_energy": energy, "largest_energy": energy}
+        fields |= dict.fromkeys(("energy", "first_energy", "smallest_energy", "largest_energy"), energy)
+        fields |= {"entropy": entropy}
         fields |= {"least_entropy_increment": np.inf, "largest_energy_increment": -np.inf}
         return self.blocks(fields, own)
 
@@ -234,7 +236,9 @@ class Stepper:
     def _text(self, newton: bool) -> str:
         lanes, n, m = self.lanes, self._shapes["X"][0], self._shapes["MATRIX"][0]
         lines = ["import math", "", "import numpy as np", "from numba import njit as compiled", ""]
-        lines += ["njit = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
+        lines += ["entry = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
+        # inlined, the programs keep their values in registers; with Newton's method there are too many calls for that
+        lines += [f"njit = compiled(error_model='numpy', nogil=True, forceinline={not newton})"]
         lines += [f"N, M, LANES, NEWTON = {n}, {m}, {lanes}, {newton}"]
         lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS.split()]
         lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]

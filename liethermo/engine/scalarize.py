@@ -102,6 +102,27 @@ class Program:
 
         return [gathered(entries, shape) for entries, shape in zip(self.outputs, self.shapes, strict=True)]
 
+    def degree(self, place: int) -> float:
+        """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
+
+        Parameters
+        ----------
+        place : int
+            Of the input.
+        """
+        degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
+        for target, op, args in self.instructions:
+            found = [degrees.get(a, 0) for a in args]
+            if op in ("add", "sub", "neg"):
+                degrees[target] = max(found)
+            elif op == "mul":
+                degrees[target] = sum(found)
+            elif op == "div" and not found[1]:
+                degrees[target] = found[0]
+            else:
+                degrees[target] = math.inf if any(found) else 0
+        return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
+
     def split(self, late: Sequence[int]) -> tuple[Program, Program]:
         """What can be computed without some of the inputs, and the rest.
 

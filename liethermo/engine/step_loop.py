@@ -57,6 +57,9 @@ def njit(function):
     return function
 
 
+entry = njit
+
+
 # -- the mark: what follows is copied ---------------------------------------------------------------------------------
 
 
@@ -242,7 +245,7 @@ def take_step(p, w, matrix, order, b):
     return True
 
 
-@njit
+@entry
 def advance(p, blocks, done, saves, every, out):
     """Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept, with its energies.
 

@@ -14,11 +14,6 @@ BODY = lt.models.rigid_body()
 ENGINES = ("array", "compiled")
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path_factory.getbasetemp() / "liethermo"))
-
-
 def states(number, dim=3, seed=0):
     return np.random.default_rng(seed).standard_normal((number, dim))
 
