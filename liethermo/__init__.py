@@ -37,12 +37,14 @@ from .errors import (
     SpecError,
 )
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
+from .stepwise import Adaptive, Relaxed
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
-from .timeloop import integrate
+from .timeloop import integrate, suggest_step
 
 __all__ = [
+    "Adaptive",
     "Audit",
     "AxiomError",
     "CasimirError",
@@ -69,6 +71,7 @@ __all__ = [
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
+    "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticSystem",
     "NonFiniteError",
@@ -76,6 +79,7 @@ __all__ = [
     "ProjectedMetric",
     "Quadratic",
     "Reference",
+    "Relaxed",
     "Solution",
     "SpecError",
     "Stats",
@@ -87,6 +91,7 @@ __all__ = [
     "models",
     "plot",
     "registered_methods",
+    "suggest_step",
 ]
 
 

@@ -199,9 +199,10 @@ def ensemble(
     states = np.broadcast_to(states, (size, states.shape[1]))
     times = Timetable(t_span, step, save_every if outputs == "trajectory" else None)
     family.check(states)
+    method.check(member)
     record = _Record(size, member, times, outputs)
 
-    small = member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
+    small = member.unrollable and member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
     chosen = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
     if chosen == "compiled":
         try:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
+import math
 import os
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,6 +24,8 @@ from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
 from .solution import Laws, Solution, Stats, Status
+from .stepwise import Adaptive, Dense, Event, Relaxed
+from .stepwise import run as run_stepwise
 from .systems import System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
@@ -48,10 +53,13 @@ def integrate(
     system: System,
     x0,
     t_span: tuple[float, float],
-    step: float,
+    step: float | Adaptive,
     method: OneStepMethod | Reference | None = None,
     *,
     save_every: int = 1,
+    save_at=None,
+    until: Relaxed | Callable | None = None,
+    dense: bool = False,
     engine: Literal["auto", "array", "compiled"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
@@ -65,12 +73,20 @@ def integrate(
     x0 : array, shape (n,)
     t_span : (float, float)
         Start and end, the end later. The last step is shortened to arrive there.
-    step : float
-        Step size, > 0; the spacing of the output for ``Reference``.
+    step : float or Adaptive
+        Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
         ``MetriplecticMidpoint()`` by default.
     save_every : int
         Keep every so-manieth state, and the last; the laws are followed at every step all the same.
+    save_at : array of times, optional
+        Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
+    until : Relaxed or function from a state, shape (n,), to a scalar, optional
+        Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
+        located to rounding on the collocation polynomial, reached by a step that ends there. ``solution.event_time``
+        and the status tell whether it happened.
+    dense : bool
+        Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
@@ -105,14 +121,25 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    table = Timetable(t_span, step, save_every)
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    adaptive = isinstance(step, Adaptive)
+    looks = adaptive or dense or save_at is not None or until is not None
+    if looks and isinstance(method, Reference):
+        raise InputError(
+            "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
+        )
+    table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
     run = _Run(system, method, system.state(x0), table, save_to, engine)
     with _Progress((table.start, table.end), progress) as bar:
-        (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
+        if looks:
+            run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
+        else:
+            (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
     solution = run.solution()
     if save_to is not None:
         solution.save(save_to)
-    if on_failure == "raise" and solution.status.code == "not_converged":
+    if on_failure == "raise" and solution.status.code in ("not_converged", "step_underflow"):
         raise ConvergenceError(solution.status.message, solution)
     if on_failure == "raise" and solution.status.code in ("non_finite", "reference_failed"):
         raise NonFiniteError(solution.status.message, solution)
@@ -131,8 +158,11 @@ class _Run:
         self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
+        self.step: float | Adaptive = table.h
+        self.event_time: float | None = None
+        self.dense: Dense | None = None
         wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
-        small = system.dim <= wanted and jax.default_backend() == "cpu"
+        small = system.unrollable and system.dim <= wanted and jax.default_backend() == "cpu"
         self.engine = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
         self.fallback = engine == "auto"
 
@@ -144,9 +174,10 @@ class _Run:
         capacity = max(
             1, min(CHUNK_SAVES, CHUNK_STEPS // (self.table.every or 1), _power_of_two(len(self.table.counts) - 1))
         )
-        state, interrupted = self._begin(), False
-        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
+        state, interrupted = None, False
+        self.values = [self._energies(self.states[0])]
         try:
+            state = self._begin()
             for h, saves, every in self.table.calls(saves=capacity):
                 state = self._advance(state, h, saves, every, capacity)
                 bar.update(self.times[-1])
@@ -155,7 +186,69 @@ class _Run:
                 self._checkpoint(state)
         except KeyboardInterrupt:
             interrupted = True
-        self.stats, self.status = _stats(state), self._status(state, interrupted)
+        if state is None:
+            self.status = Status("interrupted", "stopped by the user before the first step", 0, self.table.start)
+            return
+        step = int(state.step)
+        now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
+        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted)
+
+    def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
+        """Look at every step: adaptive ones, events, outputs at given times, dense output."""
+        start, end, every = self.table.start, self.table.end, self.table.every or 1
+        stops, event = _stops(save_at, start, end), None if until is None else Event(until, self.system)
+        self.step, pieces, last = step, [], None
+
+        def keep(t, reached, h, before, after):
+            nonlocal last
+            last = reached, after
+            if dense:
+                pieces.append((t, h, np.asarray(before.x), np.asarray(after.k)))
+            if reached in stops if save_at is not None else int(after.step) % every == 0:
+                self._append(reached, after)
+                last = None
+            bar.update(reached)
+            self._checkpoint(after)
+
+        state = None
+        try:
+            state = self._begin()
+        except KeyboardInterrupt:
+            self.values = [self._energies(self.states[0])]
+            self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
+            return
+        self.values = [np.array([[float(state.energy), float(state.entropy)]])]
+        engine = compiled if self.engine == "compiled" else array
+        outcome = run_stepwise(self.system, self.method, engine, state, (start, end), step, stops, event, keep)
+        if last is not None:
+            self._append(*last)
+        self.event_time = outcome.event_time
+        if pieces:
+            self.dense = Dense(*(np.array(column) for column in zip(*pieces, strict=True)))
+        state, now = outcome.state, self.times[-1]
+        self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
+        steps = int(state.step)
+        if outcome.underflow is not None:
+            text = (
+                f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and the error is still too "
+                "large: the tolerance may be below what rounding allows, or the functions not smooth there. "
+                f"Try a larger tolerance than {step}"
+            )
+            self.status = Status("step_underflow", text, steps, now, float(state.residual))
+        elif event is not None and outcome.event_time is not None:
+            text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
+            self.status = Status("event", text, steps, now, float(state.residual))
+        else:
+            h = step if isinstance(step, float) else float("nan")
+            self.status = self._status(state, now, h, outcome.interrupted)
+            if event is not None and self.status.ok:
+                text = f"{self.status.message}; the event ({event.name}) did not happen"
+                self.status = dataclasses.replace(self.status, message=text)
+
+    def _append(self, t: float, state) -> None:
+        self.times.append(t)
+        self.states.append(np.asarray(state.x)[None])
+        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
 
     def _begin(self):
         """The state to start from, by the engine that can run the system."""
@@ -187,14 +280,12 @@ class _Run:
         self.times.extend(self.table.time(int(n)) for n in steps)
         return state
 
-    def _status(self, state, interrupted: bool) -> Status:
+    def _status(self, state, now: float, h: float, interrupted: bool) -> Status:
         code, step, residual = int(state.status), int(state.step), float(state.residual)
-        now = self.table.time(step)
         if interrupted:
             return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
         if code == array.RUNNING:
             return Status("completed", f"reached t = {now:g} in {step} steps", step, now, residual)
-        h = self.table.last if step >= self.table.full else self.table.h
         where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
         if code == array.NOT_CONVERGED:
             message = (
@@ -244,8 +335,7 @@ class _Run:
             self.status = Status("completed", f"reached t = {now:g}", len(x) - 1, now)
 
     def _energies(self, x: np.ndarray) -> np.ndarray:
-        entropy = np.zeros(len(x)) if self.system.entropy is None else np.asarray(self.system.entropy(x))
-        return np.stack([np.asarray(self.system.energy(x)), entropy], axis=1)
+        return np.stack(at_points(array.values, self.system, x), axis=1)
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
@@ -266,6 +356,8 @@ class _Run:
             stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=laws_of(system, self.method, invariants),
             provenance=self._provenance(),
+            event_time=self.event_time,
+            dense=self.dense,
         )
 
     def _checkpoint(self, state) -> None:
@@ -282,7 +374,7 @@ class _Run:
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "method": str(self.method),
             "engine": None if isinstance(self.method, Reference) else self.engine,
-            "step": self.table.h,
+            "step": self.step if isinstance(self.step, float) else dataclasses.asdict(self.step),
             "t_span": [self.table.start, self.table.end],
             "save_every": self.table.every,
             "x0": np.asarray(self.states[0][0]).tolist(),
@@ -293,6 +385,63 @@ class _Run:
 
 
 # -- helpers --------------------------------------------------------------------------------------------------------
+
+
+def _stops(save_at, start: float, end: float) -> np.ndarray:
+    """The times at which steps have to end, the end of the span among them."""
+    if save_at is None:
+        return np.array([end])
+    times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
+    if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
+        raise InputError(f"save_at is a list of times, not {save_at!r}")
+    if times.min() < start or times.max() > end:
+        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
+    return np.unique([*times, end])
+
+
+def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None) -> float:
+    """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
+
+    The smallest that adaptive steps take in their first thirty, after they have settled, rounded down to two digits.
+
+    Parameters
+    ----------
+    system : System
+    x0 : array, shape (n,)
+    rtol : float
+    method : OneStepMethod
+        ``MetriplecticMidpoint()`` by default.
+
+    Raises
+    ------
+    InputError
+        Where nothing moves at x0, so that any step will do.
+    """
+    method = MetriplecticMidpoint() if method is None else method
+    x = np.asarray(system.state(x0))
+    speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
+    if not speed > 0.0:
+        raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
+    taken: list[float] = []
+
+    def keep(t, reached, h, before, after):
+        taken.append(h)
+        if len(taken) == 30:
+            raise _EnoughError
+
+    engine, span = array, (0.0, 1e6 * max(size, 1e-300) / speed)
+    with contextlib.suppress(_EnoughError):
+        state = engine.begin(system, method, jnp.asarray(x))
+        run_stepwise(system, method, engine, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+    if len(taken) < 2:
+        raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
+    h = min(taken[len(taken) // 2 :])
+    digits = 1 - math.floor(math.log10(h))
+    return math.floor(h * 10.0**digits) / 10.0**digits
+
+
+class _EnoughError(Exception):
+    """Ends a run that has served its purpose."""
 
 
 def check_choice(what: str, given, choices: tuple[str, ...]) -> None:

@@ -259,6 +259,26 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
 
 
+def stepping(system: System, method: OneStepMethod) -> Callable:
+    """The function (state, h) -> state after one step, or as it was with the status of a failure."""
+    return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
+
+
+@eqx.filter_jit
+def _one_step(system, method, state, h):
+    return take_step(system, method, state, h)
+
+
+def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
+    """The method's estimate of its local error, a number; for both engines."""
+    return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
+
+
+@eqx.filter_jit
+def _error(system, method, x, low, h, k):
+    return method.error(system, x, low, h, k)
+
+
 STEERED = 4 * EPS
 """Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself."""
 

@@ -87,6 +87,19 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves: int, 
     return State(**fields), (out[:, :-2], out[:, -2], out[:, -1], reached)
 
 
+def stepping(system: System, method: OneStepMethod) -> Callable:
+    """The function (state, h) -> state after one step; as :func:`.array.stepping`."""
+    stepper, parameters = stepper_for(system, method)
+
+    def step(state: State, h) -> State:
+        blocks = stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
+        stepper.run(parameters, blocks, h, 1, 1)
+        fields: dict[str, Any] = {name: value[0] for name, value in stepper.fields(blocks).items()}
+        return State(**fields)
+
+    return step
+
+
 class Stepper:
     """The step loop of one method on systems of one form, compiled; parameters are arguments.
 

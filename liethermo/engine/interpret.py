@@ -31,12 +31,16 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
     model : pytree
     points : array, shape (m, n)
     """
-    points = np.asarray(points, dtype=np.float64)
+    return evaluator(function, model, np.shape(points)[1])(points)
+
+
+def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
+    """The map from points, shape (m, dim), to :func:`at_points` there, unrolled once."""
     try:
-        program, structure = _unrolled(function, model, points.shape[1:])
+        program, structure = _unrolled(function, model, (dim,))
     except UnsupportedPrimitive:
-        return jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
-    return jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
+        return lambda points: jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
+    return lambda points: jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
 
 
 def polynomial_degree(function: Callable, model: Any, dim: int) -> float:

@@ -73,6 +73,11 @@ class System(eqx.Module):
         if validate and not _has_tracers(self):
             self._validate()
 
+    @property
+    def unrollable(self) -> bool:
+        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
+        return True
+
     # -- dynamics -------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
@@ -127,9 +132,21 @@ class System(eqx.Module):
         it too, and a Casimir only if the dissipation does: that is found out at random points.
         """
         found = {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)} | self._casimirs()
-        constant = _conserved(self, tuple(found.values()))
+        constant = self.conserves(tuple(found.values()))
         claimed = {name: (J, True) for name, J in self.momentum_maps.items()}
         return claimed | {name: (f, kept) for (name, f), kept in zip(found.items(), constant, strict=True)}
+
+    def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
+        """Whether each function is constant along the vector field, at random points inside its domain."""
+        if not functions:
+            return []
+        points = np.random.default_rng(0).standard_normal((8, self.dim))
+        rates, sizes = at_points(_rates_of_change, (self, functions), points)
+        inside = np.isfinite(rates)
+        return [
+            bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
+            for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
+        ]
 
     def _casimirs(self) -> dict[str, Energy]:
         """Casimirs of the Poisson structure worth recording."""
@@ -205,19 +222,6 @@ class System(eqx.Module):
         if self.entropy is None:
             raise InputError("this system has no entropy")
         return self.entropy
-
-
-def _conserved(system: System, functions: tuple[Energy, ...]) -> list[bool]:
-    """Whether each function is constant along the vector field, at random points inside its domain."""
-    if not functions:
-        return []
-    points = np.random.default_rng(0).standard_normal((8, system.dim))
-    rates, sizes = at_points(_rates_of_change, (system, functions), points)
-    inside = np.isfinite(rates)
-    return [
-        bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
-        for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
-    ]
 
 
 def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):

@@ -88,6 +88,10 @@ class EulerPoincareSystem(LiePoissonSystem):
         energy = _hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate)
 
+    @property
+    def unrollable(self) -> bool:
+        return not isinstance(self.energy, Legendre)  # which iterates
+
     def velocity(self, mu) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim)."""
         return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(self.state(mu, batch=True))
