@@ -13,9 +13,10 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 
 
-def call(measurement: str, *arguments: str, cache: str | None = None) -> Any:
+def call(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
     """What ``child(*arguments)`` of a measurement returns in a new process, ``cache`` being its LIETHERMO_CACHE."""
-    return json.loads(python("-m", "benchmarks.child", measurement, *arguments, cache=cache).splitlines()[-1])
+    options = ["--one-core"] if one_core else []
+    return json.loads(python("-m", "benchmarks.child", *options, measurement, *arguments, cache=cache).splitlines()[-1])
 
 
 def python(*arguments: str, cache: str | None = None) -> str:
@@ -35,6 +36,15 @@ def python(*arguments: str, cache: str | None = None) -> str:
     return done.stdout
 
 
+def main(arguments: list[str]) -> None:
+    """Run a child function and print what it returns, as JSON."""
+    if arguments[0] == "--one-core":
+        if hasattr(os, "sched_setaffinity"):  # before JAX is imported, which starts a thread for each core it may use
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        arguments = arguments[1:]
+    module = importlib.import_module(f"{__package__}.measurements.{arguments[0]}")
+    print(json.dumps(module.child(*arguments[1:])))
+
+
 if __name__ == "__main__":
-    module = importlib.import_module(f"{__package__}.measurements.{sys.argv[1]}")
-    print(json.dumps(module.child(*sys.argv[2:])))
+    main(sys.argv[1:])

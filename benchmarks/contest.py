@@ -38,14 +38,14 @@ def by_c(program: Body, steps: int, every: int | None = None) -> Callable[[], tu
 
 
 def contest(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
-    """Race the works, each of so many steps; a table, and the seconds of each.
+    """Race the works, each of so many steps in one thread; a table, and the seconds of the processor of each.
 
     Returns
     -------
     Table, dict of float
     """
     outcomes = race(works, rounds=rounds)
-    times = {name: outcome.seconds for name, outcome in outcomes.items()}
+    times = {name: outcome.processor for name, outcome in outcomes.items()}
     rows = []
     for name, outcome in outcomes.items():
         solution = outcome.result
@@ -54,7 +54,7 @@ def contest(caption: str, works: Mapping[str, Callable], steps: int, rounds: int
         else:
             run = solution[1]
             iterations, kept = float((run["iterations"] / run["steps"])[0]), laws.of_runs(run)
-        rows.append([name, outcome.seconds / steps, ratio(outcome.seconds, times.get(baseline)), iterations])
+        rows.append([name, times[name] / steps, ratio(times[name], times.get(baseline)), iterations])
         rows[-1] += kept.cells()
     columns = {"": "text", "Time a step": "seconds", f"Relative to {baseline}": "ratio", "Iterations a step": "number"}
     return Table(caption, columns | laws.COLUMNS, rows), times

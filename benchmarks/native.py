@@ -24,7 +24,10 @@ STATUSES = ("completed", "not_converged", "non_finite")
 RUN = np.dtype(
     [(name, "f8", 3) for name in ("x", "low", "k", "before")]
     + [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
-    + [(name, "f8") for name in ("least_entropy_increment", "largest_energy_increment", "residual", "worst_residual")]
+    + [
+        (name, "f8")
+        for name in ("least_entropy_increment", "largest_energy_increment", "residual", "worst_residual", "integral")
+    ]
     + [(name, "i8") for name in ("status", "steps", "iterations", "most_iterations")]
 )
 """``Run`` of c/midpoint.h."""
@@ -32,7 +35,7 @@ RUN = np.dtype(
 SUMMARY = np.dtype(
     [("x", "f8", 3)]
     + [(name, "f8") for name in ("first_energy", "largest_energy", "smallest_energy", "entropy")]
-    + [(name, "f8") for name in ("least_entropy_increment", "steps", "iterations")]
+    + [(name, "f8") for name in ("least_entropy_increment", "steps", "iterations", "integral")]
     + [("status", "i8")]
 )
 """``Summary`` of c/ensemble.c."""

@@ -12,9 +12,11 @@ INTRODUCTION = """\
 # Benchmarks
 
 The library against hand-written C (`-O3 -march=native`), SciPy, diffrax and heyoka.py. Contestants take turns and the
-best time of each counts; ratios are between times of one run. *Laws* compares the relative drift of the energy and the
-least increment of the entropy in a step, relative to its maximum, with the tolerances of the tests. `make bench`
-measures everything anew and writes this page; the programs are in `benchmarks/`."""
+best time of each counts; ratios are between times of one run. Work in one thread is timed by the processor's clock, so
+that a busy machine does not count; where threads or processes are compared the wall's clock is used, and the load
+average below says how far to trust it. *Laws* compares the relative drift of the energy and the least increment of the
+entropy in a step, relative to its maximum, with the tolerances of the tests. `make bench` measures everything anew and
+writes this page; the programs are in `benchmarks/`."""
 
 
 def write(results: Path, page: Path) -> None:

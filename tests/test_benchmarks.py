@@ -9,13 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import native, page, reference
+from benchmarks import child, laws, native, page, reference
 from benchmarks.__main__ import main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
+from benchmarks.measurements import memory
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
-from benchmarks.problems import body, body_parameters, general_body, general_parameters, random_states
+from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
 from benchmarks.report import Target
 from benchmarks.timing import race
 from liethermo.engine import array
@@ -73,7 +74,7 @@ def test_the_rules_in_c_are_the_library_s():
     text = (native.SOURCES / "rules.h").read_text().replace("DBL_EPSILON", repr(array.EPS))
     defined = dict(re.findall(r"^#define ([A-Z_]+) ([-(0-9].*)$", text, re.MULTILINE))
     assert {name: eval(value) for name, value in defined.items()} == {
-        name: getattr(array, name) for name in ("FIXED_POINT_LIMIT", "SLOW", "SHRINKING", "FLOOR", "PLATEAU")
+        name: getattr(array, name) for name in ("FIXED_POINT_LIMIT", "SLOW", "SHRINKING", "FLOOR", "PLATEAU", "STEERED")
     }
     statuses = re.search(r"enum \{ (.*) \};", text)
     assert statuses is not None
@@ -121,6 +122,23 @@ def test_the_reference_is_the_trajectory(monkeypatch):
     assert np.abs(reference.states(x0, 0.71, 5.0) - exact).max() > 1e-3
     monkeypatch.setattr(reference, "STEP", reference.STEP / 2)
     assert np.array_equal(reference.states(x0, 0.7, 5.0), exact)
+
+
+@pytest.mark.skipif(not memory.STATUS.is_file(), reason="this system does not tell a process its largest size")
+def test_a_process_is_not_charged_its_parent_s_memory():
+    """getrusage would: its figure survives the start of another program."""
+    large = np.ones(100_000_000)
+    small = child.python("-c", "from benchmarks.measurements.memory import _resident; print(_resident())")
+    assert 1e7 < float(small) < large.nbytes < memory._resident()
+
+
+@needs_compiler
+def test_c_steers_the_energy():
+    """A general energy keeps its value over a long run, as the library's does; without steering it is off by 5e-13."""
+    _, run = Body("general.c", general_parameters(1e-3)).integrate(X0, 0.1, 300_000)
+    assert laws.of_runs(run).energy_drift < 2e-14
+    _, run = Body("general.c", general_parameters(1e-3), "-DSTEERED=INFINITY").integrate(X0, 0.1, 300_000)
+    assert laws.of_runs(run).energy_drift > 2e-14
 
 
 @pytest.mark.parametrize(

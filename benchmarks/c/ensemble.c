@@ -22,7 +22,7 @@ typedef struct {
     double x[N];
     double first_energy, largest_energy, smallest_energy;
     double entropy, least_entropy_increment;
-    double steps, iterations;
+    double steps, iterations, integral;
     int64_t status;
 } Summary;
 
@@ -30,7 +30,7 @@ typedef struct {
     Lanes x[N], low[N], k[N], before[N];
     Lanes first_energy, largest_energy, smallest_energy;
     Lanes entropy, least_entropy_increment;
-    Lanes steps, iterations;
+    Lanes steps, iterations, integral;
     Mask running, undefined; /* a lane that is not running has failed: undefined, or not converged */
 } Block;
 
@@ -95,6 +95,25 @@ static inline void solve(const Problem *p, Block *b, double h, Lanes k[N])
     b->running &= ~active;
 }
 
+/* Where the energy is off by more than a few roundings of H, shift low along its gradient, by eps |x| / 4 at most. */
+static inline void steer(const Problem *p, const Lanes x[N], Lanes energy, Lanes first_energy, Lanes low[N])
+{
+    Lanes gradient[N], error = energy - first_energy, size = all(0.0), square = all(0.0);
+    EACH(i) {
+        gradient[i] = p->inverse_inertia[i] * x[i];
+        error += gradient[i] * low[i];
+        size += absolute(gradient[i] * x[i]);
+        square += gradient[i] * gradient[i];
+    }
+    const Mask off = below(STEERED * larger(absolute(first_energy), size), absolute(error)) & below(all(0.0), square);
+    if (!any(off))
+        return;
+    const Lanes most = 0.25 * DBL_EPSILON * size;
+    const Lanes shift = choose(off, larger(-most, smaller(error, most)) / square, all(0.0));
+    EACH(i)
+        low[i] -= shift * gradient[i];
+}
+
 static inline void take_step(const Problem *p, double h, Block *b)
 {
     Lanes k[N], new[N], new_low[N], energy, entropy;
@@ -113,6 +132,8 @@ static inline void take_step(const Problem *p, double h, Block *b)
     b->undefined |= b->running & ~defined;
     b->running &= defined;
 
+    steer(p, new, energy, b->first_energy, new_low);
+
     const Mask good = b->running;
     EACH(i) {
         b->before[i] = choose(good, b->k[i], b->before[i]);
@@ -125,6 +146,7 @@ static inline void take_step(const Problem *p, double h, Block *b)
     b->smallest_energy = choose(good, smaller(b->smallest_energy, energy), b->smallest_energy);
     b->least_entropy_increment =
         choose(good, smaller(b->least_entropy_increment, entropy - b->entropy), b->least_entropy_increment);
+    b->integral += choose(good, 0.5 * h * (b->entropy + entropy), all(0.0));
     b->entropy = choose(good, entropy, b->entropy);
 }
 
@@ -143,7 +165,7 @@ static void run_block(const Work *work, int64_t first)
     const Lanes nothing[N] = {all(0.0), all(0.0), all(0.0)};
     Lanes energy;
     Block b = {.running = every(), .undefined = none(), .least_entropy_increment = all(INFINITY)};
-    b.steps = b.iterations = all(0.0);
+    b.steps = b.iterations = b.integral = all(0.0);
     EACH(i) {
         for (int lane = 0; lane < WIDTH; lane++) { /* lanes beyond the last body repeat it */
             const int64_t body = first + lane < work->bodies ? first + lane : work->bodies - 1;
@@ -170,6 +192,7 @@ static void run_block(const Work *work, int64_t first)
             .least_entropy_increment = b.least_entropy_increment[lane],
             .steps = b.steps[lane],
             .iterations = b.iterations[lane],
+            .integral = b.integral[lane],
             .status = chosen(b.running, lane) ? RUNNING : chosen(b.undefined, lane) ? NON_FINITE : NOT_CONVERGED,
         };
 }

@@ -6,11 +6,12 @@
        Problem                               the parameters of the system,
        Start, start(p, x)                    what the slopes need of the state and what does not change in a step,
        slopes(p, s, x, low, h, k, out)       the right-hand side of  k = slopes(k),
-       values(p, x, &energy, &entropy).
+       values(p, x, &energy, &entropy),
+       energy_gradient(p, x, out).
 
    A step solves k = slopes(k) by fixed-point iteration from 2 k - before, down to the rounding plateau, and adds h k
-   with compensated summation. The iteration is that of liethermo/engine/step_loop.py without Newton's method: where
-   the library would turn to that, this run ends. */
+   with compensated summation; what rounding has done to the energy is steered back. The iteration is that of
+   liethermo/engine/step_loop.py without Newton's method: where the library would turn to that, this run ends. */
 
 #include <math.h>
 #include <stdint.h>
@@ -22,7 +23,7 @@ typedef struct {
     double energy, entropy;
     double first_energy, largest_energy, smallest_energy;
     double least_entropy_increment, largest_energy_increment;
-    double residual, worst_residual;
+    double residual, worst_residual, integral;
     int64_t status, steps, iterations, most_iterations;
 } Run;
 
@@ -69,6 +70,24 @@ static inline int solve(const Problem *p, const Run *run, double h, double k[N],
     return NOT_CONVERGED;
 }
 
+/* Where the energy is off by more than a few roundings of H, shift low along its gradient, by eps |x| / 4 at most. */
+static inline void steer(const Problem *p, const double x[N], double energy, double first_energy, double low[N])
+{
+    double gradient[N], error = energy - first_energy, size = 0.0, square = 0.0;
+    energy_gradient(p, x, gradient);
+    EACH(i) {
+        error += gradient[i] * low[i];
+        size += fabs(gradient[i] * x[i]);
+        square += gradient[i] * gradient[i];
+    }
+    if (!(fabs(error) > STEERED * larger(fabs(first_energy), size)) || !(square > 0.0))
+        return;
+    const double most = 0.25 * DBL_EPSILON * size;
+    const double shift = larger(-most, smaller(error, most)) / square;
+    EACH(i)
+        low[i] -= shift * gradient[i];
+}
+
 static inline int take_step(const Problem *p, double h, Run *run)
 {
     double k[N], new[N], new_low[N], update, energy, entropy, total = 0.0;
@@ -91,6 +110,7 @@ static inline int take_step(const Problem *p, double h, Run *run)
     values(p, new, &energy, &entropy);
     if (!isfinite(total + energy + entropy))
         return NON_FINITE;
+    steer(p, new, energy, run->first_energy, new_low);
 
     EACH(i) {
         run->before[i] = run->k[i];
@@ -106,6 +126,7 @@ static inline int take_step(const Problem *p, double h, Run *run)
     run->smallest_energy = smaller(run->smallest_energy, energy);
     run->least_entropy_increment = smaller(run->least_entropy_increment, entropy - run->entropy);
     run->largest_energy_increment = larger(run->largest_energy_increment, energy - run->energy);
+    run->integral += 0.5 * h * (run->entropy + entropy);
     run->energy = energy;
     run->entropy = entropy;
     return RUNNING;

@@ -47,4 +47,10 @@ static inline void values(const Problem *p, const double x[N], double *energy, d
     *entropy = 0.5 * (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
 }
 
+static inline void energy_gradient(const Problem *p, const double x[N], double out[N])
+{
+    EACH(i)
+        out[i] = p->inverse_inertia[i] * x[i];
+}
+
 #include "midpoint.h"

@@ -1,4 +1,4 @@
-/* When to stop iterating: the rules of liethermo/engine/array.py, where the reasons stand. */
+/* When to stop iterating, and when to steer the energy: the rules of liethermo/engine/array.py, where the reasons stand. */
 
 #ifndef RULES_H
 #define RULES_H
@@ -10,6 +10,9 @@
 #define SHRINKING 0.8
 #define FLOOR (1e-5 * DBL_EPSILON)
 #define PLATEAU (1e3 * DBL_EPSILON)
+#ifndef STEERED
+#define STEERED (4 * DBL_EPSILON)
+#endif
 
 enum { RUNNING, NOT_CONVERGED, NON_FINITE };
 

@@ -42,9 +42,8 @@ def run(quick: bool) -> Report:
 
     text = (
         "The metriplectic midpoint scheme on one relaxed rigid body, with the same rules for the iteration, "
-        "compensated summation and the same record of energy and entropy at every step. H and S given as plain "
-        "functions get the discrete gradient of a general energy, three gradients and two values an iteration; C and "
-        "`lt.Quadratic` need one gradient."
+        "compensated summation, steering of the energy and record of energy and entropy at every step. Times are of "
+        "the processor. That H and S are quadratic the library sees from plain functions too."
     )
     if C in long:
         text += (
