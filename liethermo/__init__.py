@@ -36,6 +36,7 @@ from .errors import (
     NonFiniteError,
     SpecError,
 )
+from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
@@ -86,6 +87,7 @@ __all__ = [
     "Status",
     "System",
     "ensemble",
+    "flow",
     "integrate",
     "load",
     "models",

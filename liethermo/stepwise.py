@@ -88,7 +88,7 @@ class Relaxed:
 
 
 class Control:
-    """The size of the next step: proportional-integral control of the local error [Hairer & Wanner 1996, IV.2].
+    """The size of the next step, from the error of the last; small changes are left out, so that it does not chatter.
 
     Parameters
     ----------
@@ -104,13 +104,11 @@ class Control:
         self.h = step.first or first if isinstance(step, Adaptive) else step
         self.largest = (step.largest or math.inf) if isinstance(step, Adaptive) else math.inf
         self.h = min(self.h, self.largest)
-        self._power, self._before = 1.0 / (order + 1), 1.0
+        self._power = 1.0 / (order + 1)
 
     def accept(self, error: float, h: float) -> None:
         """After a step of size h whose error is this fraction of the allowed one, at most 1."""
-        error = max(error, 1e-12)
-        factor = SAFETY * error ** (-0.7 * self._power) * self._before ** (0.4 * self._power)
-        self._before = error
+        factor = SAFETY * max(error, 1e-12) ** -self._power
         if h < 0.99 * self.h:  # cut short to end somewhere: it says little about the next
             factor = max(factor, self.h / h) if factor > 1.0 else 1.0
         factor = min(GROWTH, max(SHRINKAGE, factor))
