@@ -125,7 +125,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {
     "seconds": _seconds,
     "ratio": lambda a: f"{a:.3g} ×",
     "number": lambda a: f"{a:.3g}",
-    "count": lambda a: f"{a:,}".replace(",", " "),
+    "count": lambda a: f"{a:,}",
     "error": lambda a: f"{a:.1e}",
     "gigabytes": lambda a: f"{a / 1e9:.2f} GB",
 }

@@ -20,9 +20,9 @@ RATE, T_END, STEPS = 1.0, 10.0, 200
 
 def run(quick: bool) -> Report:
     """Two tables."""
-    steps, rounds, together, apart = (2000, 1, (2,), (10,)) if quick else (50_000, 3, TOGETHER, APART)
+    steps, rounds, together, apart = (2000, 1, (2,), (10,)) if quick else (200_000, 3, TOGETHER, APART)
     caption = (
-        f"Bodies on the direct sum of so(3)s, as one system: runs of {steps} steps of size {growth.STEP}, each in a "
+        f"Bodies on the direct sum of so(3)s, as one system: runs of {steps:,} steps of size {growth.STEP}, each in a "
         "new process on one core with an empty cache."
     )
     one_system = growth.table(caption, [f"bodies {n}" for n in together], steps, rounds, "Bodies")

@@ -52,14 +52,14 @@ def run(quick: bool) -> Report:
     contests = {name: _contest(name, method, steps, x0s, exact, rounds) for name, (method, steps) in methods.items()}
     times, _, skipped = contests["midpoint"]
     against_c = ratio(times[COMPILED], times.get(C))
-    targets = [Target(f"{bodies} relaxed bodies, 200 steps, against C with SIMD", 4.0, against_c)]
+    targets = [Target(f"{bodies:,} relaxed bodies, 200 steps, against C with SIMD", 4.0, against_c)]
     for name, (times, _, _) in contests.items():
         diffrax = min((times[title] for title in PEERS if title in times and "vmap" in title), default=None)
-        work = f"{bodies} relaxed bodies ({name}), against diffrax under vmap at equal accuracy"
+        work = f"{bodies:,} relaxed bodies ({name}), against diffrax under vmap at equal accuracy"
         targets.append(Target(work, 10.0, ratio(diffrax, times[COMPILED]), at_least=True))
     text = (
-        f"{bodies} bodies from random states of norm one to t = {T_END:g}, on {cores()} cores. The error is the worst "
-        f"of {len(exact)} bodies against Taylor series of {reference.DIGITS} digits. Each peer has the loosest "
+        f"{bodies:,} bodies from random states of norm one to t = {T_END:g}, on {cores()} cores. The error is the "
+        f"worst of {len(exact)} bodies against Taylor series of {reference.DIGITS} digits. Each peer has the loosest "
         "tolerance with which it is at least as accurate as the library's method."
     )
     return Report("Many bodies", text, [table for _, table, _ in contests.values()], targets, skipped)
@@ -102,7 +102,7 @@ def _contest(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, e
         row[4] = ratio(row[3], times.get(C))
     rows.sort(key=lambda row: row[3])
     columns = {"": "text", "Setting": "text", "Error": "error", "Time a body": "seconds", "Relative to C": "ratio"}
-    caption = f"The {name} scheme with {steps} steps, and peers at its accuracy; of theirs the laws see the ends alone."
+    caption = f"The library: {name}, {steps} steps; peers at its accuracy, whose laws are taken at the ends alone."
     return times, Table(caption, columns | laws.COLUMNS, rows), skipped
 
 

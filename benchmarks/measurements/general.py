@@ -23,7 +23,7 @@ def run(quick: bool) -> Report:
             "array engine": lambda: by_library(system, steps, "array"),
         }
     )
-    caption = f"A run of {steps} steps of size {STEP}, relaxing all the way (rate {rate:g}); one state kept."
+    caption = f"A run of {steps:,} steps of size {STEP}, relaxing all the way (rate {rate:g}); one state kept."
     table, times = contest(caption, works, steps, rounds, C)
     text = (
         "A quartic energy and a logarithmic entropy on so(3)*, given to the library as plain functions and to C with "

@@ -23,7 +23,7 @@ def run(quick: bool) -> Report:
             "array engine, plain functions": lambda: by_library(plain_body(rate), steps, "array"),
         }
     )
-    caption = f"A run of {steps} steps of size {STEP}, relaxing all the way (rate {rate:g}); one state kept."
+    caption = f"A run of {steps:,} steps of size {STEP}, relaxing all the way (rate {rate:g}); one state kept."
     table, times = contest(caption, long, steps, rounds, C)
 
     few = 100 if quick else 1000
