@@ -204,8 +204,12 @@ def _stage_gradients(term: Energy, x, low, h, k, A, b, finer: Finer | None) -> j
         rates = jnp.sum(between * (finer.slopes @ k), axis=1)
         smooth = h * (jnp.dot(finer.b, rates) + jnp.dot(finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
-    before, after = _values(term, jnp.stack([x, x + (low + d)]))
-    defect = (after - before) - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
+    new, new_low = _rounded(x, low + d)
+    before, after = _values(term, jnp.stack([x, new]))
+    # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
+    ends = jax.vmap(term.gradient)(jnp.stack([x, new]))
+    difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
+    defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     square = jnp.dot(b, jnp.sum(k * k, axis=1))
     slope = jnp.linalg.norm(mean)
     noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
@@ -213,6 +217,13 @@ def _stage_gradients(term: Energy, x, low, h, k, A, b, finer: Finer | None) -> j
     opened = jnp.maximum(_gate(defect, noise), harmless * _gate(spread, SPREAD * slope))
     alpha = _divide(smooth + _let_through(defect, opened), h * square)
     return gradients + alpha * k
+
+
+def _rounded(x, d):
+    """x + d as a double, and what rounding keeps from it (two-sum)."""
+    new = x + d
+    back = new - x
+    return new, (x - (new - back)) + (d - back)
 
 
 def _values(term: Energy, points) -> jax.Array:
