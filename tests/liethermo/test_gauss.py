@@ -48,7 +48,7 @@ SO3, SE3_BODY = (case.values[0] for case in nonlinear_systems())
             system,
             stages,
             id=f"{system.algebra.name}, order {2 * stages}",
-            marks=() if (system.dim, stages) in [(3, 2), (3, 5), (6, 3)] else pytest.mark.slow,
+            marks=() if (system.dim, stages) in [(3, 2), (6, 3)] else pytest.mark.slow,
         )
         for system in (SO3, SE3_BODY)
         for stages in STEPS
@@ -86,10 +86,16 @@ def assert_laws(many):
     assert (many.least_entropy_increment >= -ENTROPY * np.maximum(many.entropy_scale, 1.0)).all()
 
 
+def test_laws():
+    assert_laws(random_run(mf.so(3), 12, 1000, engine="array"))
+
+
+@pytest.mark.slow
 def test_laws_over_ten_thousand_steps():
     assert_laws(random_run(mf.so(3), 16, 10_000, engine="compiled"))
 
 
+@pytest.mark.slow
 def test_laws_on_a_semidirect_product():
     assert_laws(random_run(mf.se(3), 8, 100, engine="array"))
 
@@ -124,6 +130,7 @@ def run_special(p, x0s, steps):
     return lt.ensemble(build, x0s, (0.0, 0.05 * steps), 0.05, method, parameters=p, engine="compiled")
 
 
+@pytest.mark.slow
 def test_rest_stays_at_rest():
     """grad H = 0 (with grad S = 0 or not), grad H parallel to grad S, and an axis of the body, for 10^5 steps."""
     p = special(16)
@@ -136,9 +143,11 @@ def test_rest_stays_at_rest():
     assert_laws(many)
     # the spheres turn about their momentum, which rounding leaves where it is; the axes include the unstable one
     assert np.abs(many.x - x0s).max() <= 2e-14  # 5.4e-15 seen
-    assert many.iterations.max() <= 3 * 100_000
+    assert np.median(many.iterations) <= 1.01 * 100_000
+    assert many.iterations.max() <= 6 * 100_000  # one of the spheres takes 4, at its rounding plateau
 
 
+@pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
@@ -163,6 +172,7 @@ def test_no_entropy_gradient_no_friction():
     assert np.abs(free.x - x0s).max() > 1.0  # it does move
 
 
+@pytest.mark.slow
 def test_relaxed_state():
     """After relaxation: no motion, no noise, and less work a step."""
     g = mf.so(3)
@@ -203,6 +213,7 @@ def test_heavy_top_with_friction():
     assert float(S(solution.x[-1])) > float(S(TOP)) + 0.1
 
 
+@pytest.mark.slow
 def test_free_heavy_top():
     """Energy and both Casimirs to rounding."""
     system, kept, S = heavy_top(friction=False)
