@@ -29,11 +29,10 @@ def entropy(casimirs, p):
 
     def S(mu):
         total = 0.0
-        for C, w, centre in zip(casimirs, p["weights"], p["centre"], strict=True):
-            value = C(mu)
-            total += (
-                w[0] * value + w[1] * jnp.log(1.0 + value**2) + w[2] * jnp.sin(value) + w[3] * (value - centre) ** 2
-            )
+        for i, C in enumerate(casimirs):
+            w, value = p["weights"][i], C(mu)
+            total += w[0] * value + w[1] * jnp.log(1.0 + value**2) + w[2] * jnp.sin(value)
+            total += w[3] * (value - p["centre"][i]) ** 2
         return total
 
     return S
