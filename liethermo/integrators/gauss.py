@@ -97,11 +97,12 @@ class MetriplecticGauss(OneStepMethod):
 
     def _slope(self, system: System, u, dH, dS, dL, dC) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
-        exact = system.entropy is None or system.entropy.is_quadratic  # then Pi dS = 0 as it stands
+        entropy = system.entropy
+        exact = entropy is None or entropy.is_quadratic  # then Pi dS = 0 as it stands
         if exact and not dC:
             return system.field(u, dH, dS, dL)
         held = list(zip(dC, (C.gradient(u) for C in self.functions), strict=True))
-        off = _projector(held if exact else [(dS, system.entropy.gradient(u)), *held])
+        off = _projector(held if entropy is None or exact else [(dS, entropy.gradient(u)), *held])
         motion = off(system.poisson.sharp(u, off(dH)))
         for part in _parts(system.dissipation):
             motion = motion + self._force(part, system, u, dH, dS, dL, held)
