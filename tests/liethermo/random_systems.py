@@ -61,15 +61,20 @@ def family(g):
 def parameters(g, number, seed=0):
     """Independent ones; the entropies increase with the Casimirs, some of which have singularities behind them."""
     rng, n, kinds = np.random.default_rng(seed), g.dim, len(casimirs(g))
+
+    def directions(shortest, longest):  # long ones make systems that a step of the suite cannot follow
+        d = rng.standard_normal((number, n))
+        return d / np.linalg.norm(d, axis=1, keepdims=True) * rng.uniform(shortest, longest, (number, 1))
+
     weights = rng.uniform(-1.0, 1.0, (number, kinds, 4))
     weights[..., 0] += 2.5
     weights[..., 3] = 0.0
     return {
         "root": np.eye(n) + 0.5 * rng.standard_normal((number, n, n)) / np.sqrt(n),
         "strength": rng.uniform(0.0, [0.1, 0.5, 0.5], (number, 3)),
-        "a": rng.standard_normal((number, n)),
-        "b": rng.standard_normal((number, n)),
-        "c": rng.standard_normal((number, n)) / np.sqrt(n),
+        "a": directions(0.5, 1.5),
+        "b": directions(0.5, 3.0),
+        "c": directions(0.5, 1.5),
         "weights": weights,
         "centre": np.zeros((number, kinds)),
         "rate": rng.uniform(0.0, 0.1, number),

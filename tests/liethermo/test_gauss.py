@@ -250,7 +250,7 @@ def body(entropy=lambda m: jnp.log(1.0 + jnp.dot(m, m)), rate=0.3):
 
 def test_dependent_and_vanishing_constraints():
     """Functions that say the same twice, or whose gradient is zero where the motion goes, change nothing."""
-    system, x0 = body(rate=None), np.array([0.8, 0.5, 0.9])
+    system, x0 = body(lt.Quadratic(np.ones(3)), rate=None), np.array([0.8, 0.5, 0.9])
     C = lambda m: jnp.dot(m, m)  # noqa: E731
     twice, still = lambda m: 2.0 * C(m) + 1.0, lambda m: (C(m) - C(x0)) ** 2
     once = run(system, x0, 100, method=lt.MetriplecticGauss(2, preserve=C))
