@@ -80,6 +80,15 @@ class Dissipation(eqx.Module):
             Gradients of the functions in :attr:`preserve`, in their order.
         """
 
+    def momentum(self, dH, turned) -> jax.Array | None:
+        """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].
+
+        ``turned`` is ``[dH, dS]``. Such an F joins the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
+        action in the place of two. None where the force is of another form.
+        """
+        del dH, turned
+        return None
+
     def __add__(self, other: Dissipation) -> Dissipation:
         return Several((*_parts(self), *_parts(other)))
 
@@ -150,9 +159,12 @@ class InnerProductDissipation(Dissipation):
         _need_algebra(system, "InnerProductDissipation", self.K.shape[0])
         return self
 
+    def momentum(self, dH, turned):
+        return self.K @ turned
+
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
-        return g.ad_star(dH, self.K @ g.bracket(dH, dS))
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
 
 class KillingDissipation(Dissipation):
@@ -207,9 +219,12 @@ class KillingDissipation(Dissipation):
             )
         return KillingDissipation(self.rate, jnp.asarray(form))
 
+    def momentum(self, dH, turned):
+        return self.rate * (self.form @ turned)
+
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
-        return self.rate * g.ad_star(dH, self.form @ g.bracket(dH, dS))
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
 
 class ProjectedMetric(Dissipation):
@@ -460,6 +475,9 @@ class EulerPoincareForce(Dissipation):
         if shape != (g.dim,):
             raise InputError(f"the force F must map shape ({g.dim},) to ({g.dim},), but it returns shape {shape}")
         return self
+
+    def momentum(self, dH, turned):
+        return self.F(dH)
 
     def force(self, system, x, dH, dS, dL):
         return system.algebra.ad_star(dH, self.F(dH))

@@ -253,8 +253,12 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
         rates = jnp.sum(between * slopes, axis=1)
         smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
-    before, after = _values(term, jnp.stack([x, x + (low + d)]))
-    defect = (after - before) - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
+    new, new_low = _rounded(x, low + d)
+    before, after = _values(term, jnp.stack([x, new]))
+    # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
+    ends = jax.vmap(term.gradient)(jnp.stack([x, new]))
+    difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
+    defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     direction = k if along is None else along * k
     square = jnp.dot(b, jnp.sum(direction * direction, axis=1))
     slope = jnp.linalg.norm(mean)
@@ -263,6 +267,13 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     opened = jnp.maximum(_gate(defect, noise), harmless * _gate(spread, SPREAD * slope))
     alpha = _divide(smooth + _let_through(defect, opened), h * square)
     return gradients + alpha * direction
+
+
+def _rounded(x, d):
+    """x + d as a double, and what rounding keeps from it (two-sum)."""
+    new = x + d
+    back = new - x
+    return new, (x - (new - back)) + (d - back)
 
 
 def _values(term: Energy, points) -> jax.Array:

@@ -30,8 +30,8 @@ class MetriplecticGauss(OneStepMethod):
 
     for every smooth H, S and C and every step. Order 2s: alpha is O(h^{2s}) [Hairer, Lubich & Wanner, II.1]. Quadratic
     Casimirs and linear invariants are kept by collocation itself. One implicit equation of s times the size of the
-    state; an iteration costs s gradients of H and S and, of each that is not
-    quadratic, two values, and s + 1 gradients more for one and two stages.
+    state; an iteration costs s gradients of H and S; of each that is not quadratic two values and a gradient at the end
+    of the step besides, and s + 1 gradients between the nodes where s is 1 or 2.
 
     Parameters
     ----------
@@ -97,24 +97,26 @@ class MetriplecticGauss(OneStepMethod):
 
     def _slope(self, system: System, u, dH, dS, dL, dC) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
-        exact = system.entropy is None or system.entropy.is_quadratic  # then Pi dS = 0 as it stands
-        if exact and not dC:
+        entropy = None if system.entropy is None or system.entropy.is_quadratic else system.entropy
+        if entropy is None and not dC:  # Pi dS = 0 as it stands
             return system.field(u, dH, dS, dL)
-        off = _projector(dC if exact else (dS, *dC))
+        held = list(zip(dC, (C.gradient(u) for C in self.functions), strict=True))
+        off = _projector(held if entropy is None else [(dS, entropy.gradient(u)), *held])
         motion = off(system.poisson.sharp(u, off(dH)))
         for part in _parts(system.dissipation):
-            motion = motion + self._force(part, system, u, dH, dS, dL, dC)
+            motion = motion + self._force(part, system, u, dH, dS, dL, held)
         return motion
 
     @staticmethod
-    def _force(part: Dissipation, system: System, u, dH, dS, dL, dC) -> jax.Array:
+    def _force(part: Dissipation, system: System, u, dH, dS, dL, held) -> jax.Array:
         own = tuple(dL[i] for C in part.preserve for i, L in enumerate(system.preserved) if L is C)
         if part.energy_law != "conserved":  # it lowers the energy and has to keep the entropy
-            off = _projector((dS, *dC))
+            entropy = [] if system.entropy is None else [(dS, system.entropy.gradient(u))]
+            off = _projector([*entropy, *held])
             return off(part.force(system, u, off(dH), dS, own))
-        if not dC:
+        if not held:
             return part.force(system, u, dH, dS, own)
-        off = _projector((dH, *dC))
+        off = _projector([(dH, system.energy.gradient(u)), *held])
         return off(part.force(system, u, dH, off(dS), own))
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
@@ -146,21 +148,32 @@ def _parts(dissipation: Dissipation | None) -> tuple[Dissipation, ...]:
 
 
 def _projector(gradients):
-    """The orthogonal projector off the span of some vectors, which may vanish or depend on each other."""
-    frame: list[jax.Array] = []
+    """The orthogonal projector off the span of discrete gradients, each given with the gradient at the stage itself.
 
-    def off(v):
+    One that vanishes or depends on those before it is left out, and the gradients at the stage tell which: the discrete
+    ones of C and exp(C) differ by a multiple of the slope, and to project off both would stop the motion.
+    """
+
+    def without(frame, v):
         for _ in range(2):  # the second pass removes what rounding left of the first
             for e in frame:
                 v = v - jnp.dot(e, v) * e
         return v
 
-    for gradient in gradients:
-        before, rest = jnp.dot(gradient, gradient), off(gradient)
-        square = jnp.dot(rest, rest)
-        independent = (square > 1e-24 * before) & (square > 0.0)
-        frame.append(rest * jnp.where(independent, 1.0 / jnp.sqrt(jnp.where(independent, square, 1.0)), 0.0))
-    return off
+    frame: list[jax.Array] = []
+    plain_frame: list[jax.Array] = []
+    for gradient, plain in gradients:
+        rest, plain_rest = without(frame, gradient), without(plain_frame, plain)
+        square, plain_square = jnp.dot(rest, rest), jnp.dot(plain_rest, plain_rest)
+        independent = (plain_square > 1e-24 * jnp.dot(plain, plain)) & (plain_square > 0.0) & (square > 0.0)
+        frame.append(_unit(rest, square, independent))
+        plain_frame.append(_unit(plain_rest, plain_square, independent))
+    return lambda v: without(frame, v)
+
+
+def _unit(v, square, usable):
+    """``v / |v|``, or 0 where that cannot be used."""
+    return v * jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))
