@@ -21,6 +21,7 @@ from .dissipation import (
     KillingDissipation,
     ProjectedMetric,
 )
+from .each import Each
 from .energy import Energy, Function, Quadratic
 from .ensembles import Ensemble, ensemble
 from .errors import (
@@ -38,6 +39,7 @@ from .errors import (
 )
 from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
+from .graph_files import Graph, read_graph
 from .integrators import (
     DiscreteHerglotz,
     MetriplecticGauss,
@@ -52,6 +54,7 @@ from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
     ComposedSystem,
     ContactSystem,
+    Copies,
     EulerPoincareSystem,
     EvolutionSystem,
     Herglotz,
@@ -72,10 +75,12 @@ __all__ = [
     "ContactSystem",
     "ConvergenceError",
     "CoordinateIncrement",
+    "Copies",
     "DiscreteGradient",
     "DiscreteHerglotz",
     "Dissipation",
     "DoubleBracket",
+    "Each",
     "Energy",
     "Ensemble",
     "EulerPoincareForce",
@@ -87,6 +92,7 @@ __all__ = [
     "Function",
     "FunctionError",
     "Gonzalez",
+    "Graph",
     "Herglotz",
     "IndefiniteError",
     "InnerProductDissipation",
@@ -120,6 +126,7 @@ __all__ = [
     "load",
     "models",
     "plot",
+    "read_graph",
     "registered_methods",
     "suggest_step",
 ]

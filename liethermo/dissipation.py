@@ -16,12 +16,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
 
 from .energy import Energy, as_energy
 from .errors import IndefiniteError, InputError
+from .indices import union
 
 if TYPE_CHECKING:
     from .systems import System
@@ -52,6 +54,14 @@ class Dissipation(eqx.Module):
     def symmetric(self) -> bool:
         """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
         return True
+
+    def couplings(self, system: System) -> scipy.sparse.csr_array | None:
+        """Which components of the force depend on which components of the state and of the gradients it is handed.
+
+        A pattern, shape (n, n), for systems too large for a full Jacobian matrix; None where it is not known.
+        """
+        del system
+        return None
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -111,6 +121,9 @@ class Several(Dissipation):
     @property
     def symmetric(self) -> bool:
         return all(part.symmetric for part in self.parts)
+
+    def couplings(self, system):
+        return union(part.couplings(system) for part in self.parts)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:

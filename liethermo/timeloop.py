@@ -18,6 +18,7 @@ import numpy as np
 from .engine import array, compiled
 from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
+from .engine.sparse import SparseEngine
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
 from .progress import Progress
@@ -32,6 +33,9 @@ SMALL_DIM = 8
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
+
+SPARSE_DIM = 200
+"""Components from which a system that knows its sparsity is solved by it."""
 
 COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
@@ -55,7 +59,7 @@ def integrate(
     save_at=None,
     until: Relaxed | Callable | None = None,
     dense: bool = False,
-    engine: Literal["auto", "array", "compiled"] = "auto",
+    engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
     save_to: str | os.PathLike | None = None,
@@ -82,11 +86,12 @@ def integrate(
         and the status tell whether it happened.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
-    engine : {"auto", "array", "compiled"}
+    engine : {"auto", "array", "compiled", "sparse"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
         components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
-        uses what cannot be compiled.
+        uses what cannot be compiled. "sparse" solves stiff steps of large systems with sparse matrices; "auto" takes it
+        from 200 components on, where the system knows which of its components act on which (networks do).
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -114,7 +119,7 @@ def integrate(
         raise InputError(
             f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
         )
-    check_choice("engine", engine, ("auto", "array", "compiled"))
+    check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
     if isinstance(method, OneStepMethod):
         method.check(system)
@@ -161,8 +166,30 @@ class _Run:
         self.dense: Dense | None = None
         wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
         small = system.unrollable and system.dim <= wanted and jax.default_backend() == "cpu"
-        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
+        self.engine = ("compiled" if small else "array") if engine == "auto" else engine
+        self.sparse: SparseEngine | None = None
+        if engine == "sparse" or (engine == "auto" and system.dim >= SPARSE_DIM):
+            self.sparse = self._sparse(needed=engine == "sparse")
         self.fallback = engine == "auto"
+
+    def _sparse(self, needed: bool) -> SparseEngine | None:
+        """The sparse engine, where the system and the method can have it."""
+        if not isinstance(self.method, OneStepMethod):
+            return None
+        if self.system.sparsity() is None:
+            if needed:
+                raise InputError(
+                    f"the sparse engine cannot run a {type(self.system).__name__} that does not know its sparsity: a "
+                    "ComposedSystem of lt.Copies joined by lt.Each does"
+                )
+            return None
+        self.engine = "sparse"
+        return SparseEngine(self.system, self.method)
+
+    @property
+    def _driver(self) -> Any:
+        """The engine."""
+        return self.sparse or (compiled if self.engine == "compiled" else array)
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -215,8 +242,7 @@ class _Run:
             self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-        engine = compiled if self.engine == "compiled" else array
-        outcome = run_stepwise(self.system, self.method, engine, state, (start, end), step, stops, event, keep)
+        outcome = run_stepwise(self.system, self.method, self._driver, state, (start, end), step, stops, event, keep)
         if last is not None:
             self._append(*last)
         self.event_time = outcome.event_time
@@ -262,8 +288,7 @@ class _Run:
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
-        engine = compiled if self.engine == "compiled" else array
-        state, (x, energy, entropy, reached) = engine.advance(
+        state, (x, energy, entropy, reached) = self._driver.advance(
             self.system, self.method, state, h, saves, every, capacity
         )
         kept = int(np.asarray(reached).sum())

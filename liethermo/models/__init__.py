@@ -6,6 +6,7 @@ A function ``model_solution`` beside a model, in its module, is the exact soluti
 from __future__ import annotations
 
 from .gas_piston import gas_piston
+from .heat_grid import heat_grid
 from .oscillator import damped_oscillator
 from .rigid_body import free_rigid_body, rigid_body
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
@@ -15,6 +16,7 @@ __all__ = [
     "damped_oscillator",
     "free_rigid_body",
     "gas_piston",
+    "heat_grid",
     "moving_thermo_particles",
     "rigid_body",
     "thermo_particles",

@@ -1,7 +1,8 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
 from .base import System
-from .composed import ComposedSystem, Subsystem
+from .bodies import Copies, Subsystem
+from .composed import ComposedSystem
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
@@ -11,6 +12,7 @@ from .metriplectic import MetriplecticSystem
 __all__ = [
     "ComposedSystem",
     "ContactSystem",
+    "Copies",
     "EulerPoincareSystem",
     "EvolutionSystem",
     "Herglotz",

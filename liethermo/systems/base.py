@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
@@ -82,6 +83,20 @@ class System(eqx.Module):
     def unrollable(self) -> bool:
         """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
         return True
+
+    def sparsity(self) -> scipy.sparse.csr_array | None:
+        """Which components of the field depend on which of the state, discrete gradients included; None if not known.
+
+        A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
+        """
+        return None
+
+    def weights(self, x) -> jax.Array:
+        """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
+
+        Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
+        """
+        return jnp.ones_like(x)
 
     # -- dynamics -------------------------------------------------------------------------------------------------
 
