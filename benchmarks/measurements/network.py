@@ -66,7 +66,7 @@ def child(graph: str, nodes: str, h: str) -> dict:
     """The part that runs in a process of its own."""
     matrix = _graph(graph, int(nodes))
     count = matrix.shape[0]
-    system = lt.models.thermo_particles(np.ones(count), matrix)
+    system = lt.models.thermo_particles([1.0] * count, matrix)
     x0 = np.log(np.random.default_rng(0).uniform(250.0, 350.0, count))
     work = functools.partial(
         lt.integrate, system, x0, (0.0, STEPS * float(h)), float(h), save_every=STEPS, engine="sparse"

@@ -122,8 +122,9 @@ class Inverse:
         rowwise = scipy.sparse.csr_array(scaling @ matrix)
 
         def iterate(b):
-            x, _ = scipy.sparse.linalg.bicgstab(rowwise, scaling @ b, rtol=KRYLOV, maxiter=KRYLOV_LIMIT)
-            return x
+            size = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
+            x, _ = scipy.sparse.linalg.bicgstab(rowwise, scaling @ b / size, rtol=KRYLOV, maxiter=KRYLOV_LIMIT)
+            return size * x
 
         self._solve = iterate
 

@@ -70,7 +70,9 @@ def all_of(energy, x, d, k):
     return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in GRADIENTS.values()), stages]
 
 
-@pytest.mark.parametrize("run", [True, False], ids=["in order", "anywhere"])
+@pytest.mark.parametrize(
+    "run", [pytest.param(True, marks=pytest.mark.slow, id="in order"), pytest.param(False, id="anywhere")]
+)
 def test_each_is_the_sum_of_its_summands(run):
     """In value, gradients and all discrete gradients, also where summands share components."""
     rng = np.random.default_rng(3)
@@ -140,7 +142,9 @@ def warm_of_one(y):
 # -- sparse Jacobian matrices -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)], ids=str)
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
+)
 def test_the_compressed_jacobian_is_the_jacobian(method):
     """With a hub that is found by pulling back; and every entry of the pattern is one that can occur."""
     n, h = 12, 0.1
@@ -202,7 +206,9 @@ def grid_laplacian(shape):
 # -- the sparse engine ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("h", [0.05, 2.0], ids=["fixed point", "Newton"])
+@pytest.mark.parametrize(
+    "h", [pytest.param(0.05, marks=pytest.mark.slow, id="fixed point"), pytest.param(2.0, id="Newton")]
+)
 def test_the_engines_agree(h):
     """On a network with everything in it, by either way to solve a step."""
     system, x0 = network(), random_state(6)
@@ -223,6 +229,7 @@ def test_krylov_iteration_solves_the_same_steps(monkeypatch):
     assert_both_laws(krylov)
 
 
+@pytest.mark.slow
 def test_other_ways_to_run_it():
     """Adaptive steps, outputs at given times, an event; steps saved now and then."""
     system, x0 = network(), random_state(6)
@@ -232,11 +239,8 @@ def test_other_ways_to_run_it():
     assert_both_laws(adaptive)
 
 
-def test_which_engine_runs():
-    """From 200 components on the sparse one, where the sparsity is known; asked for in vain, an error says why."""
-    grid = lt.models.heat_grid((15, 15))
-    solution = lt.integrate(grid, np.full(225, 5.0), (0.0, 0.1), 0.1)
-    assert solution.provenance["engine"] == "sparse"
+def test_the_sparse_engine_needs_a_sparsity():
+    """The sparse one, asked for where the sparsity is not known: an error says why."""
     bodies = [lt.Subsystem(lambda x: jnp.exp(x[0]), 1) for _ in range(2)]
     coupled = lt.ComposedSystem(bodies, lt.Function(lambda y: y[0] ** 2).on(lambda x: x[:1] - x[1:]), 1.0)
     assert coupled.sparsity() is None
@@ -287,6 +291,7 @@ def test_heat_grid():
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (np.abs(slopes - 2.0) < 0.2).all(), errors
     _, stiff = heat_run((20, 20), 1000.0, 5)
+    assert stiff.provenance["engine"] == "sparse"  # from 200 components on
     assert stiff.stats.newton_iterations > 0
     assert_both_laws(stiff)
 
@@ -302,6 +307,7 @@ def test_a_hundred_thousand_nodes(shape, h):
     assert solution.stats.wall_time < 240.0
 
 
+@pytest.mark.slow
 def test_a_large_chain():
     """The N-body chain with 70 springs: angular momentum too, by the sparse engine."""
     chain = lt.models.thermoelastic_chain(70, 2, stiffness=20.0, expansion=2.0)
@@ -418,13 +424,16 @@ def test_a_graphml_file(tmp_path):
         lt.read_graph(written(tmp_path, bare, "g.graphml"))
 
 
+def particles(conductance):
+    return lt.ComposedSystem(lt.Copies(6, warm, 1, np.ones(6), name="node"), conductance=conductance)
+
+
 def test_a_network_that_falls_apart():
     with pytest.raises(lt.InputError, match=r"3 parts that exchange no heat.*node 0 and node 1.*connected=False"):
-        pairs = [(0, 1, 1.0), (2, 3, 1.0), (4, 5, 1.0)]
-        lt.ComposedSystem(lt.Copies(6, warm, 1, np.ones(6), name="node"), conductance=pairs)
+        particles([(0, 1, 1.0), (2, 3, 1.0), (4, 5, 1.0)])
     lopsided = grid_graph((6,)).tolil()
     lopsided[0, 1] = 2.0
     with pytest.raises(lt.InputError, match=r"not symmetric.*by 1"):
-        lt.ComposedSystem(lt.Copies(6, warm, 1, np.ones(6)), conductance=lopsided.tocsr())
-    with pytest.raises(lt.InputError, match="between body 0 and body 1 is -1"):
-        lt.ComposedSystem(lt.Copies(6, warm, 1, np.ones(6)), conductance=-1.0 * grid_graph((6,)))
+        particles(lopsided.tocsr())
+    with pytest.raises(lt.InputError, match="between node 0 and node 1 is -1"):
+        particles(-1.0 * grid_graph((6,)))
