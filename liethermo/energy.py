@@ -27,6 +27,9 @@ from .indices import cliques, pattern, union
 if TYPE_CHECKING:
     from .gradients import DiscreteGradient, Path
 
+LARGEST_CLIQUE = 2_000
+"""Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
+
 COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
@@ -215,7 +218,9 @@ class Pullback(Energy):
         return back(self.term.stage_gradients(scheme, path))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        return None if self.function is not None else cliques([np.array(self.indices) % dim], dim)
+        if self.function is not None or len(self.indices) > LARGEST_CLIQUE:
+            return None
+        return cliques([np.array(self.indices) % dim], dim)
 
     def check_places(self, dim: int, role: str) -> None:
         _check_coordinates(self, dim, role)

@@ -37,6 +37,9 @@ COMPILED_DIM = 40
 SPARSE_DIM = 200
 """Components from which a system that knows its sparsity is solved by it."""
 
+MOST_LISTED = 1_000
+"""Components up to which the first state is listed in the provenance; an attribute of a file cannot be of any size."""
+
 COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
 
@@ -198,6 +201,8 @@ class _Run:
         every = self.table.every or 1
         saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
+        if self.sparse is not None:
+            capacity = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
         state, interrupted = None, False
         self.values = [self._energies(self.states[0])]
         try:
@@ -401,7 +406,7 @@ class _Run:
             "step": self.step if isinstance(self.step, float) else dataclasses.asdict(self.step),
             "t_span": [self.table.start, self.table.end],
             "save_every": self.table.every,
-            "x0": np.asarray(self.states[0][0]).tolist(),
+            "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,
             "system": type(self.system).__name__,
             "algebra": None if algebra is None else algebra.name,
             "dissipation": None if self.system.dissipation is None else type(self.system.dissipation).__name__,

@@ -61,6 +61,7 @@ def test_the_ideal_gas():
 # -- the figures of the paper -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_figures_1_and_2():
     """(39) from (0, 10, 0): q to second order, S too, both laws; the errors that the figures show."""
     errors = []
@@ -85,6 +86,7 @@ def test_figures_3_and_4():
     assert solution.entropy[[0, -1]] == pytest.approx([np.log(273.15 * 300.0), 2 * np.log(286.575)], rel=1e-15)
 
 
+@pytest.mark.slow
 def test_figures_5_and_6():
     """(42) from q = 0, 1: the path to first order; the energy oscillates and settles 1.7 % below where it began."""
 
@@ -122,6 +124,7 @@ def test_moving_particles():
     assert np.abs(system.entropies(solution.x) - at_rest.x).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_thermo_springs():
     """Without friction the spring swings as if cold; with drag it stops, and all its energy is heat, shared evenly."""
     x0 = [1.0, 0.0, 0.0, -1.0, 0.0, 0.5]
@@ -137,6 +140,7 @@ def test_thermo_springs():
     assert "momentum" not in lt.models.thermo_springs(friction=0.1).momentum_maps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moles", [(1.0, 2.0)])
 def test_gas_piston(moles):
     """It comes to the equilibrium of the closed form: one pressure, one temperature."""
@@ -152,9 +156,8 @@ def test_gas_piston(moles):
     assert report.passed, f"\n{report}"
 
 
-@pytest.mark.parametrize(
-    "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)], ids=str)
 def test_thermoelastic_chain(method):
     """Both laws and the angular momentum to rounding; heat flows and the springs calm down."""
     chain = lt.models.thermoelastic_chain(2, 2, stiffness=20.0, expansion=2.0, conductance=1.0)
@@ -167,6 +170,7 @@ def test_thermoelastic_chain(method):
     assert solution.entropy[-1] > solution.entropy[0] + 1e-3
 
 
+@pytest.mark.slow
 def test_a_thermospring():
     """``T = e_S``; slack and without entropy at its own length and temperature; tension as the docstring says."""
     chain = lt.models.thermoelastic_chain(1, 1, stiffness=3.0, expansion=0.4, capacity=2.0, length=1.5, temperature=4.0)
