@@ -27,8 +27,9 @@ from .stepwise import run as run_stepwise
 from .systems import System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
-SMALL_DIM = 8
-"""Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
+SMALL_DIM, SMALL_PROGRAM = 8, 1500
+"""Components of a state and operations of a step up to which numba compiles it about as fast as XLA does (5 s), so that
+"auto" always takes it. Beyond, its time grows as their square: half a minute for 2,700 operations."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
@@ -78,14 +79,14 @@ def integrate(
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
         Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
-        located to rounding on the collocation polynomial, reached by a step that ends there. ``solution.event_time``
+        located to rounding by a step that ends there. ``solution.event_time``
         and the status tell whether it happened.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
-        components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
+        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
         uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
@@ -249,13 +250,21 @@ class _Run:
         x = self.states[0][0]
         if self.engine == "compiled":
             try:
-                return compiled.begin(self.system, self.method, x)
+                if self._affordable():
+                    return compiled.begin(self.system, self.method, x)
+                self.engine = "array"
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
                 warn_of_fallback(error, stacklevel=6)
                 self.engine = "array"
         return array.begin(self.system, self.method, x)
+
+    def _affordable(self) -> bool:
+        """Whether to compile: where it was asked for, where it is quick, or where a long run repays it."""
+        if not self.fallback or self.table.steps >= COMPILED_STEPS:
+            return True
+        return compiled.stepper_for(self.system, self.method)[0].operations <= SMALL_PROGRAM
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
