@@ -86,8 +86,8 @@ def integrate(
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
-        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
-        uses what cannot be compiled.
+        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
+        with a warning, where the system uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.

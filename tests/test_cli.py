@@ -295,7 +295,8 @@ REFUSALS = {
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
         [
-            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", "Reference" (did you mean Reference?)'
+            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", "Reference" '
+            "(did you mean Reference?)"
         ],
     ),
     "option of a method": (

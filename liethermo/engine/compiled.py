@@ -291,7 +291,7 @@ class Stepper:
         return "\n".join(lines) + "\n\n\n" + _template()
 
     def _derivative_programs(self, newton: bool) -> tuple[dict[str, list[str]], int]:
-        """The functions that Newton's method needs, empty where it is not wanted; the length of what the first hands on."""
+        """The functions of Newton's method, empty where it is not wanted; the length of what the first hands on."""
         first, second = "linearise(p, w, l, linear)", "along(p, w, l, linear, direction, change)"
         if not newton:
             return {first: ["pass"], second: ["pass"]}, 1

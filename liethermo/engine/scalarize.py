@@ -176,7 +176,7 @@ class Program:
                 "select",
                 "max",
                 "min",
-            ):  # run by Python, a result that is a plain float could not divide by zero
+            ):  # a plain float could not divide by zero in Python
                 args = [f"np.float64({t})" if isinstance(a, float) else t for a, t in zip(i.args, args, strict=True)]
             return f"{prefix}{i.target} = {OPERATIONS[i.op].format(*args)}"
 

@@ -267,8 +267,8 @@ def take_step(p, w, matrix, order, b, linear, direction):
 def advance(p, blocks, done, saves, every, out, most):
     """Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept, with its energies.
 
-    No further than ``most`` steps, or to where a block needs Newton's method and the module has none: the number of that
-    block is returned, and another call, with a module that has, goes on there; otherwise the number of blocks.
+    No further than ``most`` steps, or to where a block needs Newton's method and the module has none: the number of
+    that block is returned, and another call, with a module that has, goes on there; otherwise the number of blocks.
     """
     matrix, order, b = np.empty((M, M)), np.empty(M, np.int64), np.empty(M)
     linear, direction = np.empty(LINEAR), np.empty(M)
