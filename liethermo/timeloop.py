@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import os
 import time
 import warnings
@@ -17,6 +18,7 @@ import numpy as np
 
 from .engine import array, compiled
 from .engine.interpret import at_points
+from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
@@ -117,8 +119,7 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    if isinstance(method, OneStepMethod):
-        method.check(system)
+    _prepared(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -346,7 +347,7 @@ class _Run:
         """What there is so far."""
         system = self.system
         x = np.concatenate(self.states)
-        invariants = system.invariants()
+        invariants, laws = _prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
         return Solution(
@@ -357,7 +358,7 @@ class _Run:
             casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=laws_of(system, self.method, invariants),
+            laws=laws,
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
@@ -400,6 +401,15 @@ def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
     warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
 
 
+@remembered
+def _prepared(system: System, method) -> tuple[dict, Laws]:
+    """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    invariants = system.invariants()
+    return invariants, laws_of(system, method, invariants)
+
+
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
@@ -434,6 +444,7 @@ def _power_of_two(n: int) -> int:
     return 1 << max(0, n - 1).bit_length()
 
 
+@functools.cache
 def _version() -> str:
     try:
         return metadata.version("liethermo")

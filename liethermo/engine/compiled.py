@@ -33,6 +33,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from . import array, step_loop
 from .array import State
+from .remembered import fingerprint, remembered
 from .scalarize import Program, scalarize
 
 VECTORS = {"x": "X", "low": "LOW", "k": "K", "before": "BEFORE"}
@@ -207,7 +208,8 @@ class Stepper:
 
         def fill(first, values):
             rows = np.asarray(values, dtype=np.float64).reshape(number, -1)
-            rows = np.concatenate([rows, np.repeat(rows[-1:], count * lanes - number, axis=0)])  # some lanes stay empty
+            if number < count * lanes:  # some lanes stay empty
+                rows = np.concatenate([rows, np.repeat(rows[-1:], count * lanes - number, axis=0)])
             blocks[:, first : first + rows.shape[1]] = rows.reshape(count, lanes, -1).swapaxes(1, 2)
 
         for name, row in {**VECTORS, **NUMBERS}.items():
@@ -388,7 +390,10 @@ def stepper_of(
     """
     varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
     known = (parameters == 0.0) & ~varies
-    key = (form.key, form.shapes, known.tobytes(), method, lanes, varies.tobytes())
+    method_key = fingerprint(method)
+    if method_key is None:
+        return Stepper(form, parameters, method, lanes, varies)
+    key = (form.key, form.shapes, known.tobytes(), method_key, lanes, varies.tobytes())
     if key not in _steppers:
         while len(_steppers) >= STEPPERS:
             del _steppers[next(iter(_steppers))]
@@ -396,6 +401,7 @@ def stepper_of(
     return _steppers[key]
 
 
+@remembered
 def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndarray]:
     """The stepper for one trajectory of a system, and the system's parameters."""
     leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
