@@ -38,10 +38,29 @@ from .errors import (
 )
 from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import (
+    DiscreteHerglotz,
+    MetriplecticGauss,
+    MetriplecticMidpoint,
+    OneStepMethod,
+    Reference,
+    registered_methods,
+)
+from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
-from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
+from .systems import (
+    ComposedSystem,
+    ContactSystem,
+    EulerPoincareSystem,
+    EvolutionSystem,
+    Herglotz,
+    LiePoissonSystem,
+    MetriplecticSystem,
+    Subsystem,
+    System,
+    ThermodynamicHerglotz,
+)
 from .timeloop import integrate
 
 __all__ = [
@@ -49,26 +68,32 @@ __all__ = [
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ComposedSystem",
+    "ContactSystem",
     "ConvergenceError",
     "CoordinateIncrement",
     "DiscreteGradient",
+    "DiscreteHerglotz",
     "Dissipation",
     "DoubleBracket",
     "Energy",
     "Ensemble",
     "EulerPoincareForce",
     "EulerPoincareSystem",
+    "EvolutionSystem",
     "FileError",
     "FourBracket",
     "FrictionOperator",
     "Function",
     "FunctionError",
     "Gonzalez",
+    "Herglotz",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
     "IntegrationError",
     "KillingDissipation",
+    "Kinetic",
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
@@ -77,6 +102,7 @@ __all__ = [
     "MetriplecticSystem",
     "NonFiniteError",
     "OneStepMethod",
+    "Potential",
     "ProjectedMetric",
     "Quadratic",
     "Reference",
@@ -85,7 +111,9 @@ __all__ = [
     "SpecError",
     "Stats",
     "Status",
+    "Subsystem",
     "System",
+    "ThermodynamicHerglotz",
     "ensemble",
     "flow",
     "integrate",

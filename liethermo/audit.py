@@ -103,6 +103,8 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     drift = max(highest - first, first - lowest) / scale
     if laws.energy == "conserved":
         rows.append(_verdict("energy drift", drift, tolerances.energy))
+    elif laws.energy is None:
+        rows.append(AuditRow("energy drift", drift, None, None, "no law promised"))
     else:
         increments = [*np.diff(solution.energy), _or(stats.largest_energy_increment, -np.inf)]
         risen = float(max(increments)) / scale

@@ -92,7 +92,7 @@ class Stats:
 class Laws:
     """What the system promises: the law of the energy, of the entropy, and the functions it conserves."""
 
-    energy: str = "conserved"
+    energy: str | None = "conserved"
     entropy: str | None = None
     conserved: tuple[str, ...] = ()
 

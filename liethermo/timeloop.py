@@ -125,7 +125,10 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    run = _Run(system, method, system.state(x0), table, save_to, engine)
+    x = system.state(x0)
+    if reason := system.outside(x):
+        raise InputError(f"the run cannot start at this x0: {reason}")
+    run = _Run(system, method, x, table, save_to, engine)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
@@ -304,7 +307,9 @@ class _Run:
         for name, function in suspects.items():
             if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
                 return f"the {name} first, near x = {np.array2string(np.asarray(ahead), precision=4, threshold=8)}"
-        return "the iteration overflowed"
+        return (
+            system.outside(ahead) or f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
+        )
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
 

@@ -293,7 +293,7 @@ def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
     back = new - x
     new_low = (x - (new - back)) + (increment - back)
     energy, entropy = values(system, new)
-    if system.energy_law == "conserved":
+    if system.energy_law == "conserved" and "energy" in method.preserves:
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
     return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy
 

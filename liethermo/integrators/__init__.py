@@ -2,6 +2,7 @@
 
 from .base import OneStepMethod, registered_methods
 from .gauss import MetriplecticGauss
+from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
 from .reference import Reference
 
@@ -10,4 +11,12 @@ METHODS: dict[str, type] = {type(method).__name__: type(method) for method in re
 }
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""
 
-__all__ = ["METHODS", "MetriplecticGauss", "MetriplecticMidpoint", "OneStepMethod", "Reference", "registered_methods"]
+__all__ = [
+    "METHODS",
+    "DiscreteHerglotz",
+    "MetriplecticGauss",
+    "MetriplecticMidpoint",
+    "OneStepMethod",
+    "Reference",
+    "registered_methods",
+]

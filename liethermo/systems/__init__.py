@@ -1,8 +1,23 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
 from .base import System
+from .composed import ComposedSystem, Subsystem
 from .euler_poincare import EulerPoincareSystem, Legendre
+from .evolution import ContactSystem, EvolutionSystem
+from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
 
-__all__ = ["EulerPoincareSystem", "Legendre", "LiePoissonSystem", "MetriplecticSystem", "System"]
+__all__ = [
+    "ComposedSystem",
+    "ContactSystem",
+    "EulerPoincareSystem",
+    "EvolutionSystem",
+    "Herglotz",
+    "Legendre",
+    "LiePoissonSystem",
+    "MetriplecticSystem",
+    "Subsystem",
+    "System",
+    "ThermodynamicHerglotz",
+]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -43,6 +44,10 @@ class System(eqx.Module):
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
     dim: int = eqx.field(static=True)
+
+    production_name: ClassVar[str] = "dS/dt"
+    domain: ClassVar[str] = ""
+    """What a state of the system has to have beyond finite components, in words."""
 
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
@@ -114,8 +119,8 @@ class System(eqx.Module):
         return () if self.dissipation is None else self.dissipation.preserve
 
     @property
-    def energy_law(self) -> Law:
-        """ "conserved", or "nonincreasing" under double-bracket dissipation."""
+    def energy_law(self) -> Law | None:
+        """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
         return "conserved" if self.dissipation is None else self.dissipation.energy_law
 
     @property
@@ -197,6 +202,16 @@ class System(eqx.Module):
             ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
         """
         return check_system(self, points, samples, seed, scale)
+
+    def outside(self, x) -> str:
+        """Why a state lies outside the domain of the system, in words; empty where it does not."""
+        del x
+        return ""
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
+        del x
+        return {}
 
     def _validate(self) -> None:
         """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""
