@@ -52,12 +52,22 @@ class OneStepMethod(eqx.Module):
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
 
+    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+        """The derivative of ``slopes - k`` by k for Newton's method, shape (stages * n, stages * n)."""
+        misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
+        return jax.jacfwd(misfit)(k.ravel())
+
     @abstractmethod
     def increment(self, h, k) -> jax.Array:
         """``x' - x``, shape (n,), from the solved slopes."""
 
     def check(self, system: System) -> None:
         """Raise InputError where the method cannot be used on a system; called when a run starts."""
+
+    def explain(self, system: System, x, k, h) -> str:
+        """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
+        del system, x, k, h
+        return ""
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
