@@ -40,10 +40,12 @@ from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .integrators import (
     DiscreteHerglotz,
+    FiniteDifference,
     MetriplecticGauss,
     MetriplecticMidpoint,
     OneStepMethod,
     Reference,
+    VariationalIntegrator,
     registered_methods,
 )
 from .mechanics import Kinetic, Potential
@@ -57,6 +59,7 @@ from .systems import (
     Herglotz,
     LiePoissonSystem,
     MetriplecticSystem,
+    SimpleClosedSystem,
     Subsystem,
     System,
     ThermodynamicHerglotz,
@@ -82,6 +85,7 @@ __all__ = [
     "EulerPoincareSystem",
     "EvolutionSystem",
     "FileError",
+    "FiniteDifference",
     "FourBracket",
     "FrictionOperator",
     "Function",
@@ -107,6 +111,7 @@ __all__ = [
     "Quadratic",
     "Reference",
     "Relaxed",
+    "SimpleClosedSystem",
     "Solution",
     "SpecError",
     "Stats",
@@ -114,6 +119,7 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "VariationalIntegrator",
     "ensemble",
     "flow",
     "integrate",

@@ -311,6 +311,10 @@ class _Run:
         """Which function is not finite just ahead of the last good state."""
         ahead = jnp.asarray(state.x) + self.table.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
         system = self.system
+        if isinstance(self.method, OneStepMethod) and (
+            reason := self.method.explain(system, state.x, state.k, self.table.h)
+        ):
+            return reason
         suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}
         if system.entropy is not None:
             suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
@@ -360,7 +364,10 @@ class _Run:
             x=x,
             energy=energy,
             entropy=None if system.entropy is None else entropy,
-            casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
+            casimirs={
+                name: at_points(_value, function, x)
+                for name, function in {**{name: f for name, (f, _) in invariants.items()}, **system.ledger}.items()
+            },
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=laws,
@@ -418,7 +425,7 @@ def _prepared(system: System, method) -> tuple[dict, Laws]:
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
-    return Laws(system.energy_law, system.entropy_law, conserved)
+    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger))
 
 
 def _value(function, x):

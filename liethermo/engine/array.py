@@ -85,8 +85,11 @@ class _Iteration(NamedTuple):
         return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
-    """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
+def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable) -> Solved:
+    """Solve ``k = slopes(k)`` from ``guess``.
+
+    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``.
+    """
 
     def fixed_point_goes_on(s: _Iteration):
         slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
@@ -107,7 +110,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        inverse = _inverse(jax.jacfwd(flat)(s.k.ravel()))
+        inverse = _inverse(jacobian(s.k))
 
         def reuse(carry):
             inner, _ = carry
@@ -201,7 +204,12 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def scale(k):
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
-    solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale)
+    solved = solve_stages(
+        lambda k: method.slopes(system, x, low, h, k),
+        method.predict(state.k, state.before),
+        scale,
+        lambda k: method.jacobian(system, x, low, h, k),
+    )
     new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)

@@ -138,7 +138,7 @@ class Stepper:
             return new, jnp.max(jnp.abs(new - k)), jnp.max(jnp.abs(new))
 
         def along(p, x, low, h, k, direction):
-            return jax.jvp(lambda k: method.slopes(rebuilt(p), x, low, h[0], k) - k, (k,), (direction,))[1]
+            return method.change(rebuilt(p), x, low, h[0], k, direction)
 
         def finish(p, x, low, h, k, first_energy):
             return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])

@@ -59,7 +59,8 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
     if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
         return math.inf  # a function that closes over what is being traced
     try:
-        return scalarize(closed, limit=LIMIT).degree(len(leaves))
+        with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+            return scalarize(closed, limit=LIMIT).degree(len(leaves))
     except UnsupportedPrimitive:
         return math.inf
 

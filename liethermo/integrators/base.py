@@ -52,12 +52,26 @@ class OneStepMethod(eqx.Module):
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
 
+    def change(self, system: System, x, low, h, k, d) -> jax.Array:
+        """The derivative of ``slopes - k`` by k in the direction d, shape (stages, n), for Newton's method."""
+        return jax.jvp(lambda k: self.slopes(system, x, low, h, k) - k, (k,), (d,))[1]
+
+    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+        """The matrix of :meth:`change`, shape (stages * n, stages * n)."""
+        columns = jax.vmap(lambda d: self.change(system, x, low, h, k, d.reshape(k.shape)).ravel())(jnp.eye(k.size))
+        return columns.T
+
     @abstractmethod
     def increment(self, h, k) -> jax.Array:
         """``x' - x``, shape (n,), from the solved slopes."""
 
     def check(self, system: System) -> None:
         """Raise InputError where the method cannot be used on a system; called when a run starts."""
+
+    def explain(self, system: System, x, k, h) -> str:
+        """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
+        del system, x, k, h
+        return ""
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""

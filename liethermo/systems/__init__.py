@@ -7,6 +7,7 @@ from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
+from .simple_closed import SimpleClosedSystem
 
 __all__ = [
     "ComposedSystem",
@@ -17,6 +18,7 @@ __all__ = [
     "Legendre",
     "LiePoissonSystem",
     "MetriplecticSystem",
+    "SimpleClosedSystem",
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",

@@ -153,6 +153,11 @@ class System(eqx.Module):
             for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
         ]
 
+    @property
+    def ledger(self) -> dict[str, Energy]:
+        """What the system receives from outside, recorded along a run, by name."""
+        return {}
+
     def _casimirs(self) -> dict[str, Energy]:
         """Casimirs of the Poisson structure worth recording."""
         return {}
