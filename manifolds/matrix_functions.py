@@ -66,6 +66,14 @@ def cayley(algebra: LieAlgebra, x) -> jax.Array:
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None, None], g, jnp.nan)
 
 
+def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
+    """``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
+    identity = jnp.eye(g.shape[-1])
+    x = algebra.vee(2 * solve(g + identity, g - identity))
+    condition = largest(g + identity) * largest(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
+    return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None], x, jnp.nan)
+
+
 def log(algebra: LieAlgebra, g) -> jax.Array:
     """Principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
 
@@ -96,6 +104,22 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
     x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
     return jnp.where(converged[..., None], x, jnp.nan)
+
+
+def polar(a) -> jax.Array:
+    """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
+    adjoint = a.conj().swapaxes(-1, -2)
+    root, success = _square_root(adjoint @ a)
+    u = solve(root, adjoint).conj().swapaxes(-1, -2)
+    for _ in range(2):  # the root squares the condition number of a
+        u = orthonormalized(u)
+    success &= largest(u.conj().swapaxes(-1, -2) @ u - jnp.eye(a.shape[-1])) < 1e-12
+    return jnp.where(success[..., None, None], u, jnp.nan)
+
+
+def orthonormalized(u) -> jax.Array:
+    """One step of Newton and Schulz towards :func:`polar`: it squares the distance of ``u^H u`` from I."""
+    return 1.5 * u - 0.5 * u @ (u.conj().swapaxes(-1, -2) @ u)
 
 
 def _square_root(a):
