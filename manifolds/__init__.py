@@ -1,4 +1,4 @@
-"""Geometry for thermodynamic integrators: Lie algebras, their groups, Casimirs and Poisson structures.
+"""Geometry for thermodynamic integrators: Lie algebras and groups, Casimirs, Poisson structures, state spaces.
 
 Importing this package switches JAX to 64-bit floating point: the laws are kept to rounding, and single precision would
 round them away.
@@ -31,9 +31,11 @@ from .errors import (  # noqa: E402
     JacobiError,
     LieAlgebraError,
     ManifoldsError,
+    OffManifoldError,
     ParameterError,
     RepresentationError,
     ShapeError,
+    SpaceError,
 )
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
 from .lie_group import (  # noqa: E402
@@ -49,19 +51,38 @@ from .lie_group import (  # noqa: E402
 )
 from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
 from .polynomial import Polynomial  # noqa: E402
+from .spaces import (  # noqa: E402
+    SPD,
+    Euclidean,
+    GroupSpace,
+    Hyperbolic,
+    Power,
+    Product,
+    Space,
+    SpecialEuclidean,
+    SpecialOrthogonal,
+    SpecialUnitary,
+    Sphere,
+    Stiefel,
+    registered_spaces,
+)
 
 __all__ = [
     "GL",
     "SE",
     "SL",
     "SO",
+    "SPD",
     "SU",
     "AntisymmetryError",
     "Canonical",
     "ClosureError",
     "ComponentError",
     "DomainError",
+    "Euclidean",
+    "GroupSpace",
     "Heisenberg",
+    "Hyperbolic",
     "JacobiError",
     "LieAlgebra",
     "LieAlgebraError",
@@ -69,13 +90,23 @@ __all__ = [
     "ManifoldsError",
     "MatrixGroup",
     "NoPolynomialCasimirWarning",
+    "OffManifoldError",
     "ParameterError",
     "PoissonStructure",
     "PoissonTensor",
     "Polynomial",
+    "Power",
+    "Product",
     "RepresentationError",
     "ShapeError",
     "Sp",
+    "Space",
+    "SpaceError",
+    "SpecialEuclidean",
+    "SpecialOrthogonal",
+    "SpecialUnitary",
+    "Sphere",
+    "Stiefel",
     "abelian",
     "aff",
     "bianchi",
@@ -85,6 +116,7 @@ __all__ = [
     "heisenberg",
     "registered",
     "registered_groups",
+    "registered_spaces",
     "se",
     "semidirect_sum",
     "sl",

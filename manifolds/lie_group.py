@@ -223,8 +223,13 @@ class MatrixGroup:
             If g is not in the group (not checked under tracing).
         """
         g = self._element(g, "g")
-        if not is_traced(g) and (index := first(~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE)))) is not None:
-            raise DomainError(f"Ad on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}")
+        if not is_traced(g):
+            with jax.ensure_compile_time_eval():  # g may be a constant in a program being traced
+                outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
+                if (index := first(outside)) is not None:
+                    raise DomainError(
+                        f"Ad on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
+                    )
         return _adjoint_action(self, g)
 
     def Ad_star(self, g, mu) -> jax.Array:

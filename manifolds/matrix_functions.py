@@ -122,6 +122,30 @@ def orthonormalized(u) -> jax.Array:
     return 1.5 * u - 0.5 * u @ (u.conj().swapaxes(-1, -2) @ u)
 
 
+def complement(u) -> jax.Array:
+    """Columns that complete the orthonormal ones of u, shape (..., n, p), to a basis, shape (..., n, n - p).
+
+    By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
+    """
+    n, p = u.shape[-2:]
+    axes, normals = jnp.eye(n), []
+
+    def reflect(a, normal):
+        normal = normal[..., :, None]
+        weights = (normal * a).sum(axis=-2, keepdims=True) * (2 / (normal**2).sum(axis=-2, keepdims=True))
+        return a - normal * weights
+
+    for k in range(p):
+        column = jnp.where(jnp.arange(n) < k, 0.0, u[..., :, k])
+        size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
+        normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
+        u = reflect(u, normals[-1])
+    rest = axes[:, p:]
+    for normal in reversed(normals):
+        rest = reflect(rest, normal)
+    return rest
+
+
 def _square_root(a):
     """Principal square root, and whether it converged: Denman and Beavers' iteration [Higham 2008, eq. 6.15].
 

@@ -47,7 +47,7 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
     """Eigenvalues, shape (..., n), in no order, and orthonormal eigenvectors, as columns: cyclic Jacobi rotations.
 
     Small eigenvalues come out more accurately than by reduction to tridiagonal form [Demmel & Veselic 1992]. NaN where
-    it has not converged. The eigenvectors have no derivative where eigenvalues meet: differentiate what is made of them.
+    it has not converged. The eigenvectors have no derivative where eigenvalues meet.
     """
     n = a.shape[-1]
     pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)

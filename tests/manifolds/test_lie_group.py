@@ -384,6 +384,14 @@ def test_adjoint_action_off_the_group():
         mf.SO(3).Ad([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
+def test_an_element_that_is_constant_in_a_compiled_program_is_checked_while_it_is_traced():
+    group, mu = mf.SO(3), np.array([1.0, 2.0, 3.0])
+    g, outside = group.exp([0.3, -0.2, 0.5]), 2 * group.identity
+    assert close(jax.jit(lambda mu: group.Ad_star(g, mu))(mu), group.Ad_star(g, mu), "member")
+    with pytest.raises(mf.DomainError, match="not in the group"):
+        jax.jit(lambda mu: group.Ad_star(outside, mu))(mu)
+
+
 def test_random_elements():
     group = mf.SU(2)
     g = group.random(3, (2, 5))
