@@ -37,6 +37,7 @@ from .errors import (  # noqa: E402
     ShapeError,
     SpaceError,
 )
+from .geomstats_bridge import GeomstatsSpace, from_geomstats  # noqa: E402
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
 from .lie_group import (  # noqa: E402
     GL,
@@ -51,6 +52,16 @@ from .lie_group import (  # noqa: E402
 )
 from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
 from .polynomial import Polynomial  # noqa: E402
+from .retraction import (  # noqa: E402
+    CayleyRetraction,
+    Chart,
+    EuclideanRetraction,
+    GroupRetraction,
+    MidpointRetraction,
+    Retraction,
+    RiemannianRetraction,
+    retraction,
+)
 from .spaces import (  # noqa: E402
     SPD,
     Euclidean,
@@ -76,10 +87,15 @@ __all__ = [
     "SU",
     "AntisymmetryError",
     "Canonical",
+    "CayleyRetraction",
+    "Chart",
     "ClosureError",
     "ComponentError",
     "DomainError",
     "Euclidean",
+    "EuclideanRetraction",
+    "GeomstatsSpace",
+    "GroupRetraction",
     "GroupSpace",
     "Heisenberg",
     "Hyperbolic",
@@ -89,6 +105,7 @@ __all__ = [
     "LiePoisson",
     "ManifoldsError",
     "MatrixGroup",
+    "MidpointRetraction",
     "NoPolynomialCasimirWarning",
     "OffManifoldError",
     "ParameterError",
@@ -98,6 +115,8 @@ __all__ = [
     "Power",
     "Product",
     "RepresentationError",
+    "Retraction",
+    "RiemannianRetraction",
     "ShapeError",
     "Sp",
     "Space",
@@ -111,12 +130,14 @@ __all__ = [
     "aff",
     "bianchi",
     "direct_sum",
+    "from_geomstats",
     "galilei",
     "gl",
     "heisenberg",
     "registered",
     "registered_groups",
     "registered_spaces",
+    "retraction",
     "se",
     "semidirect_sum",
     "sl",

@@ -65,6 +65,8 @@ class Space(ABC):
     """
 
     metric: str
+    bi_invariant: bool = False
+    """Whether the space is a group whose exponential is the Riemannian one."""
     dtype: np.dtype = np.dtype(np.float64)
 
     @property
@@ -130,7 +132,7 @@ class Space(ABC):
         key_or_seed : JAX random key, or int
         size : tuple of int
         """
-        return self._compiled("_random", _key(key_or_seed), static=(tuple(size),))
+        return self._compiled("_random", random_key(key_or_seed), static=(tuple(size),))
 
     # -- tangent vectors ------------------------------------------------------------------------------------------
 
@@ -142,7 +144,7 @@ class Space(ABC):
         """Random tangent vectors at x, their components in a frame normal with standard deviation ``scale``."""
         x = self._checked_point(x, "x")
         batch = x.shape[: x.ndim - len(self.shape)]
-        return self.from_coordinates(x, scale * jax.random.normal(_key(key_or_seed), (*batch, self.dim)))
+        return self.from_coordinates(x, scale * jax.random.normal(random_key(key_or_seed), (*batch, self.dim)))
 
     def frame(self, x) -> jax.Array:
         """An orthonormal basis of the tangent space at x, shape (..., dim, *shape)."""
@@ -309,9 +311,26 @@ class Space(ABC):
     def _reach(self, x, v):
         return self._norm(x, v) / self.injectivity_radius()
 
+    # What retractions other than the Riemannian one are made of, where a space has it.
+
     def _straight_reach(self, x, v):
         """Length of v over that up to which ``x + v`` is sure to stay in a space that is an open set of arrays."""
-        raise SpaceError(f"{self.name} is not an open part of a vector space: x + v leaves it")
+        raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
+
+    def _group_exp(self, x, v):
+        """``x exp(x^-1 v)``."""
+        raise SpaceError(f"{self.name} is not a group: it has no group exponential and no Cayley map")
+
+    def _group_log(self, x, y):
+        """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
+        return self._group_exp(x, y)  # raises
+
+    def _cayley(self, x, v):
+        """``x cayley(x^-1 v)``."""
+        return self._group_exp(x, v)  # raises
+
+    def _inverse_cayley(self, x, y):
+        return self._group_exp(x, y)  # raises
 
     def _why_no_log(self, x, y) -> str:
         """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
@@ -408,7 +427,7 @@ class Space(ABC):
         return jnp.expand_dims(v, -1 - len(self.shape))
 
     def _compiled(self, kernel: str, *arrays, static: tuple = ()):
-        return _run(self, kernel, static, *arrays)
+        return run(self, kernel, static, *arrays)
 
     def __repr__(self) -> str:
         return f"<{self.name}: dim {self.dim}, points of shape {self.shape}, {self.metric} metric>"
@@ -425,7 +444,7 @@ class Space(ABC):
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _run(space: Space, kernel: str, static: tuple, *arrays) -> Any:
+def run(space: Space, kernel: str, static: tuple, *arrays) -> Any:
     return getattr(space, kernel)(*arrays, *static)
 
 
@@ -435,5 +454,5 @@ def safe_sqrt(z):
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
 
 
-def _key(key_or_seed):
+def random_key(key_or_seed):
     return jax.random.key(key_or_seed) if isinstance(key_or_seed, int | np.integer) else key_or_seed

@@ -20,6 +20,7 @@ class Euclidean(Space):
 
     sizes: tuple[int, ...]
     metric = "flat"
+    bi_invariant = True
 
     def __init__(self, *sizes: int):
         object.__setattr__(self, "sizes", tuple(_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))
@@ -78,6 +79,19 @@ class Euclidean(Space):
 
     def _transport(self, x, v, u):
         return u + jnp.zeros_like(v)
+
+    def _group_exp(self, x, v):
+        return x + v
+
+    def _group_log(self, x, y):
+        return y - x
+
+    def _cayley(self, x, v):
+        """That of the translations, as matrices ``[[I, x], [0, 1]]``."""
+        return x + v
+
+    def _inverse_cayley(self, x, y):
+        return y - x
 
     def _straight_reach(self, x, v):
         return jnp.zeros(jnp.broadcast_shapes(x.shape, v.shape)[: -len(self.shape)])

@@ -63,6 +63,28 @@ class GroupSpace(Space):
     def _residual(self, x):
         return self.group.defect(x)
 
+    def _relative(self, x, y):
+        return self.group.inverse_map(x) @ y
+
+    def _group_exp(self, x, v):
+        return self._restored(x @ self.group.exp_map(self.group.algebra, self._velocity(x, v)))
+
+    def _group_log(self, x, y):
+        return self._from_velocity(x, _log(self.group, self._relative(x, y)))
+
+    def _cayley(self, x, v):
+        self.group._need_cayley()
+        assert self.group.cayley_map is not None
+        return self._restored(x @ self.group.cayley_map(self.group.algebra, self._velocity(x, v)))
+
+    def _inverse_cayley(self, x, y):
+        self.group._need_cayley()
+        return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative(x, y)))
+
+    def _restored(self, x):
+        """One Newton step to the group, so that rounding does not add up."""
+        raise NotImplementedError
+
 
 class BiInvariantSpace(GroupSpace):
     """Unitary matrices, with the inner product of components in the basis of the algebra.
@@ -71,9 +93,9 @@ class BiInvariantSpace(GroupSpace):
     """
 
     metric = "bi-invariant"
+    bi_invariant = True
 
     def _restored(self, x):
-        """One Newton step to the group, so that rounding does not add up."""
         return orthonormalized(x)
 
     def _project_tangent(self, x, w):
@@ -96,18 +118,18 @@ class BiInvariantSpace(GroupSpace):
         return v.conj() / (np.abs(basis[0]) ** 2).sum()  # orthogonal matrices, all of this norm
 
     def _exp(self, x, v):
-        return self._restored(x @ self.group.exp_map(self.group.algebra, self._velocity(x, v)))
+        return self._group_exp(x, v)
 
     def _log(self, x, y):
-        return self._from_velocity(x, _log(self.group, self.group.inverse_map(x) @ y))
+        return self._group_log(x, y)
 
     def _transport(self, x, v, u):
         """``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
-        return x @ half @ (self.group.inverse_map(x) @ u) @ half
+        return x @ half @ self._relative(x, u) @ half
 
     def _why_no_log(self, x, y):
-        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self.group.inverse_map(x) @ y))}"
+        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative(x, y)))}"
 
 
 @register((2,), (3,), (4,))
@@ -236,6 +258,9 @@ class SpecialEuclidean(GroupSpace):
     def _exp(self, x, v):
         y = self._map(self.rotations._exp, lambda x, v: x + v, x, v)
         return affine(y[..., :-1, :-1], y[..., :-1, -1:])
+
+    def _restored(self, x):
+        return affine(orthonormalized(x[..., :-1, :-1]), x[..., :-1, -1:])
 
     def _log(self, x, y):
         return self._map(self.rotations._log, lambda x, y: y - x, x, y)

@@ -141,8 +141,24 @@ class Product(Space):
     def _reach(self, x, v):
         return jnp.stack(self._each("_reach", x, v)).max(axis=0)
 
+    @property
+    def bi_invariant(self):  # type: ignore[override]
+        return all(factor.bi_invariant for factor in self.factors)
+
     def _straight_reach(self, x, v):
         return jnp.stack(self._each("_straight_reach", x, v)).max(axis=0)
+
+    def _group_exp(self, x, v):
+        return self._joined("_group_exp", x, v)
+
+    def _group_log(self, x, y):
+        return self._joined("_group_log", x, y)
+
+    def _cayley(self, x, v):
+        return self._joined("_cayley", x, v)
+
+    def _inverse_cayley(self, x, y):
+        return self._joined("_inverse_cayley", x, y)
 
     def _why_no_log(self, x, y):
         for i, (factor, *pair) in enumerate(zip(self.factors, self.split(x), self.split(y), strict=True)):
@@ -240,8 +256,24 @@ class Power(Space):
     def _reach(self, x, v):
         return self.base._reach(x, v).max(axis=-1)
 
+    @property
+    def bi_invariant(self):  # type: ignore[override]
+        return self.base.bi_invariant
+
     def _straight_reach(self, x, v):
         return self.base._straight_reach(x, v).max(axis=-1)
+
+    def _group_exp(self, x, v):
+        return self.base._group_exp(x, v)
+
+    def _group_log(self, x, y):
+        return self.base._group_log(x, y)
+
+    def _cayley(self, x, v):
+        return self.base._cayley(x, v)
+
+    def _inverse_cayley(self, x, y):
+        return self.base._inverse_cayley(x, y)
 
     def _why_no_log(self, x, y):
         lost = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)
