@@ -1,4 +1,4 @@
-"""Formulas of particular groups: exp, log and Cayley of SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
+"""Formulas of particular groups: exp, log, Cayley of SO(2), SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
 
 The exponentials are combinations of the Stumpff functions of the squared angle, entire functions with no division at
 zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there. The
@@ -57,6 +57,19 @@ def hyperbolic_arc(z) -> jax.Array:
     return _piecewise(terms, lambda s: jnp.arcsinh(s) / s, z, 0.01)
 
 
+def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``cos(t) I + sin(t)/t X``."""
+    z = _square(x)[..., None]
+    return stumpff(0, z) * jnp.eye(2) + stumpff(1, z) * algebra.hat(x)
+
+
+def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """The angle, by way of its sine and cosine."""
+    sine, cosine = algebra.vee((g - g.swapaxes(-1, -2)) / 2), jnp.trace(g, axis1=-2, axis2=-1)[..., None] / 2
+    defined = jnp.arctan2(jnp.abs(sine), cosine) <= math.pi - HALF_TURN_MARGIN
+    return jnp.where(defined, arc(sine**2, cosine) * sine, jnp.nan)
+
+
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rodrigues' formula ``I + c1 X + c2 X^2``."""
     z, X = _square(x)[..., None], algebra.hat(x)
@@ -70,8 +83,8 @@ def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
-    X = algebra.hat(x)
-    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x)[..., None] / 4)
+    X = algebra.hat(x)[..., :3, :3]
+    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -98,6 +111,12 @@ def se3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     d = (stumpff(2, z) - stumpff(3, z)) / (4 * stumpff(1, z))
     turned = jnp.cross(w, t)
     return jnp.concatenate([w, t - turned / 2 + d * jnp.cross(w, turned)], axis=-1)
+
+
+def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """That of the rotation, R, and the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
+    rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
+    return affine(rotation, 0.5 * (rotation @ u + u))
 
 
 def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:

@@ -305,6 +305,8 @@ class MatrixGroup:
 def SO(n: int) -> MatrixGroup:
     """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
     algebra, name = catalogue.so(n), f"SO({n})"
+    if n == 2:
+        return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, closed.so2_exp, closed.so2_log)
     if n == 3:
         return MatrixGroup(
             name,
@@ -325,7 +327,7 @@ def SE(n: int) -> MatrixGroup:
     algebra, name = catalogue.se(n), f"SE({n})"
     if n == 3:
         group = MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse, closed.se3_exp, closed.se3_log)
-        return replace(group, inverse_cayley_map=closed.se3_inverse_cayley)
+        return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
     return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse)
 
 

@@ -89,7 +89,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
     def halve(state):
         s, halvings, converged = state
-        root, success = _square_root(s)
+        root, _, success = _square_root(s)
         act = far(state)
         return jnp.where(act[..., None, None], root, s), halvings + act, converged & (success | ~act)
 
@@ -108,9 +108,8 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
 def polar(a) -> jax.Array:
     """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
-    adjoint = a.conj().swapaxes(-1, -2)
-    root, success = _square_root(adjoint @ a)
-    u = solve(root, adjoint).conj().swapaxes(-1, -2)
+    _, inverse_root, success = _square_root(a.conj().swapaxes(-1, -2) @ a)
+    u = a @ inverse_root
     for _ in range(2):  # the root squares the condition number of a
         u = orthonormalized(u)
     success &= largest(u.conj().swapaxes(-1, -2) @ u - jnp.eye(a.shape[-1])) < 1e-12
@@ -147,10 +146,10 @@ def complement(u) -> jax.Array:
 
 
 def _square_root(a):
-    """Principal square root, and whether it converged: Denman and Beavers' iteration [Higham 2008, eq. 6.15].
+    """Principal square root, its inverse, whether they converged: Denman and Beavers' iteration.
 
-    The iterates (y, z) tend to (a^1/2, a^-1/2). An eigenvalue at the angle pi - d costs log2(1/d) steps more and
-    loses as many bits.
+    The iterates (y, z) tend to (a^1/2, a^-1/2) [Higham 2008, eq. 6.15]. An eigenvalue at the angle pi - d costs
+    log2(1/d) steps more and loses as many bits.
     """
 
     def unfinished(state):
@@ -164,7 +163,7 @@ def _square_root(a):
 
     roots = jnp.stack([a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)])
     roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
-    return roots[0], change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
+    return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
 _MOST_ROOT_STEPS = 33

@@ -72,7 +72,7 @@ class Retraction(ABC):
         z, v = self._step(z, v, h)
         reach = run(self, "_reach", (), z, v)
         if not is_traced(reach) and (index := first(~np.asarray(reach < 1.0))) is not None:
-            radius = self.space.injectivity_radius(jnp.broadcast_to(z, v.shape)[index])
+            radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
                 f"{self}: the step h v{at(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
                 f"(injectivity radius of the space {radius:.6g}): take a smaller step"
@@ -116,7 +116,7 @@ class Retraction(ABC):
     def _reach(self, z, v): ...
 
     def _step(self, z, v, h):
-        z, v = self.space._checked_vectors(z, v=v)
+        z, v = self.space._checked_vectors(z, "z", v=v)
         return z, h * v
 
     def __repr__(self) -> str:
@@ -151,7 +151,7 @@ class Chart(Retraction):
 
     def differential(self, z, v, w) -> jax.Array:
         """Derivative of ``v -> point(z, v)`` along w: a tangent vector at ``point(z, v)``."""
-        return run(self, "_differential", (), *self.space._checked_vectors(z, v=v, w=w))
+        return run(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
 
     @abstractmethod
     def _point(self, z, v): ...

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .closed_forms import hyperbolic_stumpff
-from .matrix_functions import expm, largest
+from .matrix_functions import expm, largest, orthonormalized
 
 _NEARLY_ONE = 0.5
-"""Largest entry of a up to which log(I + a) takes the eigenvalues of a, not those of I + a."""
+"""Largest entry of w - I up to which the logarithm of w takes the eigenvalues of w - I, not those of w."""
 
 
 def symmetrized(a) -> jax.Array:
@@ -23,11 +23,11 @@ def symmetrized(a) -> jax.Array:
 
 
 def cholesky(a) -> jax.Array:
-    """Lower triangular L with ``L L^T = a``, NaN where a is not positive definite."""
+    """Lower triangular L with ``L L^H = a``, NaN where a is not positive definite."""
     n, columns = a.shape[-1], []
     for k in range(n):
         column = jnp.where(jnp.arange(n) < k, 0.0, a[..., :, k] / jnp.sqrt(a[..., k, k])[..., None])
-        a = a - column[..., :, None] * column[..., None, :]
+        a = a - column[..., :, None] * column.conj()[..., None, :]
         columns.append(column)
     return jnp.stack(columns, axis=-1)
 
@@ -41,6 +41,15 @@ def solve_lower(L, b) -> jax.Array:
             rest = rest - L[..., i, j, None] * row
         rows.append(rest / L[..., i, i, None])
     return jnp.stack(rows, axis=-2)
+
+
+def orthonormal_columns(a) -> jax.Array:
+    """The Q of ``a = Q R`` with R upper triangular and its diagonal positive, for a of full rank, shape (..., n, p)."""
+    adjoint = a.conj().swapaxes(-1, -2)
+    q = solve_lower(cholesky(adjoint @ a), adjoint).conj().swapaxes(-1, -2)
+    for _ in range(3):  # the product squares the condition number of a
+        q = orthonormalized(q)
+    return q
 
 
 def eigh(a) -> tuple[jax.Array, jax.Array]:
@@ -76,23 +85,22 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
 
 
 @jax.custom_jvp
-def log_one_plus(a) -> jax.Array:
-    """``log(I + a)`` of a symmetric matrix, with a small relative error also for small a; NaN where not defined.
+def spd_log(w, excess) -> jax.Array:
+    """Logarithm of a symmetric positive definite matrix, given along with its excess ``w - I``; NaN where not defined.
 
-    Derivatives of every order, through ``exp(x) = I + a``.
+    With both at hand neither a w next to I nor one next to 0 loses digits. Derivatives of every order, in w, through
+    ``exp(x) = w``.
     """
-    one = jnp.eye(a.shape[-1])
-    near = largest(a) < _NEARLY_ONE
-    values, vectors = eigh(jnp.where(near[..., None, None], a, one + a))
+    near = largest(excess) < _NEARLY_ONE
+    values, vectors = eigh(jnp.where(near[..., None, None], excess, w))
     near = near[..., None]
     logs = jnp.where(near, jnp.log1p(jnp.where(near, values, 0.0)), jnp.log(jnp.where(near, 1.0, values)))
     return symmetrized((vectors * logs[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
-@log_one_plus.defjvp
+@spd_log.defjvp
 def _log_derivative(primals, tangents):
-    (a,), (da,) = primals, tangents
-    x = log_one_plus(a)
+    x, dw = spd_log(*primals), tangents[0]
     values, vectors = eigh(jax.lax.stop_gradient(x))
     mean, half = (values[..., :, None] + values[..., None, :]) / 2, (values[..., :, None] - values[..., None, :]) / 2
     quotients = jnp.exp(mean) * hyperbolic_stumpff(1, half**2)  # (e^s - e^t) / (s - t)
@@ -104,4 +112,4 @@ def _log_derivative(primals, tangents):
         return vectors @ ((vectors.swapaxes(-1, -2) @ b @ vectors) / quotients) @ vectors.swapaxes(-1, -2)
 
     # The derivative of exp is self-adjoint, and a linear solve has derivatives of its own: hence those of higher order.
-    return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(da), in_eigenvectors, symmetric=True)
+    return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(dw), in_eigenvectors, symmetric=True)

@@ -219,14 +219,14 @@ class Space(ABC):
             Where it is computed from :meth:`log` and that is not defined.
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
-        d = self._compiled("_distance", x, y)
+        d = self._distance(x, y)
         self._refuse_nan(d, 0, x, y, "distance")
         return d
 
     def midpoint(self, x, y) -> jax.Array:
         """The point half way along the shortest geodesic from x to y, shape (..., *shape); raises as :meth:`log`."""
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
-        z = self._compiled("_midpoint", x, y)
+        z = self._midpoint(x, y)
         self._refuse_nan(z, len(self.shape), x, y, "midpoint")
         return z
 
@@ -302,11 +302,13 @@ class Space(ABC):
     def _norm(self, x, v):
         return safe_sqrt(self._inner(x, v, v))
 
+    # These two are made of compiled maps, as a logarithm can be long to compile.
+
     def _distance(self, x, y):
-        return self._norm(x, self._log(x, y))
+        return self._compiled("_norm", x, self._compiled("_log", x, y))
 
     def _midpoint(self, x, y):
-        return self._exp(x, 0.5 * self._log(x, y))
+        return self._compiled("_exp", x, 0.5 * self._compiled("_log", x, y))
 
     def _reach(self, x, v):
         return self._norm(x, v) / self.injectivity_radius()
@@ -363,7 +365,7 @@ class Space(ABC):
             worst = float(residual[index])
             raise OffManifoldError(
                 f"{self.name}: {what}{at(index)} is off the space: {self._why_off(values[index], worst)}, "
-                f"tolerance {tolerance:.0e}; point(x, project=True) moves it there",
+                f"tolerance {tolerance:.0e}; point({what}, project=True) moves it there",
                 residual=worst,
                 tolerance=tolerance,
             )
@@ -372,24 +374,24 @@ class Space(ABC):
     def _why_off(self, x: np.ndarray, residual: float) -> str:
         return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
 
-    def _checked_vectors(self, x, **vectors) -> list[jax.Array]:
+    def _checked_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
         """The point, and each of the vectors as a tangent vector there."""
-        x, checked = self._checked_point(x, "x"), []
+        x, checked = self._checked_point(x, name), []
         for what, v in vectors.items():
             v = self._array(v, what)
             if not is_traced(x, v):
-                self._check_tangent(x, v, what)
+                self._check_tangent(x, name, v, what)
             checked.append(v)
         return [x, *checked]
 
-    def _check_tangent(self, x, v, what: str) -> None:
+    def _check_tangent(self, x, name: str, v, what: str) -> None:
         with jax.ensure_compile_time_eval():
             residual = np.asarray(self._compiled("_tangent_residual", x, v))
         if (index := first(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
             worst = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{at(index)} is not tangent at x: residual {worst:.3g}, tolerance "
-                f"{MEMBERSHIP_TOLERANCE:.0e}; project_tangent(x, {what}) makes it so",
+                f"{self.name}: {what}{at(index)} is not tangent at {name}: residual {worst:.3g}, tolerance "
+                f"{MEMBERSHIP_TOLERANCE:.0e}; project_tangent({name}, {what}) makes it so",
                 residual=worst,
                 tolerance=MEMBERSHIP_TOLERANCE,
             )

@@ -15,6 +15,7 @@ from ..closed_forms import affine
 from ..errors import ParameterError
 from ..lie_group import SE, SO, SU, MatrixGroup, _log
 from ..matrix_functions import determinant, orthonormalized, polar
+from ..symmetric import orthonormal_columns
 from .base import Space, register
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
@@ -132,13 +133,13 @@ class BiInvariantSpace(GroupSpace):
         return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative(x, y)))}"
 
 
-@register((2,), (3,), (4,))
+@register((3,), (4,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class SpecialOrthogonal(BiInvariantSpace):
     """Rotations of R^n, with ``inner(x, u, v) = tr(u^T v) / 2``: rotations of a plane are as far apart as their angles.
 
-    Closed forms for n = 3; general matrix functions otherwise.
+    Closed forms for n = 2 and 3; general matrix functions otherwise.
     """
 
     n: int
@@ -188,15 +189,17 @@ class SpecialUnitary(BiInvariantSpace):
         return x * (1.0 - (determinant(x) - 1.0) / self.n)[..., None, None]
 
     def _project(self, x):
-        x = polar(x)
+        return self._of_unit_determinant(polar(x))
+
+    def _of_unit_determinant(self, x):
         return x * jnp.exp(-1j * jnp.angle(determinant(x)) / self.n)[..., None, None]
 
     def _random(self, key, size):
         real, imaginary = jax.random.normal(key, (2, *size, *self.shape))
-        return self._project(real + 1j * imaginary)
+        return self._of_unit_determinant(orthonormal_columns(real + 1j * imaginary))
 
 
-@register((2,), (3,), (3, 0.5))
+@register((2,), (3, 0.5))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class SpecialEuclidean(GroupSpace):
@@ -290,5 +293,7 @@ def _rotation(x):
 
 
 def _random_rotation(key, shape):
-    x = polar(jax.random.normal(key, shape))
+    x = orthonormal_columns(
+        jax.random.normal(key, shape)
+    )  # Haar measure, as those of the columns are rotation invariant
     return x * jnp.where(jnp.arange(shape[-1]) == 0, determinant(x)[..., None, None], 1.0)

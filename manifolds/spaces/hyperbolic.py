@@ -13,7 +13,7 @@ from ..closed_forms import hyperbolic_arc, hyperbolic_stumpff
 from .base import Space, register, safe_sqrt
 
 
-@register((2,), (3,))
+@register((2,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Hyperbolic(Space):

@@ -281,10 +281,5 @@ class Power(Space):
         return f"in copy {i}, {self.base._why_no_log(x[i], y[i])}"
 
 
-@register()
-def _attitude_and_momentum() -> Space:
-    return SpecialOrthogonal(3) * Euclidean(3)
-
-
-register((Sphere(2), Euclidean(3)))(Product)
+register((Sphere(2), Euclidean(3)), (SpecialOrthogonal(3), Euclidean(3)))(Product)
 register((Sphere(2), 4))(Power)

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..catalogue import _size
 from ..matrix_functions import expm, largest
-from ..symmetric import cholesky, log_one_plus, solve_lower, symmetrized
+from ..symmetric import cholesky, solve_lower, spd_log, symmetrized
 from .base import Space, register
 
 
-@register((2,), (3,))
+@register((3,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class SPD(Space):
@@ -80,7 +80,8 @@ class SPD(Space):
         return symmetrized(half @ half.swapaxes(-1, -2))  # positive definite by its form
 
     def _log(self, x, y):
-        return _congruent(cholesky(x), log_one_plus(_congruent(self._inverse_factor(x), y - x)))
+        inverse = self._inverse_factor(x)
+        return _congruent(cholesky(x), spd_log(_congruent(inverse, y), _congruent(inverse, y - x)))
 
     def _transport(self, x, v, u):
         inverse = self._inverse_factor(x)

@@ -12,13 +12,14 @@ import numpy as np
 from ..catalogue import _size
 from ..errors import ParameterError
 from ..matrix_functions import complement, expm, largest, orthonormalized, polar, solve
+from ..symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
 
 _MOST_STEPS = 30
 """Of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
 
 
-@register((3, 1), (3, 2), (4, 2))
+@register((4, 2))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Stiefel(Space):
@@ -66,7 +67,7 @@ class Stiefel(Space):
         return polar(x)
 
     def _random(self, key, size):
-        return polar(jax.random.normal(key, (*size, *self.shape)))
+        return orthonormal_columns(jax.random.normal(key, (*size, *self.shape)))
 
     def _project_tangent(self, x, w):
         product = _transposed(x) @ w
@@ -115,7 +116,8 @@ class Stiefel(Space):
 
         def step(state):
             c, _, steps = state
-            f, J = gap(c).ravel(), jax.jacfwd(gap)(c).reshape(-1, self.dim)
+            J, f = jax.jacfwd(lambda c: (gap(c),) * 2, has_aux=True)(c)
+            J, f = J.reshape(-1, self.dim), f.ravel()
             direction = solve(J.T @ J, -(J.T @ f)[:, None])[:, 0]
             lengths = 0.5 ** jnp.arange(8)
             sizes = jax.vmap(lambda t: (gap(c + t * direction) ** 2).sum())(lengths)
@@ -126,7 +128,8 @@ class Stiefel(Space):
             unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MOST_STEPS)  # noqa: E731
             c, change, _ = jax.lax.while_loop(unfinished, step, (start, jnp.inf, 0))
             inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
-            return jnp.where(inside & (change <= 1e-8), c, jnp.nan)
+            found = (change <= 1e-8) & (jnp.abs(gap(c)).max() <= 1e-10)  # not just a point where Newton gets stuck
+            return jnp.where(inside & found, c, jnp.nan)
 
         chord = self._project_tangent(x, y - x)
         length = jnp.sqrt(self._inner(x, y - x, y - x) / jnp.maximum(self._inner(x, chord, chord), 1e-300))
