@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo test test-slow docs lock format clean
+.PHONY: help .venv demo test test-slow docs bench lock format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -18,8 +18,9 @@ help:
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make docs       build the documentation in docs/_build/html"
+	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/benchmarks.md"
 	@echo "make format     format the code and repair what the linter can"
-	@echo "make lock       choose new exact versions for requirements.lock (needs Python 3.11)"
+	@echo "make lock       choose new exact versions for both locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
 	@echo
 	@echo "Each sets up .venv by itself. Another interpreter: make test PYTHON=python3.12"
@@ -36,6 +37,10 @@ help:
 
 .venv/installed: .venv/locked pyproject.toml
 	$(PIP_INSTALL) --no-build-isolation -e .
+	@touch $@
+
+.venv/bench: .venv/installed requirements-bench.lock
+	$(PIP_INSTALL) -r requirements-bench.lock
 	@touch $@
 
 comma := ,
@@ -56,6 +61,9 @@ test-slow: .venv
 docs: .venv
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
+bench: .venv .venv/bench
+	$(BIN)/python -m benchmarks --page docs/benchmarks.md
+
 format: .venv
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -70,9 +78,15 @@ lock:
 	{ echo "# Exact versions of everything that the library, its tests and its documentation need."; \
 	  echo "# Written from pyproject.toml by 'make lock'; not edited by hand."; \
 	  "$$folder/venv/bin/python" -m pip freeze --all --exclude pip; } > "$$folder/lock"; \
-	cp "$$folder/lock" requirements.lock
+	"$(PYTHON)" -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' > "$$folder/peers"; \
+	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check -c "$$folder/lock" -r "$$folder/peers"; \
+	{ echo "# Exact versions of what the benchmarks need beside requirements.lock."; \
+	  echo "# Written from pyproject.toml by 'make lock'; not edited by hand."; \
+	  "$$folder/venv/bin/python" -m pip freeze --all --exclude pip | grep -vxFf "$$folder/lock"; } > "$$folder/lock-bench"; \
+	cp "$$folder/lock" requirements.lock; \
+	cp "$$folder/lock-bench" requirements-bench.lock
 
 clean:
-	rm -rf .venv build *.egg-info demo_output docs/_build docs/gallery docs/generated docs/sg_execution_times.rst
+	rm -rf .venv build *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/sg_execution_times.rst
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

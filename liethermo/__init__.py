@@ -22,6 +22,7 @@ from .dissipation import (
     ProjectedMetric,
 )
 from .energy import Energy, Function, Quadratic
+from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
     CasimirError,
@@ -35,13 +36,16 @@ from .errors import (
     NonFiniteError,
     SpecError,
 )
+from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
 from .solution import Solution, Stats, Status, load
+from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
 from .timeloop import integrate
 
 __all__ = [
+    "Adaptive",
     "Audit",
     "AxiomError",
     "CasimirError",
@@ -51,6 +55,7 @@ __all__ = [
     "Dissipation",
     "DoubleBracket",
     "Energy",
+    "Ensemble",
     "EulerPoincareForce",
     "EulerPoincareSystem",
     "FileError",
@@ -67,6 +72,7 @@ __all__ = [
     "LiePoissonSystem",
     "LiethermoError",
     "MeanValue",
+    "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticSystem",
     "NonFiniteError",
@@ -74,16 +80,20 @@ __all__ = [
     "ProjectedMetric",
     "Quadratic",
     "Reference",
+    "Relaxed",
     "Solution",
     "SpecError",
     "Stats",
     "Status",
     "System",
+    "ensemble",
+    "flow",
     "integrate",
     "load",
     "models",
     "plot",
     "registered_methods",
+    "suggest_step",
 ]
 
 

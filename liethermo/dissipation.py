@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import real_array
 
 from .energy import Energy, as_energy
 from .errors import IndefiniteError, InputError
@@ -72,6 +73,15 @@ class Dissipation(eqx.Module):
         dL : tuple of array, shape (n,)
             Gradients of the functions in :attr:`preserve`, in their order.
         """
+
+    def momentum(self, dH, turned) -> jax.Array | None:
+        """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].
+
+        ``turned`` is ``[dH, dS]``. Such an F joins the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
+        action in the place of two. None where the force is of another form.
+        """
+        del dH, turned
+        return None
 
     def __add__(self, other: Dissipation) -> Dissipation:
         return Several((*_parts(self), *_parts(other)))
@@ -139,9 +149,12 @@ class InnerProductDissipation(Dissipation):
         _need_algebra(system, "InnerProductDissipation", self.K.shape[0])
         return self
 
+    def momentum(self, dH, turned):
+        return self.K @ turned
+
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
-        return g.ad_star(dH, self.K @ g.bracket(dH, dS))
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
 
 class KillingDissipation(Dissipation):
@@ -196,9 +209,12 @@ class KillingDissipation(Dissipation):
             )
         return KillingDissipation(self.rate, jnp.asarray(form))
 
+    def momentum(self, dH, turned):
+        return self.rate * (self.form @ turned)
+
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
-        return self.rate * g.ad_star(dH, self.form @ g.bracket(dH, dS))
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
 
 class ProjectedMetric(Dissipation):
@@ -450,6 +466,9 @@ class EulerPoincareForce(Dissipation):
             raise InputError(f"the force F must map shape ({g.dim},) to ({g.dim},), but it returns shape {shape}")
         return self
 
+    def momentum(self, dH, turned):
+        return self.F(dH)
+
     def force(self, system, x, dH, dS, dL):
         return system.algebra.ad_star(dH, self.F(dH))
 
@@ -472,7 +491,7 @@ def _state(dim: int):
 
 def checked_rate(rate) -> jax.Array:
     """A rate as one non-negative number (or a traced one)."""
-    array = jnp.asarray(rate, dtype=jnp.float64)
+    array = real_array(rate)
     if array.shape != ():
         raise InputError(f"a rate is one number, not an array of shape {array.shape}")
     if not isinstance(array, jax.core.Tracer) and not float(array) >= 0.0:
@@ -481,16 +500,17 @@ def checked_rate(rate) -> jax.Array:
 
 
 def _semidefinite(form, what: str) -> jax.Array:
-    matrix = jnp.asarray(form, dtype=jnp.float64)
+    matrix = real_array(form)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
         return matrix
-    scale = float(jnp.max(jnp.abs(matrix)))
-    asymmetry = float(jnp.max(jnp.abs(matrix - matrix.T)))
+    numbers = np.asarray(matrix)
+    scale = float(np.abs(numbers).max())
+    asymmetry = float(np.abs(numbers - numbers.T).max())
     if not asymmetry <= 1e-12 * scale:
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
-    lowest = float(jnp.linalg.eigvalsh(matrix)[0])
+    lowest = float(np.linalg.eigvalsh(numbers)[0]) if np.isfinite(numbers).all() else -np.inf
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
             f"{what} has the negative eigenvalue {lowest:.3g}: it must be positive semidefinite, or entropy would fall",
@@ -509,13 +529,14 @@ def _check_matrix(form, dim: int, what: str) -> None:
 def _check_curvature_symmetries(R) -> None:
     if isinstance(R, jax.core.Tracer):
         return
-    tolerance = 1e-12 * float(jnp.max(jnp.abs(R)))
+    R = np.asarray(R)
+    tolerance = 1e-12 * float(np.abs(R).max())
     for name, image in [
         ("R[i,j,k,l] = -R[j,i,k,l]", -R.transpose(1, 0, 2, 3)),
         ("R[i,j,k,l] = -R[i,j,l,k]", -R.transpose(0, 1, 3, 2)),
         ("R[i,j,k,l] = R[k,l,i,j]", R.transpose(2, 3, 0, 1)),
     ]:
-        residual = float(jnp.max(jnp.abs(R - image)))
+        residual = float(np.abs(R - image).max())
         if residual > tolerance:
             raise InputError(f"not a 4-bracket: {name} fails by {residual:.3g} (tolerance {tolerance:.1g})")
 

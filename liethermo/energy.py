@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import real_array
 
+from .engine.interpret import polynomial_degree
 from .errors import FunctionError, InputError
 
 
@@ -37,6 +39,11 @@ class Energy(eqx.Module):
     def terms(self) -> tuple[Energy, ...]:
         """The summands, none of them a sum itself."""
         return (self,)
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
+        return False
 
     def __call__(self, x) -> jax.Array:
         return jnp.vectorize(self.value, signature="(n)->()")(jnp.asarray(x, dtype=jnp.float64))
@@ -62,17 +69,22 @@ class Quadratic(Energy):
     c: jax.Array
 
     def __init__(self, A, b=None, c=0.0):
-        self.A = jnp.asarray(A, dtype=jnp.float64)
-        self.b = None if b is None else jnp.asarray(b, dtype=jnp.float64)
-        self.c = jnp.asarray(c, dtype=jnp.float64)
+        self.A = real_array(A)
+        self.b = None if b is None else real_array(b)
+        self.c = real_array(c)
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
             raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:
             raise InputError(f"b has shape {self.A.shape[:1]} beside this A, not {self.b.shape}")
         if self.A.ndim == 2 and not isinstance(self.A, jax.core.Tracer):
-            asymmetry = float(jnp.max(jnp.abs(self.A - self.A.T)))
-            if asymmetry > 1e-12 * float(jnp.max(jnp.abs(self.A))):
+            matrix = np.asarray(self.A)
+            asymmetry = float(np.abs(matrix - matrix.T).max())
+            if asymmetry > 1e-12 * float(np.abs(matrix).max()):
                 raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
 
     def linear_part(self, x) -> jax.Array:
         """``A x``."""
@@ -93,6 +105,11 @@ class Function(Energy):
     """
 
     function: Callable
+    quadratic: bool = eqx.field(static=True, default=False)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.quadratic
 
     def value(self, x) -> jax.Array:
         return jnp.asarray(self.function(x))
@@ -106,6 +123,10 @@ class Sum(Energy):
     @property
     def terms(self) -> tuple[Energy, ...]:
         return self.summands
+
+    @property
+    def is_quadratic(self) -> bool:
+        return all(term.is_quadratic for term in self.summands)
 
     def value(self, x) -> jax.Array:
         return sum((term.value(x) for term in self.summands[1:]), self.summands[0].value(x))
@@ -137,6 +158,19 @@ def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
         else:
             c += float(coefficient)
     return Quadratic(A, b if b.any() else None, c)
+
+
+def recognised(energy: Energy, dim: int) -> Energy:
+    """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
+    if isinstance(energy, Sum):
+        return Sum(tuple(recognised(term, dim) for term in energy.summands))
+    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
+        return Function(energy.function, quadratic=True)
+    return energy
+
+
+def _value(energy: Energy, x):
+    return energy.value(x)
 
 
 def check_scalar(energy: Energy, dim: int, role: str) -> None:

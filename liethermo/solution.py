@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .audit import Audit, Tolerances, audit
-from .errors import FileError
+from .errors import FileError, InputError
 
 if TYPE_CHECKING:
     import xarray
+
+    from .stepwise import Dense
 
 FORMAT = "liethermo-solution-1"
 
@@ -25,7 +27,7 @@ class Status:
 
     Attributes
     ----------
-    code : {"completed", "not_converged", "non_finite", "interrupted", "reference_failed"}
+    code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "interrupted", "reference_failed"}
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
@@ -44,7 +46,7 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        return self.code == "completed"
+        return self.code in ("completed", "event")
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"
@@ -58,6 +60,8 @@ class Stats:
     ----------
     steps, fixed_point_iterations, newton_iterations, most_iterations : int
         ``most_iterations`` is the largest number in one step.
+    rejected : int
+        Steps that were tried and were too long.
     worst_residual : float
         Largest ``h |k - slopes(k)| / |x|`` accepted.
     energy_range : (float, float)
@@ -71,6 +75,7 @@ class Stats:
     steps: int = 0
     fixed_point_iterations: int = 0
     newton_iterations: int = 0
+    rejected: int = 0
     most_iterations: int = 0
     worst_residual: float = 0.0
     energy_range: tuple[float, float] | None = None
@@ -109,6 +114,10 @@ class Solution:
     laws : Laws
     provenance : dict
         Library version, method, step, system, date, spec: JSON data.
+    event_time : float or None
+        When the event of ``integrate(until=...)`` happened.
+    dense : Dense or None
+        The polynomials between the steps (``integrate(dense=True)``); not written to files.
     """
 
     t: np.ndarray
@@ -120,6 +129,20 @@ class Solution:
     stats: Stats
     laws: Laws
     provenance: dict[str, Any] = field(default_factory=dict)
+    event_time: float | None = None
+    dense: Dense | None = None
+
+    def __call__(self, t) -> np.ndarray:
+        """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.stepwise.Dense`.
+
+        Raises
+        ------
+        InputError
+            Unless the run was made with ``dense=True`` and covers the times.
+        """
+        if self.dense is None:
+            raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
+        return self.dense(t)
 
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held, as a table; see :class:`liethermo.audit.Tolerances` for the keywords."""
@@ -149,6 +172,7 @@ class Solution:
             "stats": json.dumps(asdict(self.stats)),
             "laws": json.dumps(asdict(self.laws)),
             "provenance": json.dumps(self.provenance),
+            "event_time": json.dumps(self.event_time),
         }
         return xarray.Dataset(variables, coordinates, attributes)
 
@@ -213,6 +237,7 @@ def load(path: str | os.PathLike) -> Solution:
             stats=Stats(**stored["stats"]),
             laws=Laws(**stored["laws"]),
             provenance=stored["provenance"],
+            event_time=json.loads(dataset.attrs.get("event_time", "null")),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error

@@ -4,39 +4,37 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import math
 import os
-import sys
 import time
 import warnings
+from collections.abc import Callable
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .engine import array, compiled
+from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
+from .progress import Progress
 from .solution import Laws, Solution, Stats, Status
+from .stepwise import Adaptive, Dense, Event, Relaxed, stops_of
+from .stepwise import run as run_stepwise
 from .systems import System
+from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
-if TYPE_CHECKING:
-    from rich.progress import Progress
-
-CHUNK_SAVES = 1024
-"""Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
-
-CHUNK_STEPS = 100_000
-"""Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
-
-COMPILED_STEPS = 200_000
-"""Steps from which "auto" compiles: the array engine would take longer for them than the compiler does."""
+SMALL_DIM = 8
+"""Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
+
+COMPILED_STEPS = 20_000
+"""Steps from which it is worth compiling for some seconds more."""
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
@@ -50,10 +48,13 @@ def integrate(
     system: System,
     x0,
     t_span: tuple[float, float],
-    step: float,
+    step: float | Adaptive,
     method: OneStepMethod | Reference | None = None,
     *,
     save_every: int = 1,
+    save_at=None,
+    until: Relaxed | Callable | None = None,
+    dense: bool = False,
     engine: Literal["auto", "array", "compiled"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
@@ -67,16 +68,25 @@ def integrate(
     x0 : array, shape (n,)
     t_span : (float, float)
         Start and end, the end later. The last step is shortened to arrive there.
-    step : float
-        Step size, > 0; the spacing of the output for ``Reference``.
+    step : float or Adaptive
+        Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
         ``MetriplecticMidpoint()`` by default.
     save_every : int
         Keep every so-manieth state, and the last; the laws are followed at every step all the same.
+    save_at : array of times, optional
+        Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
+    until : Relaxed or function from a state, shape (n,), to a scalar, optional
+        Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
+        located to rounding on the collocation polynomial, reached by a step that ends there. ``solution.event_time``
+        and the status tell whether it happened.
+    dense : bool
+        Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
-        more, after some seconds of compiling the first time. "auto" compiles for runs that are long enough to repay
-        it, and falls back, with a warning, where the system uses what cannot be compiled.
+        more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
+        components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
+        uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -100,16 +110,31 @@ def integrate(
     method = MetriplecticMidpoint() if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticMidpoint(), not {method!r}")
-    _check(system, t_span, step, save_every, engine, on_failure)
-    x = system.state(x0)
-    span = (float(t_span[0]), float(t_span[1]))
-    run = _Run(system, method, x, span, float(step), save_every, save_to, engine)
-    with _Progress(span, progress) as bar:
-        (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
+    if not isinstance(system, System):
+        raise InputError(
+            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
+        )
+    check_choice("engine", engine, ("auto", "array", "compiled"))
+    check_choice("on_failure", on_failure, ("raise", "return"))
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    adaptive = isinstance(step, Adaptive)
+    looks = adaptive or dense or save_at is not None or until is not None
+    if looks and isinstance(method, Reference):
+        raise InputError(
+            "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
+        )
+    table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
+    run = _Run(system, method, system.state(x0), table, save_to, engine)
+    with Progress((table.start, table.end), progress) as bar:
+        if looks:
+            run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
+        else:
+            (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
     solution = run.solution()
     if save_to is not None:
         solution.save(save_to)
-    if on_failure == "raise" and solution.status.code == "not_converged":
+    if on_failure == "raise" and solution.status.code in ("not_converged", "step_underflow"):
         raise ConvergenceError(solution.status.message, solution)
     if on_failure == "raise" and solution.status.code in ("non_finite", "reference_failed"):
         raise NonFiniteError(solution.status.message, solution)
@@ -119,79 +144,142 @@ def integrate(
 class _Run:
     """A run under way: what has been saved, and how it stands."""
 
-    def __init__(self, system, method, x0, span, h, every, save_to, engine):
-        self.system, self.method, self.span, self.h, self.every = system, method, span, h, every
+    def __init__(self, system, method, x0, table: Timetable, save_to, engine):
+        self.system, self.method, self.table = system, method, table
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
-        self.times = [span[0]]
+        self.times = [table.start]
         self.states = [np.asarray(x0)[None]]
+        self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
-        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
-        steps = (span[1] - span[0]) / h
-        self.steps = math.floor(steps * (1 + 1e-12))
-        self.last = span[1] - (span[0] + self.steps * h)
-        if self.last <= 1e-12 * (span[1] - span[0]):
-            self.last = 0.0
-        long = self.steps >= COMPILED_STEPS and system.dim <= COMPILED_DIM
-        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and long) else "array"
+        self.step: float | Adaptive = table.h
+        self.event_time: float | None = None
+        self.dense: Dense | None = None
+        wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
+        small = system.unrollable and system.dim <= wanted and jax.default_backend() == "cpu"
+        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
         self.fallback = engine == "auto"
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
     def by_steps(self, bar) -> None:
-        """Drive the engine chunk by chunk, to the end, a failure or Ctrl-C."""
-        capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // self.every, _power_of_two(self.steps // self.every)))
-        state, interrupted = array.begin(self.system, self.method, self.states[0][0]), False
+        """Drive the engine call by call, to the end, a failure or Ctrl-C."""
+        every = self.table.every or 1
+        saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
+        capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
+        state, interrupted = None, False
+        self.values = [self._energies(self.states[0])]
         try:
-            done = 0
-            while done < self.steps and int(state.status) == array.RUNNING:
-                left = self.steps - done
-                saves, every = (min(capacity, left // self.every), self.every) if left >= self.every else (1, left)
-                state = self._advance(state, self.h, saves, every, capacity)
-                done = int(state.step)
+            state = self._begin()
+            for h, saves, every in self.table.calls(saves=capacity):
+                state = self._advance(state, h, saves, every, capacity)
                 bar.update(self.times[-1])
+                if int(state.status) != array.RUNNING:
+                    break
                 self._checkpoint(state)
-            if int(state.status) == array.RUNNING and self.last > 0.0:
-                state = self._advance(state, self.last, 1, 1, capacity)
         except KeyboardInterrupt:
             interrupted = True
-        self.stats, self.status = _stats(state), self._status(state, interrupted)
+        if state is None:
+            self.status = Status("interrupted", "stopped by the user before the first step", 0, self.table.start)
+            return
+        step = int(state.step)
+        now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
+        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted)
 
-    def _advance(self, state, h, saves, every, capacity):
-        before = int(state.step)
-        arguments = (self.system, self.method, state, h, saves, every, capacity)
+    def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
+        """Look at every step: adaptive ones, events, outputs at given times, dense output."""
+        start, end, every = self.table.start, self.table.end, self.table.every or 1
+        stops, event = stops_of(save_at, start, end), None if until is None else Event(until, self.system)
+        self.step, pieces, last = step, [], None
+
+        def keep(t, reached, h, before, after):
+            nonlocal last
+            last = reached, after
+            if dense:
+                pieces.append((t, h, np.asarray(before.x), np.asarray(after.k)))
+            if reached in stops if save_at is not None else int(after.step) % every == 0:
+                self._append(reached, after)
+                last = None
+            bar.update(reached)
+            self._checkpoint(after)
+
+        state = None
+        try:
+            state = self._begin()
+        except KeyboardInterrupt:
+            self.values = [self._energies(self.states[0])]
+            self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
+            return
+        self.values = [np.array([[float(state.energy), float(state.entropy)]])]
+        engine = compiled if self.engine == "compiled" else array
+        outcome = run_stepwise(self.system, self.method, engine, state, (start, end), step, stops, event, keep)
+        if last is not None:
+            self._append(*last)
+        self.event_time = outcome.event_time
+        if pieces:
+            self.dense = Dense(*(np.array(column) for column in zip(*pieces, strict=True)))
+        state, now = outcome.state, self.times[-1]
+        self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
+        steps = int(state.step)
+        if outcome.underflow is not None:
+            text = (
+                f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and the error is still too "
+                "large: the tolerance may be below what rounding allows, or the functions not smooth there. "
+                f"Try a larger tolerance than {step}"
+            )
+            self.status = Status("step_underflow", text, steps, now, float(state.residual))
+        elif event is not None and outcome.event_time is not None:
+            text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
+            self.status = Status("event", text, steps, now, float(state.residual))
+        else:
+            h = step if isinstance(step, float) else float("nan")
+            self.status = self._status(state, now, h, outcome.interrupted)
+            if event is not None and self.status.ok:
+                text = f"{self.status.message}; the event ({event.name}) did not happen"
+                self.status = dataclasses.replace(self.status, message=text)
+
+    def _append(self, t: float, state) -> None:
+        self.times.append(t)
+        self.states.append(np.asarray(state.x)[None])
+        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
+
+    def _begin(self):
+        """The state to start from, by the engine that can run the system."""
+        x = self.states[0][0]
         if self.engine == "compiled":
             try:
-                state, (x, reached) = compiled.advance(*arguments)
+                return compiled.begin(self.system, self.method, x)
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
-                warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=5)
+                warn_of_fallback(error, stacklevel=6)
                 self.engine = "array"
-        if self.engine == "array":
-            state, (x, reached) = array.advance(*arguments)
+        return array.begin(self.system, self.method, x)
+
+    def _advance(self, state, h, saves, every, capacity):
+        before = int(state.step)
+        engine = compiled if self.engine == "compiled" else array
+        state, (x, energy, entropy, reached) = engine.advance(
+            self.system, self.method, state, h, saves, every, capacity
+        )
         kept = int(np.asarray(reached).sum())
         states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
+        values = np.stack([np.asarray(energy)[:kept], np.asarray(entropy)[:kept]], axis=1)
         if int(state.step) > before + every * kept:  # it failed between two saves: keep what there is
             states, steps = np.concatenate([states, np.asarray(state.x)[None]]), np.append(steps, int(state.step))
+            values = np.append(values, [[float(state.energy), float(state.entropy)]], axis=0)
         self.states.append(states)
-        self.times.extend(self._time(n) for n in steps)
+        self.values.append(values)
+        self.times.extend(self.table.time(int(n)) for n in steps)
         return state
 
-    def _time(self, step: int) -> float:
-        if step > self.steps or (step == self.steps and not self.last):
-            return self.span[1]
-        return self.span[0] + step * self.h
-
-    def _status(self, state, interrupted: bool) -> Status:
+    def _status(self, state, now: float, h: float, interrupted: bool) -> Status:
         code, step, residual = int(state.status), int(state.step), float(state.residual)
-        now = self._time(step)
         if interrupted:
             return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
         if code == array.RUNNING:
             return Status("completed", f"reached t = {now:g} in {step} steps", step, now, residual)
-        h = self.last if step >= self.steps else self.h
         where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
         if code == array.NOT_CONVERGED:
             message = (
@@ -208,7 +296,7 @@ class _Run:
 
     def _culprit(self, state) -> str:
         """Which function is not finite just ahead of the last good state."""
-        ahead = jnp.asarray(state.x) + self.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+        ahead = jnp.asarray(state.x) + self.table.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
         system = self.system
         suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}
         if system.entropy is not None:
@@ -222,15 +310,15 @@ class _Run:
 
     def by_scipy(self, bar) -> None:
         """One call of the reference solver, its output at the times a fixed step would have."""
-        counts = [*range(0, self.steps, self.every), self.steps]
-        times = np.array([self._time(n) for n in counts] + ([self.span[1]] if self.last else []))
-        times = np.unique(times)
+        times = self.table.times
+        self.values = [self._energies(self.states[0])]
         try:
             x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
         except KeyboardInterrupt:
             self.status = Status("interrupted", "stopped by the user before SciPy returned anything", 0, times[0])
             return
         self.times, self.states = list(times[: len(x)]), [x]
+        self.values = [self._energies(x)]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
         now = self.times[-1]
         bar.update(now)
@@ -240,6 +328,9 @@ class _Run:
         else:
             self.status = Status("completed", f"reached t = {now:g}", len(x) - 1, now)
 
+    def _energies(self, x: np.ndarray) -> np.ndarray:
+        return np.stack(at_points(array.values, self.system, x), axis=1)
+
     # -- the result ---------------------------------------------------------------------------------------------------
 
     def solution(self) -> Solution:
@@ -247,21 +338,20 @@ class _Run:
         system = self.system
         x = np.concatenate(self.states)
         invariants = system.invariants()
-        energy, entropy = np.asarray(system.energy(x)), None
-        if system.entropy is not None:
-            entropy = np.asarray(system.entropy(x))
-        conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(self.method, J))
+        energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
         return Solution(
             t=np.array(self.times),
             x=x,
             energy=energy,
-            entropy=entropy,
-            casimirs={name: np.asarray(function(x)) for name, (function, _) in invariants.items()},
+            entropy=None if system.entropy is None else entropy,
+            casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=Laws(system.energy_law, system.entropy_law, conserved),
+            laws=laws_of(system, self.method, invariants),
             provenance=self._provenance(),
+            event_time=self.event_time,
+            dense=self.dense,
         )
 
     def _checkpoint(self, state) -> None:
@@ -278,9 +368,9 @@ class _Run:
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "method": str(self.method),
             "engine": None if isinstance(self.method, Reference) else self.engine,
-            "step": self.h,
-            "t_span": list(self.span),
-            "save_every": self.every,
+            "step": self.step if isinstance(self.step, float) else dataclasses.asdict(self.step),
+            "t_span": [self.table.start, self.table.end],
+            "save_every": self.table.every,
             "x0": np.asarray(self.states[0][0]).tolist(),
             "system": type(self.system).__name__,
             "algebra": None if algebra is None else algebra.name,
@@ -291,39 +381,29 @@ class _Run:
 # -- helpers --------------------------------------------------------------------------------------------------------
 
 
-def _check(system, t_span, step, save_every, engine, on_failure) -> None:
-    if not isinstance(system, System):
-        raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
-        )
-    try:
-        start, end = (float(t) for t in t_span)
-    except (TypeError, ValueError):
-        raise InputError(f"t_span must be two numbers (start, end), not {t_span!r}") from None
-    if not (math.isfinite(start) and math.isfinite(end) and end > start):
-        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g})")
-    try:
-        h = float(step)
-    except (TypeError, ValueError):
-        raise InputError(f"step must be a number, not {step!r}") from None
-    if not (math.isfinite(h) and h > 0.0):
-        raise InputError(f"step must be positive and finite, not {h:g}: time runs forwards, since entropy grows")
-    if start + h == start or end + h == end:
-        raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
-    if isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1:
-        raise InputError(f"save_every must be a positive integer, not {save_every!r}")
-    if engine not in ("auto", "array", "compiled"):
-        raise InputError(f"engine must be 'auto', 'array' or 'compiled', not {engine!r}")
-    if on_failure not in ("raise", "return"):
-        raise InputError(f"on_failure must be 'raise' or 'return', not {on_failure!r}")
+def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
+    if given not in choices:
+        *others, last = map(repr, choices)
+        raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+
+
+def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
+    warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
+
+
+def laws_of(system: System, method, invariants) -> Laws:
+    """What the system promises and, of its invariants, what the method keeps."""
+    conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
+    return Laws(system.energy_law, system.entropy_law, conserved)
+
+
+def _value(function, x):
+    return function.value(x)
 
 
 def _keeps(method, function) -> bool:
     """Whether the method keeps a function exactly that the system conserves."""
-    from .energy import Quadratic
-
-    quadratic = all(isinstance(term, Quadratic) for term in function.terms)
-    return quadratic and "quadratic_invariants" in method.preserves
+    return function.is_quadratic and "quadratic_invariants" in method.preserves
 
 
 def _stats(state: array.State) -> Stats:
@@ -350,31 +430,3 @@ def _version() -> str:
         return metadata.version("liethermo")
     except metadata.PackageNotFoundError:
         return "(not installed)"
-
-
-class _Progress:
-    """A progress bar on the standard error, shown only where someone is there to see it."""
-
-    def __init__(self, span: tuple[float, float], wanted: bool | None):
-        self.span = span
-        self.bar: Progress | None = None
-        self.wanted = sys.stderr.isatty() if wanted is None else wanted
-
-    def __enter__(self):
-        if self.wanted:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-            columns = (TextColumn("t = {task.fields[t]:.4g}"), BarColumn(), TimeRemainingColumn())
-            self.bar = bar = Progress(*columns, console=Console(stderr=True, force_terminal=True), transient=True)
-            bar.start()
-            self.task = bar.add_task("", total=self.span[1] - self.span[0], t=self.span[0])
-        return self
-
-    def update(self, t: float) -> None:
-        if self.bar is not None:
-            self.bar.update(self.task, completed=t - self.span[0], t=t)
-
-    def __exit__(self, *_):
-        if self.bar is not None:
-            self.bar.stop()

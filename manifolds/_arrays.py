@@ -58,3 +58,10 @@ def _numeric(array: np.ndarray) -> np.ndarray:
     if not np.issubdtype(array.dtype, np.number) and array.dtype != bool:
         raise TypeError(f"dtype {array.dtype}")
     return array
+
+
+def real_array(value) -> jax.Array:
+    """``value`` as a JAX array of doubles, by NumPy where it is a plain number: XLA would compile a conversion."""
+    if isinstance(value, jax.Array):
+        return value if value.dtype == jnp.float64 else value.astype(jnp.float64)
+    return jnp.asarray(np.asarray(value, dtype=np.float64))

@@ -10,6 +10,15 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("liethermo")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _own_cache(tmp_path_factory):
+    """Compiled modules of this test run, for all its processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        base = tmp_path_factory.getbasetemp()
+        patch.setenv("LIETHERMO_CACHE", str((base.parent if base.name.startswith("popen") else base) / "liethermo"))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _bounded_compilation_cache(request):
     """Every compiled program holds memory maps, of which a process has 65,530: drop them now and then."""

@@ -41,7 +41,12 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
         exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=_name)
+def _examples():
+    for path in EXAMPLES:
+        yield pytest.param(path, id=_name(path), marks=pytest.mark.slow if path.stem == "plot_orders" else ())
+
+
+@pytest.mark.parametrize("example", list(_examples()))
 def test_an_example_runs_and_draws(example, scratch):
     runpy.run_path(str(example), run_name="__main__")
     assert plt.get_fignums(), "a gallery example shows at least one figure"

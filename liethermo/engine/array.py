@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds import matrix_functions
+
 from ..integrators import OneStepMethod
 from ..systems import System
 
@@ -87,7 +89,8 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
 
     def fixed_point_goes_on(s: _Iteration):
-        hopeless = (s.made >= 3) & ((s.rate > SLOW) | ~jnp.isfinite(s.update)) & (s.best > PLATEAU * scale(s.k))
+        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
+        hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
         return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
 
     first = jax.lax.while_loop(fixed_point_goes_on, lambda s: s.after(slopes(s.k)), _Iteration.begin(guess))
@@ -104,11 +107,11 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        factors = jax.scipy.linalg.lu_factor(jax.jacfwd(flat)(s.k.ravel()))
+        inverse = _inverse(jax.jacfwd(flat)(s.k.ravel()))
 
         def reuse(carry):
             inner, _ = carry
-            step = jax.scipy.linalg.lu_solve(factors, flat(inner.k.ravel())).reshape(guess.shape)
+            step = (inverse @ flat(inner.k.ravel())).reshape(guess.shape)
             return inner.after(inner.k - step), inner.made + 1 - s.made
 
         def goes_on(carry):
@@ -124,6 +127,18 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
+
+
+@jax.custom_batching.custom_vmap
+def _inverse(matrix):
+    """For Newton's method, which corrects what an inverse loses."""
+    return jnp.linalg.inv(matrix)
+
+
+@_inverse.def_vmap
+def _inverses(axis_size, batched, matrices):
+    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrix_functions.solve
+    return matrix_functions.inverse(matrices), True
 
 
 class State(eqx.Module):
@@ -146,10 +161,12 @@ class State(eqx.Module):
     smallest_energy: jax.Array
     least_entropy_increment: jax.Array
     largest_energy_increment: jax.Array
+    integral: jax.Array  # over time, of what relaxes: see relaxing()
+    first_energy: jax.Array
 
 
 @eqx.filter_jit
-def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
+def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
     energy, entropy = values(system, x)
@@ -172,6 +189,8 @@ def begin(system: System, method: OneStepMethod, x: jax.Array) -> State:
         smallest_energy=energy,
         least_entropy_increment=jnp.asarray(jnp.inf),
         largest_energy_increment=jnp.asarray(-jnp.inf),
+        integral=zero,
+        first_energy=energy,
     )
 
 
@@ -183,18 +202,13 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
     solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale)
-    # x + low is the state; add the increment with its rounding error caught (Neumaier's two-sum)
-    increment = method.increment(h, solved.k) + low
-    new = x + increment
-    back = new - x
-    new_low = (x - (new - back)) + (increment - back)
-    energy, entropy = values(system, new)
-    finite = jnp.isfinite(jnp.sum(new) + energy + entropy)
-    good = solved.converged & finite
+    new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
+    good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
     size = jnp.max(jnp.abs(x))
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
+    mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))
 
     new_state = State(
         x=new,
@@ -214,18 +228,24 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
         smallest_energy=jnp.minimum(state.smallest_energy, energy),
         least_entropy_increment=jnp.minimum(state.least_entropy_increment, entropy - state.entropy),
         largest_energy_increment=jnp.maximum(state.largest_energy_increment, energy - state.energy),
+        integral=state.integral + h * mean,
+        first_energy=state.first_energy,
     )
     failed = eqx.tree_at(lambda s: (s.status, s.residual), state, (failure, residual))
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 
-@eqx.filter_jit
 def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
-    Returns the new state and, for each save, the state vector and whether it was reached.
+    Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
     """
+    h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
+    return _advance(system, method, state, h, saves, every, capacity)
 
+
+@eqx.filter_jit
+def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     def one_save(state: State, index):
         target = state.step + every
 
@@ -234,12 +254,71 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves, every
 
         state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h), state)
         reached = (state.status == RUNNING) & (index < saves)
-        return state, (state.x, reached)
+        return state, (state.x, state.energy, state.entropy, reached)
 
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
+
+
+def stepping(system: System, method: OneStepMethod) -> Callable:
+    """The function (state, h) -> state after one step, or as it was with the status of a failure."""
+    return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
+
+
+@eqx.filter_jit
+def _one_step(system, method, state, h):
+    return take_step(system, method, state, h)
+
+
+def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
+    """The method's estimate of its local error, a number; for both engines."""
+    return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
+
+
+@eqx.filter_jit
+def _error(system, method, x, low, h, k):
+    return method.error(system, x, low, h, k)
+
+
+STEERED = 4 * EPS
+"""Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself."""
+
+
+def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, and a sum that is finite if they are.
+
+    x + low is the state; the increment is added with its rounding error caught (Neumaier's two-sum).
+    """
+    increment = method.increment(h, k) + low
+    new = x + increment
+    back = new - x
+    new_low = (x - (new - back)) + (increment - back)
+    energy, entropy = values(system, new)
+    if system.energy_law == "conserved":
+        new_low = new_low + _steering(system, new, new_low, energy, first_energy)
+    return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy
+
+
+def _steering(system: System, x, low, energy, first_energy):
+    """A shift of the state far below its rounding, at most ``eps |x| / 4``, along the gradient of the energy.
+
+    Each step is exact but for a few roundings, whose sum walks at random: by 1e-13 in 1e6 steps for a general energy.
+    Where it has come to more than a few roundings of H itself, it is taken back.
+    """
+    gradient = system.energy.gradient(x)
+    error = (energy - first_energy) + jnp.dot(gradient, low)
+    size = jnp.dot(jnp.abs(gradient), jnp.abs(x))
+    most = 0.25 * EPS * size
+    amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
+    square = jnp.dot(gradient, gradient)
+    return -gradient * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:
     """Energy and entropy at one state, shape (n,); zero in place of an entropy that the system does not have."""
     entropy = jnp.zeros(()) if system.entropy is None else system.entropy.value(x)
     return system.energy.value(x), entropy
+
+
+def relaxing(system: System, energy, entropy):
+    """The one of the two whose approach to equilibrium is timed: the energy under a double bracket, or the entropy."""
+    return energy if system.energy_law == "nonincreasing" else entropy

@@ -12,13 +12,17 @@ import contextlib
 import hashlib
 import importlib.util
 import inspect
+import itertools
+import math
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,34 +35,39 @@ from . import array, step_loop
 from .array import State
 from .scalarize import Program, scalarize
 
-COUNTS = ("status", "step", "fixed_point", "newton", "most_iterations")
-ARRAYS = ("x", "low", "k", "before")
-REALS = (
-    "energy",
-    "entropy",
-    "residual",
-    "worst_residual",
-    "largest_energy",
-    "smallest_energy",
-    "least_entropy_increment",
-    "largest_energy_increment",
-)
-"""The fields of :class:`.array.State` as the loop keeps them: arrays of their own, and numbers in two arrays."""
+VECTORS = {"x": "X", "low": "LOW", "k": "K", "before": "BEFORE"}
 
-CONSTANTS = (
-    "FIXED_POINT_LIMIT",
-    "FLOOR",
-    "NEEDS_NEWTON",
-    "NEWTON_LIMIT",
-    "NEWTON_REUSE",
-    "NON_FINITE",
-    "NOT_CONVERGED",
-    "PLATEAU",
-    "SHRINKING",
-    "SLOW",
-)
+NUMBERS = {
+    "energy": "ENERGY",
+    "entropy": "ENTROPY",
+    "status": "STATUS",
+    "step": "STEP",
+    "fixed_point": "FIXED_POINT",
+    "newton": "NEWTONS",
+    "most_iterations": "MOST",
+    "residual": "RESIDUAL",
+    "worst_residual": "WORST",
+    "largest_energy": "HIGHEST",
+    "smallest_energy": "LOWEST",
+    "least_entropy_increment": "LEAST_RISE",
+    "largest_energy_increment": "LARGEST_GAIN",
+    "integral": "INTEGRAL",
+    "first_energy": "FIRST_ENERGY",
+}
+"""The fields of :class:`.array.State`, and the rows that hold them in the step loop."""
 
-begin = array.begin
+WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS"
+"""The other rows of one number."""
+
+CONSTANTS = """FIXED_POINT_LIMIT FLOOR HARD IDLE ITERATING NEWTON_LIMIT NEWTON_REUSE NON_FINITE NOT_CONVERGED PLATEAU
+SHRINKING SLOW SOLVED"""
+
+
+def begin(system: System, method: OneStepMethod, x) -> State:
+    """The state of a run about to start at x; as :func:`.array.begin`."""
+    stepper, parameters = stepper_for(system, method)
+    blocks = stepper.begin(parameters, np.asarray(x, dtype=np.float64)[None])
+    return State(**{name: value[0] for name, value in stepper.fields(blocks).items()})
 
 
 def advance(system: System, method: OneStepMethod, state: State, h, saves: int, every: int, capacity: int):
@@ -71,137 +80,289 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves: int, 
     """
     del capacity  # nothing is compiled for a number of saves
     stepper, parameters = stepper_for(system, method)
-    arrays = {name: np.array(getattr(state, name), dtype=np.float64) for name in ARRAYS}
-    counts = np.array([int(getattr(state, name)) for name in COUNTS])
-    reals = np.array([float(getattr(state, name)) for name in REALS])
-    out, origin = np.empty((saves, system.dim)), int(counts[1])
-    for newton in (False, True):  # the module with a Jacobian is compiled only where a step asks for it
-        loop = stepper.loop(newton or stepper.stiff)
-        loop(parameters, float(h), origin, saves, every, *(a.reshape(-1) for a in arrays.values()), counts, reals, out)
-        if counts[0] != step_loop.NEEDS_NEWTON:
-            break
-        stepper.stiff = True
-    fields: dict[str, Any] = dict(arrays) | dict(zip((*COUNTS, *REALS), (*counts, *reals), strict=True))
-    return State(**fields), (out, np.arange(saves) < (counts[1] - origin) // every)
+    blocks = stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
+    out = stepper.run(parameters, blocks, h, saves, every)[0]
+    fields: dict[str, Any] = {name: value[0] for name, value in stepper.fields(blocks).items()}
+    reached = np.arange(saves) < (int(fields["step"]) - int(state.step)) // every
+    return State(**fields), (out[:, :-2], out[:, -2], out[:, -1], reached)
+
+
+def stepping(system: System, method: OneStepMethod) -> Callable:
+    """The function (state, h) -> state after one step; as :func:`.array.stepping`."""
+    stepper, parameters = stepper_for(system, method)
+
+    def step(state: State, h) -> State:
+        blocks = stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
+        stepper.run(parameters, blocks, h, 1, 1)
+        fields: dict[str, Any] = {name: value[0] for name, value in stepper.fields(blocks).items()}
+        return State(**fields)
+
+    return step
 
 
 class Stepper:
     """The step loop of one method on systems of one form, compiled; parameters are arguments.
 
-    Attributes
+    Parameters
     ----------
-    stiff : bool
-        Whether some step has asked for Newton's method: the loop then has it from the start.
+    form : Form
+    parameters : array, shape (p,)
+        Those of one system of that form. Zeros among them hold for all, unless they vary.
+    method : OneStepMethod
+    lanes : int
+        Trajectories that advance together, a block.
+    varies : array of bool, shape (p,)
+        Which parameters are each trajectory's own.
     """
 
-    def __init__(self, system: System, method: OneStepMethod):
-        self.stiff = False
+    def __init__(self, form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int, varies: np.ndarray):
+        self.lanes = lanes
+        system, rebuilt = form.build(parameters), form.build
+        self._stiff = False  # whether some step has asked for Newton's method: the loop then has it from the start
         self._loops: dict[bool, Callable] = {}
-        self._n, self._m = system.dim, system.dim * method.stages
-        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-        leaves, structure = jax.tree_util.tree_flatten(dynamic)
-        ends = np.cumsum([np.size(leaf) for leaf in leaves])
+        self._lock = threading.Lock()
+        self._relaxing = int(system.energy_law != "nonincreasing")
+        self._varies = varies
+        self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
 
-        def rebuilt(p):
-            parts = [p[end - np.size(a) : end].reshape(np.shape(a)) for a, end in zip(leaves, ends, strict=True)]
-            return eqx.combine(jax.tree_util.tree_unflatten(structure, parts), static)
+        def prepare(x, k, before):
+            return method.predict(k, before), jnp.max(jnp.abs(x))
 
-        def slopes(p, x, low, h, k):
-            return method.slopes(rebuilt(p), x, low, h[0], k)
+        def iterate(p, x, low, h, k):
+            new = method.slopes(rebuilt(p), x, low, h[0], k)
+            return new, jnp.max(jnp.abs(new - k)), jnp.max(jnp.abs(new))
 
-        def misfit(p, x, low, h, k):
-            flat = jax.jacfwd(lambda v: slopes(p, x, low, h, v.reshape(k.shape)).ravel() - v)
-            return flat(k.ravel())
+        def jacobian(p, x, low, h, k):
+            misfit = lambda v: method.slopes(rebuilt(p), x, low, h[0], v.reshape(k.shape)).ravel() - v  # noqa: E731
+            return jax.jacfwd(misfit)(k.ravel())
 
-        def values(p, x):
-            return jnp.concatenate([jnp.reshape(value, 1) for value in array.values(rebuilt(p), x)])
+        def finish(p, x, low, h, k, first_energy):
+            return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])
 
-        n, s = self._n, method.stages
-        self._specs: dict[str, tuple[Callable[..., Any], str, bool]] = {
-            "slopes": (slopes, "p x low h k", True),
-            "jacobian": (misfit, "p x low h k", True),
-            "values": (values, "p x", True),
-            "increment": (lambda h, k: method.increment(h[0], k), "h k", False),
-            "predict": (method.predict, "k before", False),
+        def start(p, x):
+            return method.start(rebuilt(p), x), *array.values(rebuilt(p), x)
+
+        n, m = system.dim, system.dim * method.stages
+        self._shapes: dict[str, tuple[int, ...]] = dict.fromkeys([*NUMBERS.values(), *WORK.split()], (1,))
+        self._shapes |= dict.fromkeys(("X", "LOW", "AFTER", "AFTER_LOW"), (n,))
+        self._shapes |= dict.fromkeys(("K", "BEFORE", "GUESS", "NEW"), (method.stages, n))
+        self._shapes |= {"P": parameters.shape, "MATRIX": (m, m)}
+
+        step, end = "P X LOW H GUESS", "P X LOW H GUESS FIRST_ENERGY"
+        # What an iteration needs and does not change is computed once a step.
+        fixed, changing = self._traced(iterate, step).split([step.split().index("GUESS")])
+        self._shapes["FIXED"] = fixed.shapes[0]
+        self._programs: dict[str, list[_Piece]] = {
+            "prepare": [
+                _Piece(self._traced(prepare, "X K BEFORE"), "X K BEFORE", "GUESS SIZE"),
+                _Piece(fixed, step, "FIXED"),
+            ],
+            "iterate": [_Piece(changing, f"{step} FIXED", "NEW UPDATE SLOPE")],
+            "finish": [_Piece(self._traced(finish, end), end, "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK")],
         }
-        self._shapes = {"x": (n,), "low": (n,), "h": (1,), "k": (s, n), "before": (s, n)}
-        parameters = _parameters(dynamic)
-        self._shapes["p"] = parameters.shape
-        self._zeros = np.where(parameters == 0.0, 0.0, np.nan)
+        self._start = self._traced(start, "P X")
+        self._jacobian = lambda: _Piece(self._traced(jacobian, step), step, "MATRIX")
 
-    def loop(self, newton: bool) -> Callable:
+        sizes = {name: math.prod(shape) for name, shape in self._shapes.items()}
+        sizes |= {"P": int(self._varies.sum()), "MATRIX": 0}
+        self._rows = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
+        self._height = sum(sizes.values())
+
+    def _traced(self, function: Callable, arguments: str) -> Program:
+        shapes = [jax.ShapeDtypeStruct(self._shapes[a], jnp.float64) for a in arguments.split()]
+        known = [self._known if a == "P" else None for a in arguments.split()]
+        return scalarize(jax.make_jaxpr(function)(*shapes), known)
+
+    # -- trajectories in blocks -----------------------------------------------------------------------------------
+
+    def begin(self, parameters, x: np.ndarray) -> np.ndarray:
+        """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
+
+        ``parameters`` has shape (p,), or (trajectories, p) where some vary.
+        """
+        own = np.broadcast_to(parameters, (len(x), len(self._varies)))
+        k, energy, entropy = self._start.evaluate(own, x, batch=True)
+        fields: dict[str, Any] = dict.fromkeys(NUMBERS, 0.0) | {"x": x, "low": 0.0, "k": k, "before": k}
+        fields |= dict.fromkeys(("energy", "first_energy", "smallest_energy", "largest_energy"), energy)
+        fields |= {"entropy": entropy}
+        fields |= {"least_entropy_increment": np.inf, "largest_energy_increment": -np.inf}
+        return self.blocks(fields, own)
+
+    def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
+        """Blocks of trajectories with the given fields of :class:`.array.State`, trajectories first."""
+        number, lanes = len(fields["x"]), self.lanes
+        count = -(-number // lanes)
+        blocks = np.zeros((count, self._height, lanes))
+
+        def fill(first, values):
+            rows = np.asarray(values, dtype=np.float64).reshape(number, -1)
+            rows = np.concatenate([rows, np.repeat(rows[-1:], count * lanes - number, axis=0)])  # some lanes stay empty
+            blocks[:, first : first + rows.shape[1]] = rows.reshape(count, lanes, -1).swapaxes(1, 2)
+
+        for name, row in {**VECTORS, **NUMBERS}.items():
+            fill(self._rows[row], np.broadcast_to(fields[name], (number, *np.shape(fields[name])[1:])))
+        if self._varies.any():
+            fill(self._rows["P"], parameters[:, self._varies])
+        blocks[-1, self._rows["STATUS"], lanes - (count * lanes - number) :] = EMPTY
+        return blocks.reshape(count, -1)
+
+    def fields(self, blocks: np.ndarray) -> dict[str, np.ndarray]:
+        """The fields of :class:`.array.State`, trajectories first, those of empty lanes among them."""
+        count = len(blocks)
+        rows = blocks.reshape(count, self._height, self.lanes).swapaxes(1, 2).reshape(count * self.lanes, -1)
+
+        def read(row, shape):
+            return rows[:, self._rows[row] : self._rows[row] + math.prod(shape)].reshape(-1, *shape)
+
+        vectors = {name: read(row, self._shapes[row]) for name, row in VECTORS.items()}
+        return vectors | {name: rows[:, self._rows[row]] for name, row in NUMBERS.items()}
+
+    def run(self, parameters, blocks: np.ndarray, h: float, saves: int, every: int) -> np.ndarray:
+        """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
+
+        Returns, at each save, every trajectory's state, energy and entropy: shape (trajectories, saves, n + 2), with
+        those of empty lanes, and undefined after a failure.
+        """
+        n, lanes, count = self._shapes["X"][0], self.lanes, len(blocks)
+        start = self._rows["H"] * lanes
+        blocks[:, start : start + lanes] = h
+        out, done = np.empty((count, saves, (n + 2) * lanes)), np.zeros(count, dtype=np.int64)
+        if not self._loop(self._stiff)(parameters, blocks, done, saves, every, out):
+            self._stiff = True
+            self._loop(True)(parameters, blocks, done, saves, every, out)
+        return out.reshape(count, saves, n + 2, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, n + 2)
+
+    # -- modules ------------------------------------------------------------------------------------------------------
+
+    def _loop(self, newton: bool) -> Callable:
         """The function ``advance`` of the module, compiled or found compiled."""
-        if newton not in self._loops:
-            names = [name for name in self._specs if newton or name != "jacobian"]
-            text = self._text({name: self.program(name) for name in names}, newton)
-            self._loops[newton] = load(text, self._try_out).advance
-        return self._loops[newton]
+        with self._lock:
+            if newton not in self._loops:
+                self._loops[newton] = load(self._text(newton), self._try_out).advance
+            return self._loops[newton]
 
     def _try_out(self, module: ModuleType) -> None:
         """Take no step, which compiles the loop or finds it compiled."""
-        state = [np.zeros(self._n), np.zeros(self._n), np.zeros(self._m), np.zeros(self._m)]
-        numbers = np.zeros(len(COUNTS), dtype=np.int64), np.zeros(len(REALS))
-        module.advance(np.zeros(self._shapes["p"]), 1.0, 0, 0, 1, *state, *numbers, np.zeros((0, self._n)))
+        blocks, done = np.zeros((0, self._height * self.lanes)), np.zeros(0, dtype=np.int64)
+        module.advance(np.zeros(self._shapes["P"]), blocks, done, 0, 1, np.zeros((0, 0, 0)))
 
-    def program(self, name: str) -> Program:
-        """One of the scalar programs: slopes, jacobian, values, increment or predict."""
-        function, arguments, with_parameters = self._specs[name]
-        shapes = [jax.ShapeDtypeStruct(self._shapes[a], jnp.float64) for a in arguments.split()]
-        known = [self._zeros if a == "p" else None for a in arguments.split()] if with_parameters else None
-        return scalarize(jax.make_jaxpr(function)(*shapes), known)
-
-    def _text(self, programs: dict[str, Program], newton: bool) -> str:
-        n, m = self._n, self._m
+    def _text(self, newton: bool) -> str:
+        lanes, n, m = self.lanes, self._shapes["X"][0], self._shapes["MATRIX"][0]
         lines = ["import math", "", "import numpy as np", "from numba import njit as compiled", ""]
-        lines += ["njit = compiled(cache=CACHE, error_model='numpy')", f"N, M, NEWTON = {n}, {m}, {newton}"]
-        lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS]
-        for name, program in programs.items():
-            arguments = self._specs[name][1].split()
-            sources = []
-            for argument in arguments:
-                size = int(np.prod(self._shapes[argument]))
-                sources += ["h"] if argument == "h" else [f"{argument}[{i}]" for i in range(size)]
-            targets = [f"out[{i // m}, {i % m}]" if name == "jacobian" else f"out[{i}]" for i in range(_size(program))]
-            body = program.body(sources, targets)
-            lines += ["", "", "@njit", f"def {name}({', '.join(arguments)}, out):", *(f"    {line}" for line in body)]
-        if not newton:
-            lines += ["", "", "@njit", "def jacobian(p, x, low, h, k, out):", "    return"]
+        lines += ["entry = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
+        # inlined, the programs keep their values in registers; with Newton's method there are too many calls for that
+        lines += [f"njit = compiled(error_model='numpy', nogil=True, forceinline={not newton})"]
+        lines += [f"N, M, LANES, NEWTON = {n}, {m}, {lanes}, {newton}"]
+        lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS.split()]
+        lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]
+        lines += [f"RELAXING = {self._relaxing * lanes}"]
+        for name, pieces in self._programs.items():
+            body = [line for i, piece in enumerate(pieces) for line in self._body(piece, f"_{i}")]
+            loop = ["    for l in range(first, last):", *(f"        {line}" for line in body)]
+            lines += ["", "", "@njit", f"def {name}(p, w, first, last):", *loop]
+        body = self._body(self._jacobian()) if newton else ["pass"]
+        lines += ["", "", "@njit", "def jacobian(p, w, l, matrix):", *(f"    {line}" for line in body)]
         return "\n".join(lines) + "\n\n\n" + _template()
+
+    def _body(self, piece: _Piece, prefix: str = "") -> list[str]:
+        return piece.program.body(self._cells(piece.arguments), self._cells(piece.results), prefix)
+
+    def _cells(self, names: str) -> list[str]:
+        """Where the entries of some arrays are found for lane l, as Python expressions."""
+        cells, lanes, own = [], self.lanes, itertools.count(self._rows["P"])
+        for name in names.split():
+            size = math.prod(self._shapes[name])
+            if name == "P":
+                cells += [f"w[{next(own) * lanes} + l]" if v else f"p[{i}]" for i, v in enumerate(self._varies)]
+            elif name == "MATRIX":
+                cells += [f"matrix[{i}, {j}]" for i, j in np.ndindex(self._shapes[name])]
+            else:
+                cells += [f"w[{(self._rows[name] + i) * lanes} + l]" for i in range(size)]
+        return cells
+
+
+class _Piece(NamedTuple):
+    """A program, and the names of the arrays that it reads and writes."""
+
+    program: Program
+    arguments: str
+    results: str
+
+
+EMPTY = 9.0
+"""Status of a lane without a trajectory."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """What systems have in common that differ in their parameters.
+
+    Attributes
+    ----------
+    key : hashable
+        The same for the same form.
+    shapes : tuple of shapes
+        Of the parameters, which are arrays.
+    rebuild : function from a list of arrays to a System
+    """
+
+    key: Any
+    shapes: tuple[tuple[int, ...], ...]
+    rebuild: Callable[[list], System] = field(compare=False)
+
+    @classmethod
+    def of(cls, system: System) -> Form:
+        """The form of a system, its parameters being the arrays among its leaves: its functions count by identity."""
+        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+        leaves, structure = jax.tree_util.tree_flatten(dynamic)
+        functions, outline = jax.tree_util.tree_flatten(static)
+        return cls(
+            (outline, tuple(functions)),
+            tuple(np.shape(leaf) for leaf in leaves),
+            lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
+        )
+
+    def build(self, p) -> System:
+        """The system with the parameters p, shape (p,), all arrays one after another."""
+        ends = list(itertools.accumulate(map(math.prod, self.shapes)))
+        arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
+        return self.rebuild(arrays)
 
 
 _steppers: dict[Any, Stepper] = {}
 
+STEPPERS = 256
+"""Forms whose loops are held in memory."""
+
+
+def stepper_of(
+    form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int = 1, varies: np.ndarray | None = None
+) -> Stepper:
+    """The stepper for systems of a form.
+
+    Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
+    """
+    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    known = (parameters == 0.0) & ~varies
+    key = (form.key, form.shapes, known.tobytes(), method, lanes, varies.tobytes())
+    if key not in _steppers:
+        while len(_steppers) >= STEPPERS:
+            del _steppers[next(iter(_steppers))]
+        _steppers[key] = Stepper(form, parameters, method, lanes, varies)
+    return _steppers[key]
+
 
 def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndarray]:
-    """The stepper for systems of this form, and the parameters of this one.
-
-    The form is the structure of the system (its functions by identity) and which of its parameters are zero: a diagonal
-    matrix makes a shorter program.
-    """
-    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-    parameters = _parameters(dynamic)
-    functions, structure = jax.tree_util.tree_flatten(static)
-    shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(dynamic))
-    key = (structure, tuple(functions), shapes, (parameters == 0.0).tobytes(), method)
-    if key not in _steppers:
-        _steppers[key] = Stepper(system, method)
-    return _steppers[key], parameters
-
-
-def _parameters(dynamic) -> np.ndarray:
-    """All arrays among the leaves of a system, one after another."""
-    leaves = [np.asarray(leaf, dtype=np.float64).ravel() for leaf in jax.tree_util.tree_leaves(dynamic)]
-    return np.concatenate([np.zeros(0), *leaves])
-
-
-def _size(program: Program) -> int:
-    return sum(map(len, program.outputs))
+    """The stepper for one trajectory of a system, and the system's parameters."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
+    parameters = np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
+    return stepper_of(Form.of(system), parameters, method), parameters
 
 
 def _template() -> str:
     """The step loop, as the module :mod:`.step_loop` has it below its mark."""
     source = inspect.getsource(step_loop)
-    return source[source.index("@njit\ndef residual_size") :]
+    return source[source.index("@njit\ndef settle") :]
 
 
 # -- modules on disk ----------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 Scalar = str | float | int | bool
 
@@ -94,6 +95,19 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     op: eval(f"lambda a=0, b=0, c=0: {text.format('a', 'b', 'c')}", {"np": np, "math": math})
     for op, text in OPERATIONS.items()
 }
+
+INTERPRETED: dict[str, Callable[..., Any]] = FUNCTIONS | {
+    "erf": scipy.special.erf,
+    "erfc": scipy.special.erfc,
+    "max": np.maximum,
+    "min": np.minimum,
+    "not": np.logical_not,
+    "select": np.where,
+    "float": lambda a: np.asarray(a, dtype=np.float64),
+    "int": lambda a: np.asarray(a, dtype=np.int64),
+    "truncate": np.vectorize(FUNCTIONS["truncate"], otypes=[np.int64]),
+}
+"""The same on NumPy arrays."""
 
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 

@@ -12,13 +12,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ..errors import InputError, LiethermoError
 from .primitives import (
-    FUNCTIONS,
+    INTERPRETED,
     OPERATIONS,
     PARAMETERS,
     RULES,
@@ -81,18 +82,72 @@ class Program:
         """How many instructions there are of each kind."""
         return Counter(instruction.op for instruction in self.instructions)
 
-    def evaluate(self, *arrays) -> list[np.ndarray]:
-        """The outputs for given input arrays, interpreted with Python's floats."""
-        values: dict[Scalar, Scalar] = {}
+    def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
+        """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
+
+        With ``batch`` inputs and outputs have one axis more in front, the same for all.
+        """
+        arrays = tuple(np.asarray(x, dtype=np.float64) for x in arrays)
+        front = arrays[0].shape[:1] if batch else ()
+        values: dict[Scalar, Any] = {}
         for names, x in zip(self.inputs, arrays, strict=True):
-            values.update(zip(names, np.asarray(x, dtype=np.float64).ravel(), strict=True))
+            values.update(zip(names, np.moveaxis(x.reshape(*front, -1), -1, 0), strict=True))
         with np.errstate(all="ignore"):
             for target, op, args in self.instructions:
-                values[target] = FUNCTIONS[op](*(values[a] if type(a) is str else a for a in args))
-        return [
-            np.array([values[a] if type(a) is str else a for a in entries]).reshape(shape)
-            for entries, shape in zip(self.outputs, self.shapes, strict=True)
-        ]
+                values[target] = INTERPRETED[op](*(values[a] if type(a) is str else a for a in args))
+
+        def gathered(entries, shape):
+            columns = [np.broadcast_to(values[a] if type(a) is str else a, front) for a in entries]
+            return np.stack(columns, axis=-1).reshape((*front, *shape)) if columns else np.zeros((*front, *shape))
+
+        return [gathered(entries, shape) for entries, shape in zip(self.outputs, self.shapes, strict=True)]
+
+    def degree(self, place: int) -> float:
+        """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
+
+        Parameters
+        ----------
+        place : int
+            Of the input.
+        """
+        degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
+        for target, op, args in self.instructions:
+            found = [degrees.get(a, 0) for a in args]
+            if op in ("add", "sub", "neg"):
+                degrees[target] = max(found)
+            elif op == "mul":
+                degrees[target] = sum(found)
+            elif op == "div" and not found[1]:
+                degrees[target] = found[0]
+            else:
+                degrees[target] = math.inf if any(found) else 0
+        return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
+
+    def split(self, late: Sequence[int]) -> tuple[Program, Program]:
+        """What can be computed without some of the inputs, and the rest.
+
+        The second program has one more input array, at the end: the output of the first.
+
+        Parameters
+        ----------
+        late : sequence of int
+            Places of those inputs.
+        """
+        waiting: set[Scalar] = {name for i in late for name in self.inputs[i]}
+        early, rest = [], []
+        for instruction in self.instructions:
+            if waiting.isdisjoint(instruction.args):
+                early.append(instruction)
+            else:
+                rest.append(instruction)
+                waiting.add(instruction.target)
+        wanted = {a for instruction in rest for a in instruction.args} | {
+            a for entries in self.outputs for a in entries
+        }
+        handed = tuple(instruction.target for instruction in early if instruction.target in wanted)
+        instructions, renamed = _live(early, handed)
+        first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
+        return first, Program((*self.inputs, handed), tuple(rest), self.outputs, self.shapes)
 
     def body(self, sources: Sequence[str], targets: Sequence[str], prefix: str = "") -> list[str]:
         """The program as lines of Python, to be placed in a function that numba compiles.

@@ -2,6 +2,11 @@
 
 The engine copies everything below the mark into a module of its own for each system, after the scalar programs that
 take the place of the stand-ins above it. The rules of the iteration are those of the array engine, in the same words.
+
+A *block* of LANES trajectories advances together, one SIMD lane each; a single trajectory is a block of one lane. All
+that a block knows lies in one array w of rows, a number for each lane: ``w[X + i * LANES + l]`` is component i of the
+state of lane l. (One array, and offsets that are constants, are what lets the compiler see that lanes do not interact.)
+The programs work on the lanes from ``first`` to ``last``.
 """
 
 import numpy as np
@@ -18,50 +23,71 @@ from .array import (
     SLOW,
 )
 
-N = M = 0
-"""Components of the state, and of all stage slopes together."""
+IDLE, ITERATING, SOLVED, HARD = 0, 1, 2, 3
+"""Phases of a lane within a step."""
 
+N = M = LANES = 1
 NEWTON = False
-"""Whether the module has a Jacobian; one without is smaller, and reports NEEDS_NEWTON where it would want it."""
+"""Components of the state and of all stage slopes together; trajectories in a block; whether there is a Jacobian."""
 
-NEEDS_NEWTON = 3
-
-
-def predict(k, before, out):
-    raise NotImplementedError
-
-
-def slopes(p, x, low, h, k, out):
-    raise NotImplementedError
+X = LOW = K = BEFORE = GUESS = NEW = AFTER = AFTER_LOW = AFTER_ENERGY = AFTER_ENTROPY = CHECK = 0
+H = SIZE = UPDATE = SLOPE = PREVIOUS = BEST = STALLED = PHASE = CHANGE = TRIES = CORRECTIONS = 0
+STATUS = STEP = FIXED_POINT = NEWTONS = MOST = ENERGY = ENTROPY = RESIDUAL = WORST = 0
+HIGHEST = LOWEST = LEAST_RISE = LARGEST_GAIN = INTEGRAL = RELAXING = 0
+"""Offsets of the rows in w. ENTROPY follows ENERGY; RELAXING is the distance to the one whose relaxation is timed."""
 
 
-def jacobian(p, x, low, h, k, out):
-    raise NotImplementedError
+def prepare(p, w, first, last):
+    """GUESS from K and BEFORE; SIZE, the largest component of the state."""
 
 
-def increment(h, k, out):
-    raise NotImplementedError
+def iterate(p, w, first, last):
+    """NEW, the slopes at GUESS; UPDATE, their largest difference; SLOPE, the largest of them."""
 
 
-def values(p, x, out):
-    raise NotImplementedError
+def jacobian(p, w, lane, matrix):
+    """The derivative of NEW - GUESS by GUESS."""
+
+
+def finish(p, w, first, last):
+    """AFTER and AFTER_LOW, the state that GUESS leads to, its energy and entropy; CHECK, finite if they all are."""
 
 
 def njit(function):
     return function
 
 
+entry = njit
+
+
 # -- the mark: what follows is copied ---------------------------------------------------------------------------------
 
 
 @njit
-def residual_size(p, x, low, h, k, new):
-    """``|slopes(k) - k|``; new receives the slopes."""
-    slopes(p, x, low, h, k, new)
-    total = 0.0
-    for i in range(M):
-        total += (new[i] - k[i]) ** 2
-    return np.sqrt(total)
+def settle(w, made):
+    """Judge the iterates of all lanes and accept NEW; the number of lanes that go on."""
+    for i in range(0, M * LANES, LANES):
+        for l in range(LANES):
+            w[GUESS + i + l] = w[NEW + i + l] if w[PHASE + l] == ITERATING else w[GUESS + i + l]
+    going = 0
+    for l in range(LANES):
+        update, previous, best = w[UPDATE + l], w[PREVIOUS + l], w[BEST + l]
+        rate = update / previous if made > 1 and previous > 0.0 else 0.0
+        stalled = 0.0 if update < SHRINKING * best else w[STALLED + l] + 1.0
+        best = update if update < best else best
+        scale = w[SIZE + l] / w[H + l] + w[SLOPE + l]
+        done = update <= FLOOR * scale or (stalled >= 2.0 and update <= PLATEAU * scale)
+        hopeless = not update < np.inf or (made >= 3 and rate > SLOW and best > PLATEAU * scale)
+        phase = SOLVED if done else (HARD if hopeless or made == FIXED_POINT_LIMIT else ITERATING)
+        keep = w[PHASE + l] == ITERATING
+        w[PREVIOUS + l] = update
+        w[BEST + l] = best
+        w[STALLED + l] = stalled
+        w[CHANGE + l] = update if keep else w[CHANGE + l]
+        w[TRIES + l] = made if keep else w[TRIES + l]
+        w[PHASE + l] = phase if keep else w[PHASE + l]
+        going += 1 if keep and phase == ITERATING else 0
+    return going
 
 
 @njit
@@ -99,129 +125,148 @@ def substitute(A, order, b):
 
 
 @njit
-def solve_by_newton(p, x, low, h, k, new, largest, matrix, order):
-    """Simplified Newton from k, in place; returns status, iterations and last update."""
-    update, best, rate, stalled, made, used = np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
-    while made < NEWTON_LIMIT:
+def misfit(p, w, l):
+    """``|slopes(k) - k|`` at the GUESS of a lane."""
+    iterate(p, w, l, l + 1)
+    total = 0.0
+    for i in range(l, M * LANES, LANES):
+        total += (w[NEW + i] - w[GUESS + i]) ** 2
+    return np.sqrt(total)
+
+
+@njit
+def solve_by_newton(p, w, l, matrix, order, b):
+    """Simplified Newton for one lane."""
+    # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may wander.
+    prepare(p, w, l, l + 1)
+    predicted = misfit(p, w, l)
+    for i in range(l, M * LANES, LANES):
+        w[GUESS + i] = 0.0
+    if predicted <= misfit(p, w, l):
+        prepare(p, w, l, l + 1)
+    status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
+    while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:
-            jacobian(p, x, low, h, k, matrix)
+            jacobian(p, w, l, matrix)
             if not factorise(matrix, order):
-                return NON_FINITE, made, np.nan
+                status, update = NON_FINITE, np.nan
+                break
             used = 0
-        slopes(p, x, low, h, k, new)
+        iterate(p, w, l, l + 1)
         for i in range(M):
-            new[i] -= k[i]
-        substitute(matrix, order, new)
+            b[i] = w[NEW + i * LANES + l] - w[GUESS + i * LANES + l]
+        substitute(matrix, order, b)
         previous, update, size, total = update, 0.0, 0.0, 0.0
         for i in range(M):
-            update = max(update, abs(new[i]))
-            total += new[i]
-            k[i] -= new[i]
-            size = max(size, abs(k[i]))
+            w[GUESS + i * LANES + l] -= b[i]
+            update = max(update, abs(b[i]))
+            size = max(size, abs(w[GUESS + i * LANES + l]))
+            total += b[i]
         made, used = made + 1, used + 1
+        rate = update / previous if made > 1 and previous > 0.0 else 0.0
+        stalled = 0 if update < SHRINKING * best else stalled + 1
+        best = min(best, update)
+        scale = w[SIZE + l] / w[H + l] + size
         if not np.isfinite(total):
-            return NON_FINITE, made, np.nan
-        rate = update / previous if made > 1 and previous > 0.0 else 0.0
-        stalled = 0 if update < SHRINKING * best else stalled + 1
-        best = min(best, update)
-        scale = largest / h + size
-        if update <= FLOOR * scale or (stalled >= 2 and update <= PLATEAU * scale):
-            return 0, made, update
-    return NOT_CONVERGED, made, update
+            status, update = NON_FINITE, np.nan
+        elif update <= FLOOR * scale or (stalled >= 2 and update <= PLATEAU * scale):
+            status = 0
+    w[STATUS + l] = status
+    w[PHASE + l] = SOLVED if status == 0 else IDLE
+    w[CHANGE + l] = update
+    w[CORRECTIONS + l] = made
+    if status != 0:
+        w[RESIDUAL + l] = w[H + l] * update / (w[SIZE + l] if w[SIZE + l] > 0.0 else 1.0)
 
 
 @njit
-def take_step(p, h, x, low, k, before, counts, reals, guess, new, d, pair, matrix, order):
-    """One step in place; where it fails nothing changes but the status, which is returned, and the residual."""
-    largest = 0.0
-    for i in range(N):
-        largest = max(largest, abs(x[i]))
-    predict(k, before, guess)
-    update, best, stalled, made, done = np.inf, np.inf, 0, 0, False
-    while made < FIXED_POINT_LIMIT:
-        slopes(p, x, low, h, guess, new)
-        previous, update, size, total = update, 0.0, 0.0, 0.0
-        for i in range(M):
-            change = abs(new[i] - guess[i])
-            update = max(update, change)
-            total += change
-            size = max(size, abs(new[i]))
-            guess[i] = new[i]
-        finite = np.isfinite(total)
-        made += 1
-        rate = update / previous if made > 1 and previous > 0.0 else 0.0
-        stalled = 0 if update < SHRINKING * best else stalled + 1
-        best = min(best, update)
-        scale = largest / h + size
-        if finite and (update <= FLOOR * scale or (stalled >= 2 and update <= PLATEAU * scale)):
-            done = True
-            break
-        if not finite or (made >= 3 and rate > SLOW and best > PLATEAU * scale):
-            break
-    corrections = 0
-    if not done:
-        if not NEWTON:
-            return NEEDS_NEWTON
-        # The prediction, or a step of nothing where that solves the equations better: far out Newton may wander.
-        predict(k, before, guess)
-        predicted = residual_size(p, x, low, h, guess, new)
-        for i in range(M):
-            new[i] = 0.0
-        nothing = residual_size(p, x, low, h, new.copy(), new)
-        if not predicted <= nothing:
-            for i in range(M):
-                guess[i] = 0.0
-        status, corrections, update = solve_by_newton(p, x, low, h, guess, new, largest, matrix, order)
-        if status != 0:
-            reals[2] = h * update / (largest if largest > 0.0 else 1.0)
-            return status
-    increment(h, guess, d)
-    for i in range(N):  # x + low is the state; add the increment with its rounding error caught (Neumaier's two-sum)
-        d[i] += low[i]
-        pair[i] = x[i] + d[i]
-    values(p, pair, pair[N:])
-    total = pair[N] + pair[N + 1]
-    for i in range(N):
-        total += pair[i]
-    if not np.isfinite(total):
-        reals[2] = h * update / (largest if largest > 0.0 else 1.0)
-        return NON_FINITE
-    for i in range(N):
-        back = pair[i] - x[i]
-        low[i] = (x[i] - (pair[i] - back)) + (d[i] - back)
-        x[i] = pair[i]
-    for i in range(M):
-        before[i] = k[i]
-        k[i] = guess[i]
-    energy, entropy = pair[N], pair[N + 1]
-    counts[1] += 1
-    counts[2] += made
-    counts[3] += corrections
-    counts[4] = max(counts[4], made + corrections)
-    reals[2] = h * update / (largest if largest > 0.0 else 1.0)
-    reals[3] = max(reals[3], reals[2])
-    reals[4] = max(reals[4], energy)
-    reals[5] = min(reals[5], energy)
-    reals[6] = min(reals[6], entropy - reals[1])
-    reals[7] = max(reals[7], energy - reals[0])
-    reals[0] = energy
-    reals[1] = entropy
-    return 0
+def take_step(p, w, matrix, order, b):
+    """One step of every lane that is running; where one fails its state stays and a status says why.
 
-
-@njit
-def advance(p, h, origin, saves, every, x, low, k, before, counts, reals, out):
-    """From wherever ``counts`` says up to step ``origin + saves * every``, keeping every so-manieth state in out.
-
-    Where a step fails its status is left in ``counts[0]``, and another call may go on from there.
+    False, and nothing has happened, where some lane needs Newton's method and the module has none.
     """
-    guess, new, d, pair = np.empty(M), np.empty(M), np.empty(N), np.empty(N + 2)
-    matrix, order = np.empty((M, M)), np.empty(M, np.int64)
-    while counts[1] < origin + saves * every:
-        counts[0] = take_step(p, h, x, low, k, before, counts, reals, guess, new, d, pair, matrix, order)
-        if counts[0] != 0:
-            return
-        done = counts[1] - origin
-        if done % every == 0:
-            for i in range(N):
-                out[done // every - 1, i] = x[i]
+    prepare(p, w, 0, LANES)
+    going = 0
+    for l in range(LANES):
+        running = w[STATUS + l] == 0.0
+        w[PHASE + l] = ITERATING if running else IDLE
+        w[PREVIOUS + l] = np.inf
+        w[BEST + l] = np.inf
+        w[STALLED + l] = 0.0
+        w[CORRECTIONS + l] = 0.0
+        going += 1 if running else 0
+    made = 0
+    while going > 0:
+        iterate(p, w, 0, LANES)
+        made += 1
+        going = settle(w, made)
+    hard = 0
+    for l in range(LANES):
+        hard += 1 if w[PHASE + l] == HARD else 0
+    if hard > 0:
+        if not NEWTON:
+            return False
+        for l in range(LANES):
+            if w[PHASE + l] == HARD:
+                solve_by_newton(p, w, l, matrix, order, b)
+    finish(p, w, 0, LANES)
+    for l in range(LANES):
+        solved = w[PHASE + l] == SOLVED
+        good = solved and np.isfinite(w[CHECK + l])
+        residual = w[H + l] * w[CHANGE + l] / (w[SIZE + l] if w[SIZE + l] > 0.0 else 1.0)
+        energy, entropy, relaxing = w[AFTER_ENERGY + l], w[AFTER_ENTROPY + l], w[AFTER_ENERGY + RELAXING + l]
+        rise, gain = entropy - w[ENTROPY + l], energy - w[ENERGY + l]
+        iterations = w[TRIES + l] + w[CORRECTIONS + l]
+        w[INTEGRAL + l] += 0.5 * w[H + l] * (w[ENERGY + RELAXING + l] + relaxing) if good else 0.0
+        w[STATUS + l] = NON_FINITE if solved and not good else w[STATUS + l]
+        w[PHASE + l] = SOLVED if good else IDLE
+        w[RESIDUAL + l] = residual if solved else w[RESIDUAL + l]
+        w[STEP + l] += 1.0 if good else 0.0
+        w[FIXED_POINT + l] += w[TRIES + l] if good else 0.0
+        w[NEWTONS + l] += w[CORRECTIONS + l] if good else 0.0
+        w[MOST + l] = iterations if good and iterations > w[MOST + l] else w[MOST + l]
+        w[WORST + l] = residual if good and residual > w[WORST + l] else w[WORST + l]
+        w[HIGHEST + l] = energy if good and energy > w[HIGHEST + l] else w[HIGHEST + l]
+        w[LOWEST + l] = energy if good and energy < w[LOWEST + l] else w[LOWEST + l]
+        w[LEAST_RISE + l] = rise if good and rise < w[LEAST_RISE + l] else w[LEAST_RISE + l]
+        w[LARGEST_GAIN + l] = gain if good and gain > w[LARGEST_GAIN + l] else w[LARGEST_GAIN + l]
+        w[ENERGY + l] = energy if good else w[ENERGY + l]
+        w[ENTROPY + l] = entropy if good else w[ENTROPY + l]
+    for i in range(0, N * LANES, LANES):
+        for l in range(LANES):
+            good = w[PHASE + l] == SOLVED
+            w[X + i + l] = w[AFTER + i + l] if good else w[X + i + l]
+            w[LOW + i + l] = w[AFTER_LOW + i + l] if good else w[LOW + i + l]
+    for i in range(0, M * LANES, LANES):
+        for l in range(LANES):
+            good = w[PHASE + l] == SOLVED
+            w[BEFORE + i + l] = w[K + i + l] if good else w[BEFORE + i + l]
+            w[K + i + l] = w[GUESS + i + l] if good else w[K + i + l]
+    return True
+
+
+@entry
+def advance(p, blocks, done, saves, every, out):
+    """Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept, with its energies.
+
+    False where a block needs Newton's method and the module has none: another call, with one that has, goes on there.
+    """
+    matrix, order, b = np.empty((M, M)), np.empty(M, np.int64), np.empty(M)
+    for block in range(len(blocks)):
+        w = blocks[block]
+        while done[block] < saves * every:
+            running = 0
+            for l in range(LANES):
+                running += 1 if w[STATUS + l] == 0.0 else 0
+            if running == 0:
+                break
+            if not take_step(p, w, matrix, order, b):
+                return False
+            done[block] += 1
+            if done[block] % every == 0:
+                kept = out[block, done[block] // every - 1]
+                for i in range(N * LANES):
+                    kept[i] = w[X + i]
+                for i in range(2 * LANES):
+                    kept[N * LANES + i] = w[ENERGY + i]
+    return True

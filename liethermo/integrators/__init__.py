@@ -1,6 +1,7 @@
 """Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
 
 from .base import OneStepMethod, registered_methods
+from .gauss import MetriplecticGauss
 from .midpoint import MetriplecticMidpoint
 from .reference import Reference
 
@@ -9,4 +10,4 @@ METHODS: dict[str, type] = {type(method).__name__: type(method) for method in re
 }
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""
 
-__all__ = ["METHODS", "MetriplecticMidpoint", "OneStepMethod", "Reference", "registered_methods"]
+__all__ = ["METHODS", "MetriplecticGauss", "MetriplecticMidpoint", "OneStepMethod", "Reference", "registered_methods"]

@@ -9,7 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..errors import InputError
 from ..systems import System
+from .tableaus import at_start
 
 _registry: list[OneStepMethod] = []
 
@@ -54,6 +56,13 @@ class OneStepMethod(eqx.Module):
     def increment(self, h, k) -> jax.Array:
         """``x' - x``, shape (n,), from the solved slopes."""
 
+    def check(self, system: System) -> None:
+        """Raise InputError where the method cannot be used on a system; called when a run starts."""
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
+        raise InputError(f"{self} has no error estimate, so its steps cannot be adaptive")
+
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""
         return jnp.tile(system.vector_field(x), (self.stages, 1))
@@ -64,6 +73,20 @@ class OneStepMethod(eqx.Module):
 
     def __str__(self) -> str:
         return type(self).__name__
+
+
+def collocation_error(system: System, x, low, h, k) -> jax.Array:
+    """A local error O(h^{2s+1}) of collocation at s Gauss nodes, from how far its polynomial u misses the field.
+
+    ``e = h |f(x) - u'(0)| / (s + 1)`` is the difference to a quadrature formula of order s on the nodes and the
+    start: O(h^{s+1}) [Hairer & Wanner 1996, IV.8]. The method being of order 2s, e relative to the state is raised to
+    the power (2s + 1)/(s + 1).
+    """
+    s = len(k)
+    missed = system.vector_field(x + low) - at_start(s) @ k
+    size = jnp.max(jnp.abs(x))
+    relative = h * jnp.max(jnp.abs(missed)) / ((s + 1) * jnp.where(size > 0.0, size, 1.0))
+    return size * relative ** ((2 * s + 1) / (s + 1))
 
 
 def register(*methods: OneStepMethod) -> None:

@@ -6,7 +6,7 @@ import jax
 
 from ..gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
-from .base import OneStepMethod, register
+from .base import OneStepMethod, collocation_error, register
 
 
 class MetriplecticMidpoint(OneStepMethod):
@@ -50,6 +50,9 @@ class MetriplecticMidpoint(OneStepMethod):
         dS = None if system.entropy is None else system.entropy.gradient(z)
         dL = tuple(self.gradient(L, x, d, low) for L in system.preserved)
         return system.field(z, dH, dS, dL)[None]
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        return collocation_error(system, x, low, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]

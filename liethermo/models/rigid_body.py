@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 
@@ -32,20 +32,20 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     return LiePoissonSystem(
         mf.so(3),
         energy=Quadratic(1.0 / _inertia(inertia)),
-        entropy=Quadratic(jnp.ones(3)),
+        entropy=Quadratic(np.ones(3)),
         dissipation=KillingDissipation(0.5 * checked_rate(rate)),
     )
 
 
 def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePoissonSystem:
     """The free rigid body ``Pi' = Pi × Omega``: energy and ``|Pi|^2 / 2`` both conserved."""
-    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / _inertia(inertia)), entropy=Quadratic(jnp.ones(3)))
+    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / _inertia(inertia)), entropy=Quadratic(np.ones(3)))
 
 
-def _inertia(inertia) -> jax.Array:
-    moments = jnp.asarray(inertia, dtype=jnp.float64)
+def _inertia(inertia) -> np.ndarray | jax.Array:
+    moments = inertia if isinstance(inertia, jax.core.Tracer) else np.asarray(inertia, dtype=np.float64)
     if moments.shape != (3,):
         raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
-    if not isinstance(moments, jax.core.Tracer) and not bool((moments > 0.0).all() & jnp.isfinite(moments).all()):
+    if not isinstance(moments, jax.core.Tracer) and not (np.all(moments > 0.0) and np.isfinite(moments).all()):
         raise InputError(f"moments of inertia are positive and finite, not {moments.tolist()}")
     return moments

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar
+from ..energy import Energy, as_energy, check_scalar, recognised
+from ..engine.interpret import at_points
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 
@@ -51,8 +53,10 @@ class System(eqx.Module):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
         self.momentum_maps = {name: as_energy(J, f"momentum map {name!r}") for name, J in momentum_maps.items()}
         check_scalar(self.energy, dim, "the energy")
+        self.energy = recognised(self.energy, dim)
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
+            self.entropy = recognised(self.entropy, dim)
         for name, J in self.momentum_maps.items():
             check_scalar(J, dim, f"momentum map {name!r}")
         if dissipation is not None and not isinstance(dissipation, Dissipation):
@@ -68,6 +72,11 @@ class System(eqx.Module):
             self.dissipation = dissipation.prepared(self)
         if validate and not _has_tracers(self):
             self._validate()
+
+    @property
+    def unrollable(self) -> bool:
+        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
+        return True
 
     # -- dynamics -------------------------------------------------------------------------------------------------
 
@@ -123,9 +132,21 @@ class System(eqx.Module):
         it too, and a Casimir only if the dissipation does: that is found out at random points.
         """
         found = {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)} | self._casimirs()
-        constant = _conserved(self, tuple(found.values()))
+        constant = self.conserves(tuple(found.values()))
         claimed = {name: (J, True) for name, J in self.momentum_maps.items()}
         return claimed | {name: (f, kept) for (name, f), kept in zip(found.items(), constant, strict=True)}
+
+    def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
+        """Whether each function is constant along the vector field, at random points inside its domain."""
+        if not functions:
+            return []
+        points = np.random.default_rng(0).standard_normal((8, self.dim))
+        rates, sizes = at_points(_rates_of_change, (self, functions), points)
+        inside = np.isfinite(rates)
+        return [
+            bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
+            for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
+        ]
 
     def _casimirs(self) -> dict[str, Energy]:
         """Casimirs of the Poisson structure worth recording."""
@@ -147,16 +168,18 @@ class System(eqx.Module):
                 raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
             if x.dtype.kind not in "fiubc":
                 raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
-        x = jnp.asarray(x)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
             expected = f"(..., {self.dim})" if batch else f"({self.dim},)"
             raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
-        if not isinstance(x, jax.core.Tracer) and not bool(jnp.isfinite(x).all()):
-            where = np.argwhere(~np.isfinite(np.asarray(x)))[0]
-            raise InputError(f"the state is not finite: component {tuple(map(int, where))} is {x[tuple(where)]}")
-        return x.astype(jnp.float64)
+        if isinstance(x, jax.core.Tracer):
+            return x.astype(jnp.float64)
+        numbers = np.asarray(x)
+        if not np.isfinite(numbers).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+            raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
+        return real_array(x)
 
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
@@ -201,29 +224,13 @@ class System(eqx.Module):
         return self.entropy
 
 
-def _conserved(system: System, functions: tuple[Energy, ...]) -> list[bool]:
-    """Whether each function is constant along the vector field, at random points inside its domain."""
-    if not functions:
-        return []
-    points = np.random.default_rng(0).standard_normal((8, system.dim))
-    rates, sizes = (np.asarray(values) for values in _rates_of_change(system, functions, points))
-    inside = np.isfinite(rates)
-    return [
-        bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
-        for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
-    ]
-
-
-@eqx.filter_jit
-def _rates_of_change(system: System, functions: tuple[Energy, ...], points):
-    def at(x):
-        velocity, gradients = system.vector_field(x), jnp.stack([f.gradient(x) for f in functions])
-        speed = jnp.linalg.norm(velocity) + jnp.linalg.norm(
-            system.poisson.tensor(x) @ jnp.abs(system.energy.gradient(x))
-        )
-        return gradients @ velocity, jnp.linalg.norm(gradients, axis=1) * speed
-
-    return jax.vmap(at)(points)
+def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
+    """The rate of change of each function along the vector field, and the size of what cancels in it."""
+    system, functions = model
+    velocity, gradients = system.vector_field(x), jnp.stack([f.gradient(x) for f in functions])
+    speed = jnp.linalg.norm(velocity)
+    speed += jnp.linalg.norm(system.poisson.tensor(x) @ jnp.abs(system.energy.gradient(x)))
+    return gradients @ velocity, jnp.linalg.norm(gradients, axis=1) * speed
 
 
 def square_field(function: Callable, dim: int, what: str) -> None:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..engine.interpret import at_points
 from ..errors import InputError
 
 if TYPE_CHECKING:
@@ -59,8 +59,11 @@ def check_system(system: System, points, samples: int, seed: int, scale: float) 
         if samples < 1:
             raise InputError(f"samples must be a positive integer, not {samples}")
         points = scale * np.random.default_rng(seed).standard_normal((samples, system.dim))
-    points = jnp.atleast_2d(system.state(points, batch=True)).reshape(-1, system.dim)
-    measured = {name: np.asarray(value) for name, value in _measure(system, points).items()}
+    points = np.asarray(system.state(points, batch=True)).reshape(-1, system.dim)
+    measured = at_points(_residuals, system, points)
+    friction = measured.pop("friction", None)
+    if friction is not None:
+        measured["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
     inside = np.isfinite(measured["domain"])
     if not inside.any():
         raise InputError(
@@ -107,13 +110,16 @@ def _row(system: System, name: str, values: np.ndarray, axiom: str, note: str) -
     return CheckRow(axiom, worst, AXIOM_TOLERANCE, passed, "" if passed else note)
 
 
-@eqx.filter_jit
-def _measure(system: System, points: jax.Array) -> dict[str, jax.Array]:
-    """Residual of each axiom at each point, relative to the size of the terms that cancel."""
-    return jax.vmap(lambda x: _residuals(system, x))(points)
+def _indefiniteness(K: np.ndarray) -> float:
+    """Minus the lowest eigenvalue where that is negative, relative to the size of K."""
+    scale = np.abs(K).max()
+    if not 0.0 < scale < np.inf:
+        return 0.0 if scale == 0.0 else np.nan
+    return max(0.0, -float(np.linalg.eigvalsh((K + K.T) / 2)[0])) / scale
 
 
 def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
+    """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix."""
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     tensor, dH = system.poisson.tensor(x), system.energy.gradient(x)
@@ -135,7 +141,7 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
         K = system.friction_matrix(x)
         found["symmetric"] = relative(size(K - K.T), size(K))
         found["kernel"] = relative(size(K @ dH), size(K) * size(dH))
-        found["semidefinite"] = relative(-jnp.minimum(jnp.linalg.eigvalsh((K + K.T) / 2)[0], 0.0), size(K))
+        found["friction"] = K
         for L in system.preserved:
             dL = L.gradient(x)
             residual = relative(size(K @ dL), size(K) * size(dL))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, EulerPoincareForce
 from ..energy import Energy, Quadratic, as_energy, check_scalar
@@ -87,6 +88,10 @@ class EulerPoincareSystem(LiePoissonSystem):
         energy = _hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate)
 
+    @property
+    def unrollable(self) -> bool:
+        return not isinstance(self.energy, Legendre)  # which iterates
+
     def velocity(self, mu) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim)."""
         return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(self.state(mu, batch=True))
@@ -129,7 +134,7 @@ def _inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
 
     def refine(carry):
         xi, r, _, k = carry
-        step = jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), r)
+        step = solve(jax.hessian(lagrangian.value)(xi), r[:, None])[:, 0]
 
         def shorten(state):
             t, _ = state
@@ -162,4 +167,4 @@ def _inverse_gradient_jvp(primals, tangents):
     if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):
         _, moved = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
         change = change - moved
-    return xi, jnp.linalg.solve(jax.hessian(lagrangian.value)(xi), change)
+    return xi, solve(jax.hessian(lagrangian.value)(xi), change[:, None])[:, 0]

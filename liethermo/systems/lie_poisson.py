@@ -7,6 +7,7 @@ import math
 import warnings
 
 import equinox as eqx
+import jax.numpy as jnp
 
 import manifolds as mf
 
@@ -57,6 +58,13 @@ class LiePoissonSystem(System):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
+
+    def field(self, x, dH, dS, dL=()):
+        """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
+        if self.dissipation is None or self.dissipation.momentum(dH, jnp.zeros_like(dH)) is None:
+            return super().field(x, dH, dS, dL)
+        ad = self.algebra.ad(dH)
+        return ad.T @ (x + self.dissipation.momentum(dH, ad @ dS))
 
     def _casimirs(self) -> dict[str, Energy]:
         return _recorded_casimirs(self.algebra)

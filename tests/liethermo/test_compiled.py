@@ -19,11 +19,6 @@ BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path_factory.getbasetemp() / "liethermo"))
-
-
 def both(system, x0, span, h, method=None, **options):
     return [
         lt.integrate(system, x0, span, h, method, engine=engine, on_failure="return", **options)
@@ -149,16 +144,46 @@ def unsupported():
 def test_what_cannot_be_compiled(monkeypatch):
     with pytest.raises(lt.LiethermoError, match="JAX primitive"):
         lt.integrate(unsupported(), [0.5, 1.0, 0.2], (0.0, 1.0), 0.1, engine="compiled")
-    monkeypatch.setattr("liethermo.timeloop.COMPILED_STEPS", 5)
     with pytest.warns(UserWarning, match=r"JAX primitive.*array engine"):
         solution = lt.integrate(unsupported(), [0.5, 1.0, 0.2], (0.0, 1.0), 0.1)
     assert solution.provenance["engine"] == "array"
 
 
-def test_auto_compiles_long_runs(monkeypatch):
-    assert lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"] == "array"
+def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
+    chosen = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
+    assert chosen() == "compiled"
+    monkeypatch.setattr("liethermo.timeloop.SMALL_DIM", 2)
+    assert chosen() == "array"
     monkeypatch.setattr("liethermo.timeloop.COMPILED_STEPS", 5)
-    assert lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"] == "compiled"
+    assert chosen() == "compiled"
+    monkeypatch.setattr("liethermo.timeloop.COMPILED_DIM", 2)
+    assert chosen() == "array"
+
+
+def test_a_plain_function_that_is_quadratic_is_treated_as_one():
+    """By what is written, not by its Hessian: that of ``|x|`` vanishes too."""
+    matrix = np.array([[1.0, 0.3, 0.0], [0.3, 2.0, 0.1], [0.0, 0.1, 0.5]])
+    offset = jnp.array([0.1, 0.0, 0.2])
+    plain = lt.LiePoissonSystem(
+        mf.so(3), lambda m: 0.5 * m @ matrix @ m + offset @ m, lambda m: jnp.sum(m**2), lt.ProjectedMetric()
+    )
+    given = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(matrix, offset), lt.Quadratic(2 * np.ones(3)), lt.ProjectedMetric()
+    )
+    assert plain.energy.is_quadratic
+    assert plain.entropy.is_quadratic
+    a, b = (lt.integrate(system, [0.5, 1.0, 0.2], (0.0, 5.0), 0.1) for system in (plain, given))
+    assert np.abs(a.x - b.x).max() <= 1e-14
+    for general in (
+        lambda m: jnp.abs(m[0]),
+        lambda m: jnp.floor(m[0]) * m[1],
+        lambda m: jnp.where(m[0] > 0.0, m[0] ** 2, m[1] ** 2),
+        lambda m: m[0] * m[1] * m[2],
+        lambda m: jnp.linalg.norm(m) ** 2,
+        lambda m: m[0] / m[1],
+        lambda m: m[0] ** m[1],
+    ):
+        assert not lt.LiePoissonSystem(mf.so(3), general, validate=False).energy.is_quadratic
 
 
 # -- the cache --------------------------------------------------------------------------------------------------------

@@ -142,7 +142,7 @@ def test_one_iteration_is_not_enough_and_says_so(method, monkeypatch):
     monkeypatch.setattr(array, "FIXED_POINT_LIMIT", 1)
     monkeypatch.setattr(array, "NEWTON_LIMIT", 1)
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
-    solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.1, method, on_failure="return")
+    solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.1, method, on_failure="return", engine="array")
     assert solution.status.code == "not_converged"
 
 
@@ -197,13 +197,24 @@ def test_the_reference_method_reports_failure_too():
         lt.Reference(scheme="Euler")
 
 
-def test_ctrl_c_returns_what_exists():
-    threading.Timer(2.5, lambda: signal.raise_signal(signal.SIGINT)).start()
-    solution = lt.integrate(BODY, X0, (0.0, 1e9), 0.1, save_every=1000)
+@pytest.mark.parametrize("engine", ["array", "compiled"])
+def test_ctrl_c_returns_what_exists(engine):
+    lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine=engine)  # nothing is left to compile
+    threading.Timer(4.0, lambda: signal.raise_signal(signal.SIGINT)).start()
+    solution = lt.integrate(BODY, X0, (0.0, 1e9), 0.1, save_every=1000, engine=engine)
     assert solution.status.code == "interrupted"
     assert "stopped by the user" in str(solution.status)
     assert len(solution.t) > 10
     assert solution.audit().passed
+
+
+def test_ctrl_c_before_the_first_step(monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(array, "begin", interrupted)
+    solution = lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="array")
+    assert (solution.status.code, solution.x.tolist(), solution.stats.steps) == ("interrupted", [X0], 0)
 
 
 def test_progress_bar_is_silent_by_default_and_shown_on_request(capsys):

@@ -39,3 +39,17 @@ def test_relaxing_to_rounding_and_staying_there(name):
     assert np.abs(late.x - late.x[0]).max() < 1e-13  # no random walk along the equilibria
     assert late.stats.iterations_per_step <= early.stats.iterations_per_step
     assert late.stats.newton_iterations == 0
+
+
+@pytest.mark.parametrize("engine", ["array", "compiled"])
+def test_the_energy_of_a_motion_that_goes_on(engine):
+    """A general energy, hardly relaxing: each step rounds anew, and the errors must not add up (they came to 1e-11)."""
+    inertia = jnp.array([10.0, 5.0, 1.0])
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m: jnp.sum(m**2 / (2 * inertia)) + 0.025 * jnp.sum(m**4),
+        lambda m: jnp.log(1.0 + jnp.sum(m**2)),
+        lt.KillingDissipation(1.7e-4),
+    )
+    solution = lt.integrate(system, [0.001, 1.0, 0.001], (0.0, 10_000.0), 0.1, save_every=1000, engine=engine)
+    assert solution.audit(energy=8e-15).passed, str(solution.audit())

@@ -1,0 +1,49 @@
+"""The driver: ``python -m benchmarks [names] [--quick] [--page FILE]``."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from . import page
+from .machine import description, load
+from .measurements import NAMES
+from .report import targets_table
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the measurements that are named, print their tables, and keep each as JSON."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=main.__doc__)
+    parser.add_argument("names", nargs="*", metavar="name", help=f"all by default: {', '.join(NAMES)}")
+    parser.add_argument("--quick", action="store_true", help="see that everything runs; the figures mean nothing")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results")
+    parser.add_argument("--page", type=Path, help="write the results kept in the folder to this page, with its figure")
+    options = parser.parse_args(arguments)
+    unknown = set(options.names) - set(NAMES)
+    if unknown:
+        parser.error(f"no measurement {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+    if options.quick and options.page:
+        parser.error("quick results mean nothing on a page")
+    for name in options.names or NAMES:
+        print(f"-- {name}", flush=True)
+        about = {"date": datetime.date.today().isoformat(), "load": load(), "machine": description()}
+        start = time.perf_counter()
+        report = importlib.import_module(f"{__package__}.measurements.{name}").run(options.quick)
+        report.save(options.out / f"{name}.json", name=name, quick=options.quick, **about)
+        print(report.markdown())
+        if report.targets:
+            print(targets_table(report.targets).markdown())
+        warning = "; quick: the figures mean nothing" if options.quick else ""
+        print(f"\n({time.perf_counter() - start:.0f} s{warning})\n", flush=True)
+    if options.page:
+        page.write(options.out, options.page)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+/* A relaxing system on so(3)* whose energy and entropy are not quadratic, with derivatives by hand,
+
+       Pi' = (Pi + rate dH x dS) x dH,   H = sum Pi_i^2 / (2 I_i) + (stiffness / 4) sum Pi_i^4,   S = log(1 + |Pi|^2).
+
+   The discrete gradient of H is Gonzalez's [BFM 4.3]. Compiled as it stands it is the one of liethermo/gradients.py:
+   the difference of H is predicted from the gradient at three Gauss nodes, and the defect of that prediction is let
+   through where it exceeds rounding. With -DTEXTBOOK it is the formula as printed, which costs one gradient and one
+   value and divides rounding noise by |d|^2 when the system comes to rest. */
+
+#include <math.h>
+
+#include "rules.h"
+
+#define N 3
+
+typedef struct {
+    double inverse_inertia[N];
+    double rate, stiffness;
+} Problem;
+
+typedef struct {
+    double energy, size;
+} Start;
+
+static const double TINY = 1e-290;
+
+static inline double dot(const double u[N], const double v[N]) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
+
+static inline double energy_of(const Problem *p, const double x[N])
+{
+    double total = 0.0;
+    EACH(i) {
+        const double square = x[i] * x[i];
+        total += square * (0.5 * p->inverse_inertia[i] + 0.25 * p->stiffness * square);
+    }
+    return total;
+}
+
+static inline void energy_gradient(const Problem *p, const double x[N], double out[N])
+{
+    EACH(i)
+        out[i] = x[i] * (p->inverse_inertia[i] + p->stiffness * x[i] * x[i]);
+}
+
+static inline Start start(const Problem *p, const double x[N])
+{
+    return (Start){.energy = energy_of(p, x), .size = sqrt(dot(x, x))};
+}
+
+static inline void at(const double x[N], const double low[N], double c, const double d[N], double out[N])
+{
+    EACH(i)
+        out[i] = x[i] + (low[i] + c * d[i]);
+}
+
+#ifdef TEXTBOOK
+
+static inline void discrete_gradient(const Problem *p, const Start *s, const double x[N], const double low[N],
+                                     const double d[N], double out[N])
+{
+    double z[N], end[N];
+    at(x, low, 0.5, d, z);
+    at(x, low, 1.0, d, end);
+    energy_gradient(p, z, out);
+    const double square = dot(d, d);
+    const double factor = square > TINY ? (energy_of(p, end) - s->energy - dot(out, d)) / square : 0.0;
+    EACH(i)
+        out[i] += factor * d[i];
+}
+
+#else
+
+static const double NODE = 0.1127016653792583; /* (1 - sqrt(3/5)) / 2, the first of three Gauss nodes on (0, 1) */
+static const double EPS = 0x1p-52;
+static const double DIFFERENCE_NOISE = 8 * 0x1p-52;
+static const double CURVATURE_SWITCH = 1e-6;
+
+/* 0 where |size| <= threshold, 1 from twice that on, linear between. */
+static inline double gate(double size, double threshold)
+{
+    threshold = threshold > TINY ? threshold : TINY;
+    size = fabs(size);
+    return size >= 2.0 * threshold ? 1.0 : size <= threshold ? 0.0 : size / threshold - 1.0;
+}
+
+static inline void discrete_gradient(const Problem *p, const Start *s, const double x[N], const double low[N],
+                                     const double d[N], double out[N])
+{
+    double point[N], left[N], middle[N], right[N];
+    at(x, low, NODE, d, point);
+    energy_gradient(p, point, left);
+    at(x, low, 0.5, d, point);
+    energy_gradient(p, point, middle);
+    at(x, low, 1.0 - NODE, d, point);
+    energy_gradient(p, point, right);
+    at(x, low, 1.0, d, point);
+    const double end = energy_of(p, point);
+
+    double second = 0.0;
+    EACH(i)
+        second += (left[i] + right[i] - 2.0 * middle[i]) * d[i];
+    const double square = dot(d, d), slope = sqrt(dot(middle, middle));
+    double defect = (end - s->energy) - (dot(middle, d) + (5.0 / 18.0) * second);
+    double opened = gate(second, CURVATURE_SWITCH * slope * sqrt(square));
+    if (opened < 1.0) {
+        const double noise = DIFFERENCE_NOISE * (fabs(s->energy) + fabs(end)) + 4.0 * EPS * slope * s->size;
+        const double by_size = gate(defect, noise);
+        opened = by_size > opened ? by_size : opened;
+    }
+    defect *= opened;
+    const double factor = square > TINY ? ((5.0 / 18.0) * second + defect) / square : 0.0;
+    EACH(i)
+        out[i] = middle[i] + factor * d[i];
+}
+
+#endif
+
+static inline void slopes(const Problem *p, const Start *s, const double x[N], const double low[N], double h,
+                          const double k[N], double out[N])
+{
+    double d[N], z[N], w[N];
+    EACH(i)
+        d[i] = h * k[i];
+    at(x, low, 0.5, d, z);
+    discrete_gradient(p, s, x, low, d, w);
+    const double b = 2.0 * p->rate / (1.0 + dot(z, z)); /* rate times the factor of grad S(z) = b z */
+    const double u0 = z[0] + b * (w[1] * z[2] - w[2] * z[1]);
+    const double u1 = z[1] + b * (w[2] * z[0] - w[0] * z[2]);
+    const double u2 = z[2] + b * (w[0] * z[1] - w[1] * z[0]);
+    out[0] = u1 * w[2] - u2 * w[1];
+    out[1] = u2 * w[0] - u0 * w[2];
+    out[2] = u0 * w[1] - u1 * w[0];
+}
+
+static inline void values(const Problem *p, const double x[N], double *energy, double *entropy)
+{
+    *energy = energy_of(p, x);
+    *entropy = log(1.0 + dot(x, x));
+}
+
+#include "midpoint.h"

@@ -1,0 +1,50 @@
+"""A part of a measurement in a process of its own: ``python -m benchmarks.child MEASUREMENT ARGUMENTS``."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+
+
+def call(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
+    """What ``child(*arguments)`` of a measurement returns in a new process, ``cache`` being its LIETHERMO_CACHE."""
+    options = ["--one-core"] if one_core else []
+    return json.loads(python("-m", "benchmarks.child", *options, measurement, *arguments, cache=cache).splitlines()[-1])
+
+
+def python(*arguments: str, cache: str | None = None) -> str:
+    """The standard output of a Python process in the repository's root.
+
+    Raises
+    ------
+    RuntimeError
+        If it fails; with the end of its standard error.
+    """
+    environment = dict(os.environ) if cache is None else os.environ | {"LIETHERMO_CACHE": cache}
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"python {' '.join(arguments[:3])} failed:\n{done.stderr[-2000:]}")
+    return done.stdout
+
+
+def main(arguments: list[str]) -> None:
+    """Run a child function and print what it returns, as JSON."""
+    if arguments[0] == "--one-core":
+        if hasattr(os, "sched_setaffinity"):  # before JAX is imported, which starts a thread for each core it may use
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        arguments = arguments[1:]
+    module = importlib.import_module(f"{__package__}.measurements.{arguments[0]}")
+    print(json.dumps(module.child(*arguments[1:])))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

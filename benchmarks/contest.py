@@ -1,0 +1,76 @@
+"""Contests over one trajectory: the library's engines against a program in C that runs the same scheme."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import numpy as np
+
+import liethermo as lt
+
+from . import laws
+from .native import Body
+from .problems import X0
+from .report import Table, ratio
+from .timing import race
+
+Engine = Literal["array", "compiled"]
+
+STEP = 0.1
+
+RELAXATION = 10.0
+"""Rate times duration: the body relaxes all the way, and its last step still needs most of the first one's work."""
+
+COMPARED_STEPS = 300
+
+
+def by_library(system: lt.System, steps: int, engine: Engine, every: int | None = None) -> Callable[[], lt.Solution]:
+    """A run of the library from :data:`.problems.X0`; by default only the last state is kept."""
+    span = (0.0, STEP * steps)
+    return functools.partial(lt.integrate, system, X0, span, STEP, save_every=every or steps, engine=engine)
+
+
+def by_c(program: Body, steps: int, every: int | None = None) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """The same run by a program in C."""
+    return functools.partial(program.integrate, X0, STEP, steps, every)
+
+
+def contest(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
+    """Race the works, each of so many steps in one thread; a table, and the seconds of the processor of each.
+
+    Returns
+    -------
+    Table, dict of float
+    """
+    outcomes = race(works, rounds=rounds)
+    times = {name: outcome.processor for name, outcome in outcomes.items()}
+    rows = []
+    for name, outcome in outcomes.items():
+        solution = outcome.result
+        if isinstance(solution, lt.Solution):
+            iterations, kept = solution.stats.iterations_per_step, laws.of_solution(solution)
+        else:
+            run = solution[1]
+            iterations, kept = float((run["iterations"] / run["steps"])[0]), laws.of_runs(run)
+        rows.append([name, times[name] / steps, ratio(times[name], times.get(baseline)), iterations])
+        rows[-1] += kept.cells()
+    columns = {"": "text", "Time a step": "seconds", f"Relative to {baseline}": "ratio", "Iterations a step": "number"}
+    return Table(caption, columns | laws.COLUMNS, rows), times
+
+
+def difference(program: Body, system: lt.System) -> float:
+    """Largest difference between the C program's trajectory and the compiled engine's, relative to the state.
+
+    Raises
+    ------
+    RuntimeError
+        If it exceeds 1e-12: then they do not run the same scheme, and comparing their times means nothing.
+    """
+    ours = by_library(system, COMPARED_STEPS, "compiled", 1)().x[1:]
+    theirs, _ = program.integrate(X0, STEP, COMPARED_STEPS, 1)
+    found = float(np.abs(ours - theirs).max() / np.abs(ours).max())
+    if not found <= 1e-12:
+        raise RuntimeError(f"after {COMPARED_STEPS} steps C and the compiled engine differ by {found:.1e}")
+    return found

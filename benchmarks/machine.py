@@ -1,0 +1,68 @@
+"""The machine and the software that a result was measured with; no names of hosts or folders."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+from .native import compiler
+
+PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka".split()
+
+
+def description() -> dict[str, str]:
+    """What is worth knowing, by name."""
+    return {
+        "Processor": _processor(),
+        "Cores": str(cores()),
+        "Memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
+        "System": f"{_system()}, {platform.machine()}",
+        "C compiler": _compiler(),
+        "Python": platform.python_version(),
+        "Packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
+    }
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def load() -> str:
+    """How busy the machine is: the load average of the last minute."""
+    return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+
+
+def _processor() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        fields.setdefault(name.strip(), value.strip())
+    vectors = [name for name in ("avx512f", "avx2") if name in fields.get("flags", "").split()]
+    return " with ".join([fields.get("model name", platform.machine()), *map(str.upper, vectors[:1])])
+
+
+def _system() -> str:
+    try:
+        return platform.freedesktop_os_release()["PRETTY_NAME"]
+    except (OSError, KeyError, AttributeError):
+        return platform.system()
+
+
+def _compiler() -> str:
+    command = compiler()
+    if command is None:
+        return "none"
+    return subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout.splitlines()[0]
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"

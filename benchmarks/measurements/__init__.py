@@ -1,0 +1,3 @@
+"""The measurements, by name, in the order of the page."""
+
+NAMES = ("single_body", "general", "ensemble", "work_precision", "dimension", "bodies", "first_run", "memory")

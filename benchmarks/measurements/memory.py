@@ -1,0 +1,64 @@
+"""The memory of a million bodies of which only summaries are kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .. import child as process
+from .. import laws
+from ..ensembles import by_library
+from ..ensembles import laws as ensemble_laws
+from ..problems import body, random_states
+from ..report import Report, Table, Target
+
+RATE, T_END, STEPS = 1.0, 10.0, 200
+
+STATUS = Path("/proc/self/status")
+
+
+def run(quick: bool) -> Report:
+    """Ensembles of two sizes, each in a process of its own."""
+    sizes: tuple[int, ...] = (100,) if quick else (10_000, 1_000_000)
+    rows: list[list] = []
+    skipped: dict[str, str] = {}
+    peak = None
+    if not STATUS.is_file():
+        sizes, skipped = (), {"all": "this system does not tell a process its largest size"}
+    for bodies in sizes:
+        found = process.call("memory", str(bodies))
+        peak = found["peak"]
+        kept = laws.Laws(*found["laws"])
+        rows.append([bodies, found["before"], peak, found["seconds"], *kept.cells()])
+    columns = {"Bodies": "count", "Memory before": "gigabytes", "Peak": "gigabytes", "Time": "seconds"}
+    table = Table(f'`outputs="summary"`, {STEPS} steps each, compiled engine.', columns | laws.COLUMNS, rows)
+    text = (
+        "The largest resident size of a process of its own: before the ensemble, with the packages loaded and the "
+        "initial states made, and at its end."
+    )
+    targets = [Target("10⁶ bodies, summaries only: memory", 2e9, None if quick else peak, "gigabytes")]
+    return Report("Memory", text, [table], targets, skipped)
+
+
+def child(bodies: str) -> dict:
+    """The part that runs in a process of its own."""
+    work = by_library(body(RATE), random_states(int(bodies)), T_END, STEPS, "compiled", outputs="summary")
+    before, result = _resident(), work()
+    kept = ensemble_laws(result)
+    assert np.all(np.isfinite(result.energy))
+    return {
+        "before": before,
+        "peak": _resident(),
+        "seconds": result.wall_time,
+        "laws": [kept.energy_drift, kept.least_entropy_increment],
+    }
+
+
+def _resident() -> float:
+    """Largest resident size of this program so far, in bytes.
+
+    Not ``getrusage``: a process inherits its figure from the one that started it, which may have been larger.
+    """
+    fields = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+    return 1024.0 * int(fields["VmHWM"].split()[0])

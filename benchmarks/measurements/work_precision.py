@@ -1,0 +1,120 @@
+"""Time against error: the relaxed rigid body to a fixed time, by every method at several settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+import liethermo as lt
+
+from .. import laws, peers, reference
+from ..native import Body
+from ..problems import X0, body, body_parameters
+from ..report import Report, Table, take_part
+from ..timing import race
+
+RATE, T_END = 0.1, 100.0
+"""The body is half way to its rest at the end, where errors are taken."""
+
+STEPS = (500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+LARGE_STEPS = (100, 200, 500, 1000, 2000)
+
+TOLERANCES = tuple(10.0**-n for n in range(3, 14))
+
+METHODS: dict[str, tuple[lt.OneStepMethod, tuple[int, ...]]] = {
+    "midpoint": (lt.MetriplecticMidpoint(), STEPS),
+    **{f"Gauss, order {2 * s}": (lt.MetriplecticGauss(stages=s), LARGE_STEPS) for s in (2, 3, 4)},
+}
+"""The library's methods and the numbers of steps to run each with. Another method is one more line."""
+
+PEERS: dict[str, tuple[Callable[..., peers.Run], tuple[float, ...]]] = {
+    "SciPy DOP853": (peers.scipy, TOLERANCES),
+    "diffrax Tsit5": (lambda *arguments: peers.diffrax("Tsit5", *arguments), TOLERANCES),
+    "diffrax Dopri8": (lambda *arguments: peers.diffrax("Dopri8", *arguments), TOLERANCES),
+    "heyoka Taylor": (peers.heyoka, (*TOLERANCES, 1e-15, 1e-18)),
+}
+
+WANTED = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+
+
+def run(quick: bool) -> Report:
+    """Race every method at every setting; errors are relative to a reference of forty digits."""
+    builders: dict[tuple[str, str], Callable] = {}
+    for name, (method, counts) in METHODS.items():
+        if quick and name != "midpoint":
+            continue
+        for steps in counts[:1] if quick else counts:
+            builders |= {
+                (f"{name}, {engine} engine", f"{steps} steps"): _library(method, steps, engine)
+                for engine in ("compiled", "array")
+            }
+            if name == "midpoint":
+                builders["midpoint, C", f"{steps} steps"] = _c(steps)
+    for name, (solver, tolerances) in PEERS.items():
+        for tolerance in tolerances[:1] if quick else tolerances:
+            builders[name, f"tolerance {tolerance:.0e}"] = _peer(solver, tolerance)
+    contestants, skipped = take_part(builders)
+    outcomes = race({key: end for key, (end, _) in contestants.items()}, rounds=1 if quick else 5, patience=2.0)
+
+    exact = reference.states(X0, RATE, T_END)
+    rows: list[list] = []
+    series: dict[str, list[list[float]]] = {}
+    for (name, setting), outcome in outcomes.items():
+        state, kept = contestants[name, setting][1](outcome.result)
+        error = float(np.abs(state - exact).max() / np.abs(exact).max())
+        rows.append([name, setting, error, outcome.processor, *kept.cells()])
+        series.setdefault(name, []).append([error, outcome.processor])
+    rows.sort(key=lambda row: list(series).index(row[0]))
+    columns = {"": "text", "Setting": "text", "Error": "error", "Time": "seconds"} | laws.COLUMNS
+    text = (
+        f"The relaxed rigid body (rate {RATE}) from {X0} to t = {T_END:g}: the error of the last state against Taylor "
+        f"series of {reference.DIGITS} digits. The times are the processor's, of whole calls from Python. For the "
+        "peers the laws are taken over their own steps; nothing but accuracy keeps the laws there."
+    )
+    return Report(
+        "Work and precision",
+        text,
+        [_fastest(series), Table("Every run.", columns, rows)],
+        skipped={name: reason for (name, _), reason in skipped.items()},
+        series=series,
+    )
+
+
+def _fastest(series: dict[str, list[list[float]]]) -> Table:
+    """The least time in which each method reaches an error."""
+    rows = [
+        [name, *(min((seconds for error, seconds in points if error <= wanted), default=None) for wanted in WANTED)]
+        for name, points in series.items()
+    ]
+    columns = {"": "text"} | {f"≤ {wanted:.0e}": "seconds" for wanted in WANTED}
+    return Table("The least time in which an error was reached, over the settings tried.", columns, rows)
+
+
+# Each builder returns what to time, and what makes of its result the last state and the laws.
+
+
+def _library(method, steps, engine):
+    def build():
+        system, span = body(RATE), (0.0, T_END)
+        end = lambda: lt.integrate(system, X0, span, T_END / steps, method, save_every=steps, engine=engine)  # noqa: E731
+        return end, lambda solution: (solution.x[-1], laws.of_solution(solution))
+
+    return build
+
+
+def _c(steps):
+    def build():
+        program = Body("rigid_body.c", body_parameters(RATE))
+        end = lambda: program.integrate(X0, T_END / steps, steps)  # noqa: E731
+        return end, lambda found: (found[0][-1], laws.of_runs(found[1]))
+
+    return build
+
+
+def _peer(solver, tolerance):
+    def build():
+        run, system = solver(tolerance, X0, T_END, RATE), body(RATE)
+        return run.end, lambda state: (state, laws.of_path(run.path(), system))
+
+    return build

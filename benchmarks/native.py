@@ -1,0 +1,140 @@
+"""The programs in C: built on first use with ``cc -O3 -march=native``, called through ctypes."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .report import UnavailableError
+
+SOURCES = Path(__file__).parent / "c"
+OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
+
+STATUSES = ("completed", "not_converged", "non_finite")
+
+RUN = np.dtype(
+    [(name, "f8", 3) for name in ("x", "low", "k", "before")]
+    + [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
+    + [
+        (name, "f8")
+        for name in ("least_entropy_increment", "largest_energy_increment", "residual", "worst_residual", "integral")
+    ]
+    + [(name, "i8") for name in ("status", "steps", "iterations", "most_iterations")]
+)
+"""``Run`` of c/midpoint.h."""
+
+SUMMARY = np.dtype(
+    [("x", "f8", 3)]
+    + [(name, "f8") for name in ("first_energy", "largest_energy", "smallest_energy", "entropy")]
+    + [(name, "f8") for name in ("least_entropy_increment", "steps", "iterations", "integral")]
+    + [("status", "i8")]
+)
+"""``Summary`` of c/ensemble.c."""
+
+
+def compiler() -> str | None:
+    """The C compiler: ``$CC``, or ``cc``; None where there is none."""
+    return shutil.which(os.environ.get("CC", "cc"))
+
+
+@functools.cache
+def program(source: str, *options: str) -> ctypes.CDLL:
+    """The library built from a file in ``c/``.
+
+    Raises
+    ------
+    UnavailableError
+        If there is no compiler, or it fails.
+    """
+    command = compiler()
+    if command is None:
+        raise UnavailableError("no C compiler was found; install one, or name it with CC=...")
+    target = _folder() / f"{Path(source).stem}{len(os.listdir(_folder()))}.so"
+    arguments = [command, *OPTIONS, *options, str(SOURCES / source), "-o", str(target), "-lm", "-lpthread"]
+    built = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    if built.returncode != 0:
+        raise UnavailableError(f"{source} could not be compiled: {built.stderr.strip().splitlines()[-1]}")
+    return ctypes.CDLL(str(target))
+
+
+class Body:
+    """The step loop of one body.
+
+    Parameters
+    ----------
+    source : str
+        File in ``c/``.
+    parameters : sequence of float
+        The numbers of its ``Problem``, in order.
+    options : str
+        Further options of the compiler.
+    """
+
+    def __init__(self, source: str, parameters: Sequence[float], *options: str):
+        self._library, self._parameters = program(source, *options), np.array(parameters, dtype=float)
+
+    def integrate(self, x0, step: float, steps: int, every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """``steps`` steps from x0; every so-manieth state, by default the last, and a record of type :data:`RUN`."""
+        every = steps if every is None else every
+        saves, run, x0 = steps // every, np.zeros(1, RUN), np.ascontiguousarray(x0, dtype=float)
+        out = np.empty((saves, 3))
+        self._library.integrate(
+            _pointer(self._parameters),
+            _pointer(x0),
+            ctypes.c_double(step),
+            ctypes.c_int64(saves),
+            ctypes.c_int64(every),
+            _pointer(out),
+            _pointer(run),
+        )
+        _require_success(run)
+        return out, run
+
+
+class Bodies:
+    """The step loop of many rigid bodies, in SIMD lanes and threads; parameters as of rigid_body.c."""
+
+    def __init__(self, parameters: Sequence[float]):
+        self._library, self._parameters = program("ensemble.c", "-Wno-psabi"), np.array(parameters, dtype=float)
+
+    def integrate(self, x0s, step: float, steps: int, threads: int) -> np.ndarray:
+        """``steps`` steps from each of the x0s, shape (bodies, 3); records of type :data:`SUMMARY`."""
+        x0s = np.ascontiguousarray(x0s, dtype=float)
+        out = np.zeros(len(x0s), SUMMARY)
+        self._library.integrate_ensemble(
+            _pointer(self._parameters),
+            _pointer(x0s),
+            ctypes.c_int64(len(x0s)),
+            ctypes.c_double(step),
+            ctypes.c_int64(steps),
+            ctypes.c_int64(threads),
+            _pointer(out),
+        )
+        _require_success(out)
+        return out
+
+
+@functools.cache
+def _folder() -> Path:
+    folder = tempfile.TemporaryDirectory(prefix="liethermo-benchmarks-")
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+def _require_success(records: np.ndarray) -> None:
+    worst = int(records["status"].max())
+    if worst != 0:
+        raise RuntimeError(f"a C program stopped early: {STATUSES[worst]}, after {records['steps'].min()} steps")

@@ -1,0 +1,77 @@
+"""The systems that are timed."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+import liethermo as lt
+import manifolds as mf
+
+INERTIA = (10.0, 5.0, 1.0)
+X0 = (0.001, 1.0, 0.001)
+"""The body of [BFM §4.3, Fig. 1], set spinning about its middle axis."""
+
+STIFFNESS = 0.1
+
+
+def body_field(x, y, z, rate):
+    """The relaxed rigid body for the peers, by hand: ``Pi' = (Pi + rate Omega × Pi) × Omega``, three scalars.
+
+    Plain arithmetic, so that numba, JAX and heyoka can each make of it what suits them.
+    """
+    a, b, c = x / INERTIA[0], y / INERTIA[1], z / INERTIA[2]
+    u, v, w = x + rate * (b * z - c * y), y + rate * (c * x - a * z), z + rate * (a * y - b * x)
+    return v * c - w * b, w * a - u * c, u * b - v * a
+
+
+def body(rate: float) -> lt.LiePoissonSystem:
+    """The relaxed rigid body, H and S given as ``lt.Quadratic``."""
+    return lt.models.rigid_body(INERTIA, rate)
+
+
+def plain_body(rate: float) -> lt.LiePoissonSystem:
+    """The same body, H and S given as plain functions: nothing tells the library that they are quadratic."""
+    inertia = jnp.array(INERTIA)
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        energy=lambda mu: 0.5 * jnp.sum(mu**2 / inertia),
+        entropy=lambda mu: 0.5 * jnp.sum(mu**2),
+        dissipation=lt.KillingDissipation(0.5 * rate),
+    )
+
+
+def general_body(rate: float) -> lt.LiePoissonSystem:
+    """H quartic and S logarithmic, as in c/general.c."""
+    inertia = jnp.array(INERTIA)
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        energy=lambda mu: jnp.sum(mu**2 / (2 * inertia)) + STIFFNESS / 4 * jnp.sum(mu**4),
+        entropy=lambda mu: jnp.log(1.0 + jnp.sum(mu**2)),
+        dissipation=lt.KillingDissipation(0.5 * rate),
+    )
+
+
+def body_parameters(rate: float) -> list[float]:
+    """The ``Problem`` of c/rigid_body.c and c/ensemble.c."""
+    return [*(1.0 / moment for moment in INERTIA), rate]
+
+
+def general_parameters(rate: float) -> list[float]:
+    """The ``Problem`` of c/general.c."""
+    return [*body_parameters(rate), STIFFNESS]
+
+
+def generalized_body(g: mf.LieAlgebra, rate: float) -> lt.LiePoissonSystem:
+    """A body on any algebra whose Killing form is definite: distinct inertias, and that form's Casimir for entropy."""
+    inertia = 1.0 + np.arange(g.dim) / g.dim
+    killing = -g.killing_form()
+    inverse = np.linalg.inv(killing)
+    entropy = lt.Quadratic((inverse + inverse.T) / 2 * np.trace(killing) / g.dim)
+    return lt.LiePoissonSystem(g, lt.Quadratic(1.0 / inertia), entropy, lt.KillingDissipation(rate))
+
+
+def random_states(bodies: int, dim: int = 3) -> np.ndarray:
+    """States of norm one in random directions, shape (bodies, dim)."""
+    states = np.random.default_rng(0).standard_normal((bodies, dim))
+    return states / np.linalg.norm(states, axis=1, keepdims=True)

@@ -1,0 +1,106 @@
+"""Where a run of equal steps arrives when, what it keeps, and in which portions the engines take it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from .errors import InputError
+
+CHUNK_SAVES = 1024
+"""Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
+
+CHUNK_STEPS = 100_000
+"""Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
+
+
+class Timetable:
+    """Steps of one size over a span of time, and a shorter one where the span is no multiple of it.
+
+    Parameters
+    ----------
+    span : (float, float)
+    step : float
+    every : int or None
+        Keep every so-manieth state, and the last; None keeps the last alone.
+
+    Attributes
+    ----------
+    start, end, h : float
+    last : float
+        Size of the shorter last step; 0 where there is none.
+    full, steps : int
+        How many full steps there are, and steps in all.
+
+    Raises
+    ------
+    InputError
+        If the span or the step cannot be used.
+    """
+
+    def __init__(self, span, step, every: int | None):
+        self.start, self.end = _checked_span(span)
+        self.h = _checked_step(step, self.start, self.end)
+        if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
+            raise InputError(f"save_every must be a positive integer, not {every!r}")
+        self.every = every
+        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
+        self.full = math.floor((self.end - self.start) / self.h * (1 + 1e-12))
+        self.last = self.end - (self.start + self.full * self.h)
+        if self.last <= 1e-12 * (self.end - self.start):
+            self.last = 0.0
+        self.steps = self.full + (self.last > 0.0)
+
+    def time(self, step: int) -> float:
+        """The time after so many steps."""
+        return self.end if step >= self.steps else self.start + step * self.h
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Steps after which states are kept, 0 (the start) and the last among them."""
+        kept = np.array([0]) if self.every is None else np.arange(0, self.full + 1, self.every)
+        return np.unique([*kept, *([] if self.every is None else [self.full]), self.steps])
+
+    @property
+    def times(self) -> np.ndarray:
+        """The times at :attr:`counts`."""
+        return np.array([self.time(int(n)) for n in self.counts])
+
+    def calls(self, limit: int = CHUNK_STEPS, saves: int = CHUNK_SAVES) -> Iterator[tuple[float, int, int]]:
+        """The run in calls ``(h, saves, every)`` of an engine: so many saves, each after so many steps of size h.
+
+        None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save.
+        """
+        done = 0
+        while done < self.full:
+            left = self.full - done
+            every = min(self.every or limit, left)
+            kept = 1 if self.every is None else max(1, min(saves, limit // every, left // every))
+            yield self.h, kept, every
+            done += kept * every
+        if self.last:
+            yield self.last, 1, 1
+
+
+def _checked_span(span) -> tuple[float, float]:
+    try:
+        start, end = (float(t) for t in span)
+    except (TypeError, ValueError):
+        raise InputError(f"t_span must be two numbers (start, end), not {span!r}") from None
+    if not (math.isfinite(start) and math.isfinite(end) and end > start):
+        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g})")
+    return start, end
+
+
+def _checked_step(step, start: float, end: float) -> float:
+    try:
+        h = float(step)
+    except (TypeError, ValueError):
+        raise InputError(f"step must be a number, not {step!r}") from None
+    if not (math.isfinite(h) and h > 0.0):
+        raise InputError(f"step must be positive and finite, not {h:g}: time runs forwards, since entropy grows")
+    if start + h == start or end + h == end:
+        raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
+    return h

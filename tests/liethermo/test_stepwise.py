@@ -1,0 +1,239 @@
+"""Adaptive steps, events, outputs at given times and dense output: where a run steps is free, the laws are not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.stepwise import Control
+
+BODY = lt.models.rigid_body()
+X0 = [0.001, 1.0, 0.001]
+
+
+def nonlinear():
+    inertia = jnp.array([3.0, 2.0, 1.0])
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p * p / inertia) + 0.1 * p[0] ** 4 + 0.05 * jnp.cos(p[1]),
+        lambda p: jnp.log(1.0 + p @ p),
+        lt.ProjectedMetric(rate=0.3),
+    )
+
+
+SYSTEM, START = nonlinear(), [0.8, 0.5, 0.9]
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The state at t = 20, to 1e-14: two methods of high order agree on it."""
+    x, y = (lt.integrate(SYSTEM, START, (0.0, 20.0), 0.05, lt.MetriplecticGauss(s)).x[-1] for s in (3, 4))
+    assert np.abs(x - y).max() < 1e-10
+    return y
+
+
+# -- adaptive steps ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stages", "rtol"), [(2, 1e-4), (2, 1e-7), (3, 1e-4), (3, 1e-7), (3, 1e-10), (4, 1e-7), (4, 1e-10)]
+)
+def test_the_error_follows_the_tolerance(stages, rtol, exact):
+    """Within a factor that leaves room for errors to add up over the steps, and is not too careful either."""
+    solution = lt.integrate(SYSTEM, START, (0.0, 20.0), lt.Adaptive(rtol), lt.MetriplecticGauss(stages))
+    error = np.abs(solution.x[-1] - exact).max() / rtol
+    assert 1e-2 < error < 1e2
+    assert solution.audit(energy=1e-14).passed, str(solution.audit())
+    assert solution.t[-1] == 20.0
+    assert solution.stats.rejected <= 0.1 * solution.stats.steps
+
+
+def test_steps_grow_as_a_body_relaxes():
+    """At most 300 steps to t = 10^4; the last are of the size of the whole relaxation."""
+    solution = lt.integrate(BODY, X0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(4))
+    assert solution.stats.steps <= 300
+    assert solution.audit().passed
+    assert solution.entropy[-1] == pytest.approx(10 * solution.energy[0], rel=1e-14)
+    assert np.diff(solution.t)[-2] > 100 * np.diff(solution.t).min()
+
+
+def test_steps_do_not_chatter():
+    """In a steady rotation the step settles: it is changed in few of the steps, and nothing is rejected."""
+    free = lt.models.free_rigid_body()
+    solution = lt.integrate(free, [0.5, 0.0, 0.9], (0.0, 200.0), lt.Adaptive(1e-7), lt.MetriplecticGauss(3))
+    steps = np.diff(solution.t)[5:-3]
+    assert (np.abs(np.diff(steps)) > 1e-9 * steps[1:]).mean() < 0.5
+    assert np.abs(np.diff(np.log(steps))).max() < np.log(3.1)
+
+
+def test_control():
+    """On an error that follows h^(order + 1) the step tends to the one with the error wanted, and stays."""
+    control = Control(lt.Adaptive(1e-6), order=4, first=1e-5)
+    for _ in range(60):
+        h = control.h
+        error = (h / 0.1) ** 5
+        control.accept(error, h) if error <= 1.0 else control.reject(error, h)
+    assert 0.05 < control.h <= 0.1
+    assert control.h == h
+
+
+def test_both_engines_take_the_same_steps():
+    a, b = (
+        lt.integrate(SYSTEM, START, (0.0, 5.0), lt.Adaptive(1e-6), lt.MetriplecticGauss(2), engine=engine)
+        for engine in ("array", "compiled")
+    )
+    assert np.allclose(a.t, b.t, rtol=1e-9, atol=0)
+    assert np.abs(a.x - b.x).max() < 1e-9
+
+
+def test_the_midpoint_scheme_can_be_adaptive_too(exact):
+    solution = lt.integrate(SYSTEM, START, (0.0, 20.0), lt.Adaptive(1e-5))
+    assert np.abs(solution.x[-1] - exact).max() < 1e-2
+    assert solution.audit().energy_drift < 1e-14
+
+
+def test_largest_and_first():
+    options = lt.Adaptive(1e-6, first=0.01, largest=0.3)
+    solution = lt.integrate(SYSTEM, START, (0.0, 5.0), options, lt.MetriplecticGauss(3))
+    steps = np.diff(solution.t)
+    assert steps[0] == 0.01
+    assert steps.max() <= 0.3 * (1 + 1e-12)
+
+
+def test_a_tolerance_that_cannot_be_met():
+    """A kink in the energy: the error estimate cannot fall below it, and the step underflows with a clear status."""
+    kinked = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p**2 / jnp.array([3.0, 2.0, 1.0])) + jnp.where(p[0] > 0.5, 1.0, 0.0) * p[1],
+        validate=False,
+    )
+    options = {"method": lt.MetriplecticGauss(2), "on_failure": "return"}
+    solution = lt.integrate(kinked, [0.8, 0.5, 0.9], (0.0, 10.0), lt.Adaptive(1e-9), **options)
+    assert solution.status.code == "step_underflow"
+    assert "Try a larger tolerance" in solution.status.message
+    assert solution.stats.steps > 3
+    assert np.isfinite(solution.x).all()
+    assert solution.x[-1, 0] == pytest.approx(0.5, abs=1e-6)
+    with pytest.raises(lt.ConvergenceError, match="the step fell to"):
+        lt.integrate(kinked, [0.8, 0.5, 0.9], (0.0, 10.0), lt.Adaptive(1e-9), lt.MetriplecticGauss(2))
+
+
+def test_suggest_step(exact):
+    for rtol in (1e-6, 1e-9):
+        h = lt.suggest_step(SYSTEM, START, rtol, lt.MetriplecticGauss(3))
+        solution = lt.integrate(SYSTEM, START, (0.0, 20.0), h, lt.MetriplecticGauss(3))
+        assert np.abs(solution.x[-1] - exact).max() < 1e2 * rtol
+        assert solution.stats.steps < 2000
+    with pytest.raises(lt.InputError, match="nothing moves"):
+        lt.suggest_step(BODY, [1.0, 0.0, 0.0])
+
+
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-9)])
+def test_relaxed(step):
+    solution = lt.integrate(BODY, X0, (0.0, 1e4), step, lt.MetriplecticGauss(3), until=lt.Relaxed(1e-8))
+    assert solution.status.code == "event"
+    assert solution.status.ok
+    assert solution.t[-1] == solution.event_time
+    assert float(BODY.entropy_production(solution.x[-1])) == pytest.approx(1e-8, rel=1e-4)
+    assert solution.audit().passed  # the last state too is a step's end
+
+
+def test_an_event_is_located_to_rounding():
+    """The free body's third component crosses zero; the time does not depend on the step but by its accuracy."""
+    free = lt.models.free_rigid_body()
+    found = [
+        lt.integrate(free, [0.1, 0.2, 0.9], (0.0, 100.0), h, lt.MetriplecticGauss(6), until=lambda x: x[0]).event_time
+        for h in (0.05, 0.031)
+    ]
+    assert found[0] == pytest.approx(found[1], rel=1e-13)
+    solution = lt.integrate(free, [0.1, 0.2, 0.9], (0.0, 100.0), 0.05, lt.MetriplecticGauss(6), until=lambda x: x[0])
+    assert abs(solution.x[-1, 0]) < 1e-13
+    assert solution.audit().passed
+
+
+def test_an_event_that_never_happens():
+    solution = lt.integrate(BODY, X0, (0.0, 10.0), 0.1, until=lambda x: x[0] - 5.0)
+    assert (solution.status.code, solution.event_time) == ("completed", None)
+    assert "did not happen" in solution.status.message
+    assert solution.t[-1] == 10.0
+
+
+def test_a_file_keeps_the_event(tmp_path):
+    solution = lt.integrate(BODY, X0, (0.0, 1e3), 0.1, until=lt.Relaxed(1e-6))
+    assert lt.load(solution.save(tmp_path / "run.nc")).event_time == solution.event_time
+
+
+# -- outputs ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
+def test_save_at(step):
+    times = [0.37, 1.0, 1.05, 7.3]
+    solution = lt.integrate(SYSTEM, START, (0.0, 8.0), step, lt.MetriplecticGauss(3), save_at=times)
+    assert solution.t.tolist() == [0.0, *times, 8.0]
+    assert solution.audit().passed
+    for t, x in zip(solution.t[1:], solution.x[1:], strict=True):
+        reference = lt.integrate(SYSTEM, START, (0.0, t), 0.02, lt.MetriplecticGauss(4)).x[-1]
+        assert np.abs(x - reference).max() < 1e-6
+
+
+@pytest.mark.parametrize(("stages", "order"), [(1, 2), (2, 3), (3, 4), (4, 5)])
+def test_order_of_dense_output(stages, order):
+    """O(h^(s+1)) between the steps."""
+    times = np.linspace(0.1, 3.9, 23)
+    reference = lt.integrate(SYSTEM, START, (0.0, 4.0), 0.025, lt.MetriplecticGauss(5), dense=True)(times)
+    errors = [
+        np.abs(lt.integrate(SYSTEM, START, (0.0, 4.0), h, lt.MetriplecticGauss(stages), dense=True)(times) - reference)
+        for h in (0.4, 0.2, 0.1)
+    ]
+    errors = [error.max() for error in errors]
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.5)
+
+
+def test_dense_output():
+    solution = lt.integrate(SYSTEM, START, (0.0, 4.0), lt.Adaptive(1e-8), lt.MetriplecticGauss(4), dense=True)
+    assert np.abs(solution(solution.t) - solution.x).max() < 1e-14
+    assert solution(1.0).shape == (3,)
+    assert solution(np.ones((2, 5))).shape == (2, 5, 3)
+    with pytest.raises(lt.InputError, match=r"known from t = 0 to 4, not at 4\.1"):
+        solution(4.1)
+    with pytest.raises(lt.InputError, match="dense=True"):
+        lt.integrate(BODY, X0, (0.0, 1.0), 0.1)(0.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"step": lt.Adaptive(1e-6), "method": lt.Reference()}, "chooses its own steps"),
+        ({"until": 3.0}, r"lt\.Relaxed\(tol\) or a function"),
+        ({"until": lambda x: x}, "one number"),
+        ({"until": lt.Relaxed(1e-3), "system": lt.models.free_rigid_body()}, "produces no entropy"),
+        ({"save_at": [0.5, 2.0]}, r"outside \(0, 1\)"),
+        ({"save_at": [np.nan]}, "list of times"),
+    ],
+)
+def test_bad_input(arguments, message):
+    default = {"system": BODY, "x0": X0, "t_span": (0.0, 1.0), "step": 0.1}
+    with pytest.raises((lt.InputError, lt.FunctionError), match=message):
+        lt.integrate(**(default | arguments))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rtol": -1.0}, "rtol must be"),
+        ({"rtol": 0.0}, "both zero"),
+        ({"rtol": 1e-17}, "below the rounding"),
+        ({"first": 0.0}, "first step"),
+        ({"largest": np.inf}, "largest step"),
+    ],
+)
+def test_bad_tolerances(options, message):
+    with pytest.raises(lt.InputError, match=message):
+        lt.Adaptive(**options)
+    with pytest.raises(lt.InputError, match="entropy production"):
+        lt.Relaxed(0.0)

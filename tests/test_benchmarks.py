@@ -1,0 +1,172 @@
+"""The benchmarks run, their opponents in C run the same scheme, and what is missing is said. Nothing is timed here."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks import child, laws, native, page, reference
+from benchmarks.__main__ import main
+from benchmarks.contest import difference
+from benchmarks.laws import Laws
+from benchmarks.measurements import memory
+from benchmarks.native import Bodies, Body
+from benchmarks.peers import scipy
+from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
+from benchmarks.report import Target
+from benchmarks.timing import race
+from liethermo.engine import array
+
+needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path_factory.getbasetemp() / "liethermo"))
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """A machine without a C compiler and without the peers that the library does not need itself."""
+    monkeypatch.setenv("CC", "no-such-compiler")
+    for name in ("diffrax", "heyoka"):
+        monkeypatch.setitem(sys.modules, name, None)
+    native.program.cache_clear()
+    yield
+    native.program.cache_clear()
+
+
+def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
+    main(["work_precision", "--quick", "--out", str(tmp_path)])
+    printed = capsys.readouterr().out
+    for name in (
+        "midpoint, C (no C compiler was found",
+        "diffrax Tsit5 (diffrax is not",
+        "heyoka Taylor (heyoka is not",
+    ):
+        assert f"Left out: {name}" in printed
+    result = json.loads((tmp_path / "work_precision.json").read_text())
+    rows = {row[0]: row for row in result["report"]["tables"][1]["rows"]}
+    assert {"midpoint, compiled engine", "midpoint, array engine", "SciPy DOP853"} == rows.keys()
+    assert all(rows[f"midpoint, {engine} engine"][-1] == "hold" for engine in ("array", "compiled"))
+    assert rows["SciPy DOP853"][-1] == "broken: energy"
+
+    with pytest.raises(ValueError, match="holds no results"):  # quick ones do not count
+        page.write(tmp_path, tmp_path / "page.md")
+    result["quick"] = False
+    (tmp_path / "work_precision.json").write_text(json.dumps(result))
+    page.write(tmp_path, tmp_path / "page.md")
+    assert "| midpoint, array engine | 500 steps |" in (tmp_path / "page.md").read_text()
+    assert (tmp_path / "_static" / "work_precision.svg").read_text().count("SciPy DOP853") == 1
+
+
+def test_the_driver_refuses_unknown_names(capsys):
+    with pytest.raises(SystemExit):
+        main(["single_bodies"])
+    assert "no measurement single_bodies; there are single_body," in capsys.readouterr().err
+
+
+def test_the_rules_in_c_are_the_library_s():
+    text = (native.SOURCES / "rules.h").read_text().replace("DBL_EPSILON", repr(array.EPS))
+    defined = dict(re.findall(r"^#define ([A-Z_]+) ([-(0-9].*)$", text, re.MULTILINE))
+    assert {name: eval(value) for name, value in defined.items()} == {
+        name: getattr(array, name) for name in ("FIXED_POINT_LIMIT", "SLOW", "SHRINKING", "FLOOR", "PLATEAU", "STEERED")
+    }
+    statuses = re.search(r"enum \{ (.*) \};", text)
+    assert statuses is not None
+    assert [getattr(array, name) for name in statuses[1].split(", ")] == [0, 1, 2]
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("source", "parameters", "system"),
+    [("rigid_body.c", body_parameters, body), ("general.c", general_parameters, general_body)],
+)
+def test_c_runs_the_same_scheme(source, parameters, system):
+    assert difference(Body(source, parameters(1.0)), system(1.0)) <= 1e-12
+    with pytest.raises(RuntimeError, match="differ by"):  # another rate is another trajectory
+        difference(Body(source, parameters(1.001)), system(1.0))
+
+
+@needs_compiler
+def test_lanes_do_as_one_body_does():
+    bodies, alone = Bodies(body_parameters(1.0)), Body("rigid_body.c", body_parameters(1.0))
+    x0s = random_states(19)  # no multiple of the lanes
+    summaries = bodies.integrate(x0s, 0.05, 200, threads=3)
+    for x0, summary in zip(x0s, summaries, strict=True):
+        (end,), (run,) = alone.integrate(x0, 0.05, 200)
+        assert np.abs(summary["x"] - end).max() <= 1e-14
+        assert summary["iterations"] == pytest.approx(run["iterations"], rel=0.02)
+        assert summary["least_entropy_increment"] == pytest.approx(run["least_entropy_increment"], rel=1e-6)
+
+
+@needs_compiler
+def test_a_c_program_that_fails_says_so():
+    with pytest.raises(RuntimeError, match="stopped early: not_converged"):
+        Body("rigid_body.c", body_parameters(1.0)).integrate([0.1, 1.0, 0.1], 3.0, 5)
+    with pytest.raises(RuntimeError, match="stopped early: not_converged"):
+        Bodies(body_parameters(1.0)).integrate([[0.0, 1.0, 0.0], [0.1, 1.0, 0.1]], 3.0, 5, threads=1)
+    with pytest.raises(RuntimeError, match="stopped early: non_finite"):
+        Bodies(body_parameters(1.0)).integrate([[0.1, 1.0, 0.1], [np.nan, 0.0, 1.0]], 0.1, 5, threads=1)
+
+
+def test_the_reference_is_the_trajectory(monkeypatch):
+    """Against SciPy, which knows nothing of series, and against itself with another step."""
+    x0 = [0.3, -0.8, 0.5]
+    exact = reference.states(x0, 0.7, 5.0)
+    assert np.abs(scipy(1e-13, x0, 5.0, 0.7).end() - exact).max() < 1e-11
+    assert np.abs(reference.states(x0, 0.71, 5.0) - exact).max() > 1e-3
+    monkeypatch.setattr(reference, "STEP", reference.STEP / 2)
+    assert np.array_equal(reference.states(x0, 0.7, 5.0), exact)
+
+
+@pytest.mark.skipif(not memory.STATUS.is_file(), reason="this system does not tell a process its largest size")
+def test_a_process_is_not_charged_its_parent_s_memory():
+    """getrusage would: its figure survives the start of another program."""
+    large = np.ones(100_000_000)
+    small = child.python("-c", "from benchmarks.measurements.memory import _resident; print(_resident())")
+    assert 1e7 < float(small) < large.nbytes < memory._resident()
+
+
+@needs_compiler
+def test_c_steers_the_energy():
+    """A general energy keeps its value over a long run, as the library's does; without steering it is off by 5e-13."""
+    _, run = Body("general.c", general_parameters(1e-3)).integrate(X0, 0.1, 300_000)
+    assert laws.of_runs(run).energy_drift < 2e-14
+    _, run = Body("general.c", general_parameters(1e-3), "-DSTEERED=INFINITY").integrate(X0, 0.1, 300_000)
+    assert laws.of_runs(run).energy_drift > 2e-14
+
+
+@pytest.mark.parametrize(
+    ("bound", "measured", "at_least", "verdict"),
+    [
+        (2.5, 2.4, False, "met"),
+        (2.5, 2.6, False, "missed"),
+        (30.0, 31.0, True, "met"),
+        (30.0, 29.0, True, "missed"),
+        (30.0, None, True, "not measured"),
+        (2.5, float("nan"), False, "missed"),
+    ],
+)
+def test_verdicts(bound, measured, at_least, verdict):
+    assert Target("work", bound, measured, at_least=at_least).verdict == verdict
+
+
+def test_broken_laws_are_named():
+    assert Laws(1e-15, 0.0).cells()[-1] == "hold"
+    assert Laws(1e-15, None).cells()[-1] == "hold"
+    assert Laws(1e-12, -1e-12).cells()[-1] == "broken: energy, entropy"
+    assert Laws(float("nan"), 0.0).cells()[-1] == "broken: energy"
+
+
+def test_a_race_takes_turns():
+    taken = []
+    outcomes = race({"a": lambda: taken.append("a"), "b": lambda: taken.append("b") or 7}, rounds=3)
+    turns = re.sub(r"(.)\1+", r"\1", "".join(taken))
+    assert turns == "ab" * 4  # one before the first round
+    assert outcomes["b"].result == 7
+    assert 0.0 < outcomes["a"].seconds < 0.02
