@@ -23,6 +23,7 @@ from .catalogue import (  # noqa: E402
     sp,
     su,
 )
+from .coordinates import Coordinates, Place, coordinates_around  # noqa: E402
 from .errors import (  # noqa: E402
     AntisymmetryError,
     ClosureError,
@@ -50,7 +51,14 @@ from .lie_group import (  # noqa: E402
     Sp,
     registered_groups,
 )
-from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
+from .poisson import (  # noqa: E402
+    Canonical,
+    LiePoisson,
+    NoPoisson,
+    PoissonMap,
+    PoissonStructure,
+    PoissonTensor,
+)
 from .polynomial import Polynomial  # noqa: E402
 from .retraction import (  # noqa: E402
     CayleyRetraction,
@@ -91,6 +99,7 @@ __all__ = [
     "Chart",
     "ClosureError",
     "ComponentError",
+    "Coordinates",
     "DomainError",
     "Euclidean",
     "EuclideanRetraction",
@@ -106,9 +115,12 @@ __all__ = [
     "ManifoldsError",
     "MatrixGroup",
     "MidpointRetraction",
+    "NoPoisson",
     "NoPolynomialCasimirWarning",
     "OffManifoldError",
     "ParameterError",
+    "Place",
+    "PoissonMap",
     "PoissonStructure",
     "PoissonTensor",
     "Polynomial",
@@ -129,6 +141,7 @@ __all__ = [
     "abelian",
     "aff",
     "bianchi",
+    "coordinates_around",
     "direct_sum",
     "from_geomstats",
     "galilei",

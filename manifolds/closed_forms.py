@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .lie_algebra import LieAlgebra
-from .matrix_functions import determinant, inverse, largest
+from .matrix_functions import determinant, inverse, largest, orthonormalized
 
 HALF_TURN_MARGIN = 1e-8
 """A logarithm is taken of eigenvalues at angles up to pi minus this; beyond, its sign is decided by noise."""
@@ -220,6 +220,25 @@ def heisenberg_inverse(g) -> jax.Array:
     """``I - N + N^2`` with N = g - I."""
     N = g - jnp.eye(g.shape[-1])
     return jnp.eye(g.shape[-1]) - N + N @ N
+
+
+# -- one Newton step to the group ---------------------------------------------------------------------------------
+
+
+def unchanged(g) -> jax.Array:
+    """g itself."""
+    return g
+
+
+def unitary_restored(g) -> jax.Array:
+    """Orthonormal rows, and determinant 1."""
+    g = orthonormalized(g)
+    return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
+
+
+def rigid_restored(g) -> jax.Array:
+    """An orthonormal linear part."""
+    return affine(orthonormalized(g[..., :-1, :-1]), g[..., :-1, -1:])
 
 
 def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:

@@ -81,6 +81,8 @@ class GeomstatsSpace(Space):
     source : geomstats Manifold
     """
 
+    smooth = False
+
     def __init__(self, source, radius: float | None):
         self.source, self._radius = source, radius
         self.metric = type(source.metric).__name__

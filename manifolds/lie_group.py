@@ -68,6 +68,8 @@ class MatrixGroup:
     inverse_map, exp_map, log_map, cayley_map, inverse_cayley_map : callable or None
         ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
         or None where the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
+    restore_map : callable
+        ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it, where it has a formula.
     """
 
     name: str
@@ -78,6 +80,7 @@ class MatrixGroup:
     log_map: Callable = general.log
     cayley_map: Callable | None = general.cayley
     inverse_cayley_map: Callable = general.inverse_cayley
+    restore_map: Callable = closed.unchanged
 
     @property
     def dim(self) -> int:
@@ -304,43 +307,47 @@ class MatrixGroup:
 @register((2,), (3,), (4,))
 def SO(n: int) -> MatrixGroup:
     """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
-    algebra, name = catalogue.so(n), f"SO({n})"
+    group = MatrixGroup(
+        f"SO({n})",
+        catalogue.so(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        restore_map=general.orthonormalized,
+    )
     if n == 2:
-        return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, closed.so2_exp, closed.so2_log)
+        return replace(group, exp_map=closed.so2_exp, log_map=closed.so2_log)
     if n == 3:
-        return MatrixGroup(
-            name,
-            algebra,
-            closed.unitary_defect,
-            closed.unitary_inverse,
-            closed.so3_exp,
-            closed.so3_log,
-            closed.so3_cayley,
-            closed.so3_inverse_cayley,
-        )
-    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse)
+        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log)
+        return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
+    return group
 
 
 @register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
     """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
-    algebra, name = catalogue.se(n), f"SE({n})"
+    group = MatrixGroup(
+        f"SE({n})", catalogue.se(n), closed.rigid_defect, closed.rigid_inverse, restore_map=closed.rigid_restored
+    )
     if n == 3:
-        group = MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse, closed.se3_exp, closed.se3_log)
+        group = replace(group, exp_map=closed.se3_exp, log_map=closed.se3_log)
         return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
-    return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse)
+    return group
 
 
 @register((2,), (3,))
 def SU(n: int) -> MatrixGroup:
     """Unitary complex matrices of determinant 1."""
-    algebra, name = catalogue.su(n), f"SU({n})"
+    group = MatrixGroup(
+        f"SU({n})",
+        catalogue.su(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        restore_map=closed.unitary_restored,
+    )
     if n == 2:
-        group = MatrixGroup(
-            name, algebra, closed.unitary_defect, closed.unitary_inverse, closed.su2_exp, closed.su2_log
-        )
+        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
         return replace(group, inverse_cayley_map=closed.su2_inverse_cayley)
-    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, cayley_map=None)
+    return replace(group, cayley_map=None)
 
 
 @register((2,), (3,))

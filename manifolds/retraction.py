@@ -153,6 +153,14 @@ class Chart(Retraction):
         """Derivative of ``v -> point(z, v)`` along w: a tangent vector at ``point(z, v)``."""
         return run(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
 
+    def carry(self, z, v, u) -> jax.Array:
+        """The tangent vector u at z, taken along to ``x = point(z, v)``: such that ``point(x, -carry(z, v, v))`` is z.
+
+        Parallel transport with the Riemannian chart, the same left-trivialised velocity with those of groups. With
+        ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
+        """
+        return run(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
+
     @abstractmethod
     def _point(self, z, v): ...
 
@@ -162,6 +170,9 @@ class Chart(Retraction):
     @abstractmethod
     def _middle(self, x, y):
         """The z with ``vector(z, x) = -vector(z, y)``."""
+
+    @abstractmethod
+    def _carry(self, z, v, u): ...
 
     @abstractmethod
     def _midpoint_reach(self, z, v):
@@ -210,6 +221,9 @@ class RiemannianRetraction(Chart):
     def _middle(self, x, y):
         return self.space._midpoint(x, y)
 
+    def _carry(self, z, v, u):
+        return self.space._transport(z, v, u)
+
     def _reach(self, z, v):
         return self.space._reach(z, v)
 
@@ -241,6 +255,9 @@ class EuclideanRetraction(Chart):
     def _middle(self, x, y):
         return 0.5 * (x + y)
 
+    def _carry(self, z, v, u):
+        return u + jnp.zeros_like(v)
+
     def _reach(self, z, v):
         return self.space._straight_reach(z, v)
 
@@ -251,6 +268,9 @@ class EuclideanRetraction(Chart):
 class _GroupChart(Chart):
     def _middle(self, x, y):
         return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
+
+    def _carry(self, z, v, u):
+        return self.space._left_carry(z, self._point(z, v), u)
 
 
 @jax.tree_util.register_static

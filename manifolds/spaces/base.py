@@ -67,6 +67,8 @@ class Space(ABC):
     metric: str
     bi_invariant: bool = False
     """Whether the space is a group whose exponential is the Riemannian one."""
+    smooth: bool = True
+    """Whether its maps have derivatives of every order, not of the first alone."""
     dtype: np.dtype = np.dtype(np.float64)
 
     @property
@@ -133,6 +135,27 @@ class Space(ABC):
         size : tuple of int
         """
         return self._compiled("_random", random_key(key_or_seed), static=(tuple(size),))
+
+    @property
+    def size(self) -> int:
+        """Number of real components of a point."""
+        return math.prod(self.shape) * (2 if self.dtype.kind == "c" else 1)
+
+    def to_vector(self, x) -> jax.Array:
+        """Points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary ones."""
+        x = self._array(x, "x")
+        rows = x.reshape(*x.shape[: x.ndim - len(self.shape)], -1)
+        return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
+
+    def from_vector(self, x) -> jax.Array:
+        """The inverse of :meth:`to_vector`, shape (..., *shape)."""
+        x = jnp.asarray(as_numeric(x, "x"))
+        if x.shape[-1:] != (self.size,):
+            raise ShapeError(f"x must have last axis {self.size} for {self.name}, but its shape is {x.shape}")
+        if self.dtype.kind == "c":
+            real, imaginary = jnp.split(x, 2, axis=-1)
+            x = real + 1j * imaginary
+        return x.reshape(*x.shape[:-1], *self.shape)
 
     # -- tangent vectors ------------------------------------------------------------------------------------------
 
@@ -326,6 +349,10 @@ class Space(ABC):
     def _group_log(self, x, y):
         """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
         return self._group_exp(x, y)  # raises
+
+    def _left_carry(self, x, y, u):
+        """``y x^-1 u``."""
+        return self._group_exp(x, u)  # raises
 
     def _cayley(self, x, v):
         """``x cayley(x^-1 v)``."""

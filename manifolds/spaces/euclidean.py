@@ -86,6 +86,9 @@ class Euclidean(Space):
     def _group_log(self, x, y):
         return y - x
 
+    def _left_carry(self, x, y, u):
+        return u + jnp.zeros_like(y)
+
     def _cayley(self, x, v):
         """That of the translations, as matrices ``[[I, x], [0, 1]]``."""
         return x + v

@@ -14,7 +14,7 @@ from ..catalogue import _size
 from ..closed_forms import affine
 from ..errors import ParameterError
 from ..lie_group import SE, SO, SU, MatrixGroup, _log
-from ..matrix_functions import determinant, orthonormalized, polar
+from ..matrix_functions import determinant, polar
 from ..symmetric import orthonormal_columns
 from .base import Space, register
 
@@ -73,6 +73,9 @@ class GroupSpace(Space):
     def _group_log(self, x, y):
         return self._from_velocity(x, _log(self.group, self._relative(x, y)))
 
+    def _left_carry(self, x, y, u):
+        return y @ (self.group.inverse_map(x) @ u)
+
     def _cayley(self, x, v):
         self.group._need_cayley()
         assert self.group.cayley_map is not None
@@ -84,7 +87,7 @@ class GroupSpace(Space):
 
     def _restored(self, x):
         """One Newton step to the group, so that rounding does not add up."""
-        raise NotImplementedError
+        return self.group.restore_map(x)
 
 
 class BiInvariantSpace(GroupSpace):
@@ -95,9 +98,6 @@ class BiInvariantSpace(GroupSpace):
 
     metric = "bi-invariant"
     bi_invariant = True
-
-    def _restored(self, x):
-        return orthonormalized(x)
 
     def _project_tangent(self, x, w):
         return self._from_velocity(x, self._velocity(x, w))  # vee is the orthogonal projection
@@ -184,10 +184,6 @@ class SpecialUnitary(BiInvariantSpace):
     def injectivity_radius(self, x=None):
         return math.pi * math.sqrt(2 * self.n / (self.n - 1))
 
-    def _restored(self, x):
-        x = orthonormalized(x)
-        return x * (1.0 - (determinant(x) - 1.0) / self.n)[..., None, None]
-
     def _project(self, x):
         return self._of_unit_determinant(polar(x))
 
@@ -261,9 +257,6 @@ class SpecialEuclidean(GroupSpace):
     def _exp(self, x, v):
         y = self._map(self.rotations._exp, lambda x, v: x + v, x, v)
         return affine(y[..., :-1, :-1], y[..., :-1, -1:])
-
-    def _restored(self, x):
-        return affine(orthonormalized(x[..., :-1, :-1]), x[..., :-1, -1:])
 
     def _log(self, x, y):
         return self._map(self.rotations._log, lambda x, y: y - x, x, y)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..catalogue import _size
 from ..errors import SpaceError
-from .base import Space, register
+from .base import Space, random_key, register
 from .euclidean import Euclidean
 from .groups import SpecialOrthogonal
 from .sphere import Sphere
@@ -90,9 +90,12 @@ class Product(Space):
     def _project(self, x):
         return self._joined("_project", x)
 
+    def random(self, key_or_seed, size=()):
+        keys = jax.random.split(random_key(key_or_seed), len(self.factors))
+        return self.join(*(factor.random(k, size) for factor, k in zip(self.factors, keys, strict=True)))
+
     def _random(self, key, size):
-        keys = jax.random.split(key, len(self.factors))
-        return self.join(*(factor._random(k, size) for factor, k in zip(self.factors, keys, strict=True)))
+        return self.random(key, size)
 
     def _project_tangent(self, x, w):
         return self._joined("_project_tangent", x, w)
@@ -145,6 +148,10 @@ class Product(Space):
     def bi_invariant(self):  # type: ignore[override]
         return all(factor.bi_invariant for factor in self.factors)
 
+    @property
+    def smooth(self):  # type: ignore[override]
+        return all(factor.smooth for factor in self.factors)
+
     def _straight_reach(self, x, v):
         return jnp.stack(self._each("_straight_reach", x, v)).max(axis=0)
 
@@ -153,6 +160,9 @@ class Product(Space):
 
     def _group_log(self, x, y):
         return self._joined("_group_log", x, y)
+
+    def _left_carry(self, x, y, u):
+        return self._joined("_left_carry", x, y, u)
 
     def _cayley(self, x, v):
         return self._joined("_cayley", x, v)
@@ -211,8 +221,11 @@ class Power(Space):
     def _project(self, x):
         return self.base._project(x)
 
+    def random(self, key_or_seed, size=()):
+        return self.base.random(key_or_seed, (*size, self.count))
+
     def _random(self, key, size):
-        return self.base._random(key, (*size, self.count))
+        return self.random(key, size)
 
     def _project_tangent(self, x, w):
         return self.base._project_tangent(x, w)
@@ -260,6 +273,10 @@ class Power(Space):
     def bi_invariant(self):  # type: ignore[override]
         return self.base.bi_invariant
 
+    @property
+    def smooth(self):  # type: ignore[override]
+        return self.base.smooth
+
     def _straight_reach(self, x, v):
         return self.base._straight_reach(x, v).max(axis=-1)
 
@@ -268,6 +285,9 @@ class Power(Space):
 
     def _group_log(self, x, y):
         return self.base._group_log(x, y)
+
+    def _left_carry(self, x, y, u):
+        return self.base._left_carry(x, y, u)
 
     def _cayley(self, x, v):
         return self.base._cayley(x, v)

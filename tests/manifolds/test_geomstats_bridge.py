@@ -46,7 +46,7 @@ def slow(*args, **kwargs):
     scope="module",
     params=[
         pytest.param((mf.Sphere(2), gs_hypersphere.Hypersphere(2)), id="S^2"),
-        pytest.param((mf.SpecialOrthogonal(3), gs_so.SpecialOrthogonal(3)), id="SO(3)"),
+        slow((mf.SpecialOrthogonal(3), gs_so.SpecialOrthogonal(3)), id="SO(3)"),
         slow((mf.SpecialEuclidean(3, 2**0.5), gs_se.SpecialEuclidean(3)), id="SE(3)"),
         slow((mf.SPD(3), gs_spd.SPDMatrices(3)), id="SPD(3)"),
         slow((mf.Hyperbolic(2), gs_hyperboloid.Hyperboloid(2)), id="H^2"),
@@ -125,6 +125,7 @@ def test_retractions(twins):
     assert close(jax.jit(jax.vmap(theirs))(z, v)[1], theirs(z, v)[1])
 
 
+@pytest.mark.slow
 def test_other_models():
     """The Poincaré ball has coordinates of its own; the Grassmannian no native twin at all."""
     ball, hyperboloid = mf.from_geomstats(gs_ball.PoincareBall(2)), mf.Hyperbolic(2)
@@ -143,6 +144,7 @@ def test_other_models():
     assert close(planes.inner(y, *[planes.transport(x, v, a) for a in (u, v)]), planes.inner(x, u, v))
 
 
+@pytest.mark.slow
 def test_powers_and_products_of_them():
     sphere = mf.from_geomstats(gs_hypersphere.Hypersphere(2))
     native, other = mf.Sphere(2) ** 3, sphere**3

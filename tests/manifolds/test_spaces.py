@@ -42,7 +42,7 @@ TOLERANCES = {
 
 seeds = st.integers(0, 10**6)
 BATCH = 3
-SLOW = ("S^1", "S^3", "SO(4)", "SU(2)", "SU(3)", "SE(2)", "St(4, 2)", "SO(3) x R^3")
+SLOW = ("S^1", "S^3", "SO(4)", "SU(2)", "SU(3)", "SE(2)", "SE(3)", "St(4, 2)", "SO(3) x R^3")
 """Spaces whose whole suite is left to the slow tests: together they compile for more than a minute."""
 
 BY_FACTORS = (mf.Product, mf.Power, mf.SpecialEuclidean)
@@ -297,6 +297,7 @@ def test_geomstats_agrees(S):
         assert not close(fine, exact, "ladder")  # control: the extrapolation is needed
 
 
+@pytest.mark.slow
 def test_rigid_motions_with_the_metric_of_geomstats():
     """The Frobenius product there: twice the native metric, if a length sqrt(2) counts as one radian."""
     S, other = mf.SpecialEuclidean(2, 2**0.5), gs_se.SpecialEuclidean(2)
@@ -304,6 +305,7 @@ def test_rigid_motions_with_the_metric_of_geomstats():
     assert close(S.distance(x, y) * 2**0.5, other.metric.dist(x, y), "oracle")
 
 
+@pytest.mark.slow
 def test_su2_is_a_sphere_of_radius_two():
     S, sphere = mf.SpecialUnitary(2), mf.Sphere(3)
 
@@ -335,6 +337,7 @@ def test_so3_is_totally_geodesic_in_su3():
     assert close(S.transport(x, v, u), real.transport(x, v, u))
 
 
+@pytest.mark.slow
 def test_stiefel_in_brief():
     """The whole suite on St(4, 2) is slow."""
     S, other = mf.Stiefel(3, 2), gs_stiefel.Stiefel(3, 2)
@@ -382,9 +385,9 @@ def test_just_inside_the_cut_locus(space):
 def test_distant_positive_definite_matrices():
     space = mf.SPD(3)
     x = points(space, 15)
-    for factor in (1e-10, 1e10):
-        assert close(space.log(x, factor * x), np.log(factor) * x, "spd")
-        assert close(space.distance(x, factor * x), 3**0.5 * abs(np.log(factor)), "spd")
+    for factor in (1e-10, 1e10):  # logarithms with entries up to 60
+        assert close(space.log(x, factor * x), np.log(factor) * x, "spd", scale=3.0)
+        assert close(space.distance(x, factor * x), 3**0.5 * abs(np.log(factor)), "spd", scale=3.0)
 
 
 def test_neighbours_keep_their_relative_accuracy():
@@ -397,7 +400,7 @@ def test_neighbours_keep_their_relative_accuracy():
         assert np.abs(np.asarray(space.norm(x, space.log(x, y))) / chord - 1).max() < 1e-15
 
 
-@pytest.mark.parametrize("space", [named(space, slow=space.name != "S^2") for space in mf.registered_spaces()])
+@pytest.mark.parametrize("space", [named(space, slow=True) for space in mf.registered_spaces()])
 def test_derivatives_at_zero_and_elsewhere(space):
     """``c -> log(exp(c))`` is the identity: its first derivative is I and its second 0, forward and reverse."""
     x = space.random(21)
@@ -418,8 +421,15 @@ def test_derivatives_at_zero_and_elsewhere(space):
     "space",
     [
         named(mf.Sphere(2)),
-        named(mf.SpecialOrthogonal(3)),
-        *(named(space, slow=True) for space in (mf.SpecialEuclidean(3), mf.SpecialUnitary(2), mf.Stiefel(4, 2))),
+        *(
+            named(space, slow=True)
+            for space in (
+                mf.SpecialOrthogonal(3),
+                mf.SpecialEuclidean(3),
+                mf.SpecialUnitary(2),
+                mf.Stiefel(4, 2),
+            )
+        ),
     ],
 )
 def test_points_do_not_drift_off(space):
@@ -446,9 +456,10 @@ def test_points_do_not_drift_off(space):
 @pytest.mark.parametrize(
     "space",
     [
-        named(mf.Sphere(2) ** 2),
-        named(mf.Hyperbolic(2)),
-        named(mf.SpecialOrthogonal(3)),
+        named(mf.Sphere(2)),
+        named(mf.Sphere(2) ** 2, slow=True),
+        named(mf.Hyperbolic(2), slow=True),
+        named(mf.SpecialOrthogonal(3), slow=True),
         named(mf.SpecialEuclidean(3), slow=True),
         named(mf.SPD(2), slow=True),
     ],
@@ -470,6 +481,7 @@ def test_closed_forms_unroll_into_scalar_programs(space):
         assert close(a, b, *rounding(space, x, y))
 
 
+@pytest.mark.slow
 def test_batches_broadcast_and_compile():
     space = mf.Sphere(2) * mf.Hyperbolic(2)
     x, y = space.random(0, (2, 1)), space.random(1, (3,))
@@ -493,6 +505,7 @@ def test_under_tracing_what_is_not_defined_is_nan():
     assert close(space.distance(x, y), [np.pi / 2, np.pi])
 
 
+@pytest.mark.slow
 def test_product_parts():
     space = mf.Sphere(2) * mf.Euclidean(2) * mf.SpecialUnitary(2)
     assert space.name == "S^2 x R^2 x SU(2)"
