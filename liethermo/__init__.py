@@ -38,17 +38,27 @@ from .errors import (
 )
 from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod, Reference, registered_methods
+from .integrators import (
+    InCharts,
+    MetriplecticGauss,
+    MetriplecticMidpoint,
+    OneStepMethod,
+    Reference,
+    WithAttitude,
+    registered_methods,
+)
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
-from .systems import EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
+from .systems import AttitudeSystem, ChartSystem, EulerPoincareSystem, LiePoissonSystem, MetriplecticSystem, System
 from .timeloop import integrate
 
 __all__ = [
     "Adaptive",
+    "AttitudeSystem",
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ChartSystem",
     "ConvergenceError",
     "CoordinateIncrement",
     "DiscreteGradient",
@@ -64,6 +74,7 @@ __all__ = [
     "Function",
     "FunctionError",
     "Gonzalez",
+    "InCharts",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
@@ -86,6 +97,7 @@ __all__ = [
     "Stats",
     "Status",
     "System",
+    "WithAttitude",
     "ensemble",
     "flow",
     "integrate",

@@ -193,21 +193,23 @@ def stage_gradients(energy: Energy, x, low, h, k, A, b, finer: Finer | None = No
 
 
 def _stage_gradients(term: Energy, x, low, h, k, A, b, finer: Finer | None) -> jax.Array:
-    gradients = jax.vmap(term.gradient)(x + (low + h * (A @ k)))
     if term.is_quadratic:
-        return gradients
-    d, mean = h * (b @ k), b @ gradients
+        return jax.vmap(term.gradient)(x + (low + h * (A @ k)))
+    d = h * (b @ k)
+    new, new_low = _rounded(x, low + d)
+    nodes = A if finer is None else np.concatenate([A, finer.A])
+    # one map for all points, as one is what a compiler has to work on
+    found = jax.vmap(term.gradient)(jnp.concatenate([x + (low + h * (nodes @ k)), jnp.stack([x, new])]))
+    gradients, between, ends = found[: len(A)], found[len(A) : -2], found[-2:]
+    mean = b @ gradients
     spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
     smooth = jnp.zeros(())
     if finer is not None:
-        between = jax.vmap(lambda a: term.gradient(x + (low + h * (a @ k))))(finer.A)
         rates = jnp.sum(between * (finer.slopes @ k), axis=1)
         smooth = h * (jnp.dot(finer.b, rates) + jnp.dot(finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
-    new, new_low = _rounded(x, low + d)
     before, after = _values(term, jnp.stack([x, new]))
     # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
-    ends = jax.vmap(term.gradient)(jnp.stack([x, new]))
     difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
     defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     square = jnp.dot(b, jnp.sum(k * k, axis=1))

@@ -85,8 +85,13 @@ class _Iteration(NamedTuple):
         return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
-    """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
+def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, exact: bool = True) -> Solved:
+    """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against.
+
+    On manifolds the Jacobian is not ``exact`` but made of differences: the second derivatives of a chart may not exist,
+    and where they do the compiler would spend most of its time on what is hardly ever needed.
+    """
+    derivative = jax.jacfwd if exact else _differences
 
     def fixed_point_goes_on(s: _Iteration):
         slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
@@ -99,7 +104,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     def better_start():
         """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
         nothing = jnp.zeros_like(guess)
-        misfit = [jnp.linalg.norm(slopes(k) - k) for k in (guess, nothing)]
+        misfit = jax.lax.map(lambda k: jnp.linalg.norm(slopes(k) - k), jnp.stack([guess, nothing]))
         return jnp.where(misfit[0] <= misfit[1], guess, nothing)
 
     def newton_goes_on(s: _Iteration):
@@ -107,7 +112,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        inverse = _inverse(jax.jacfwd(flat)(s.k.ravel()))
+        inverse = _inverse(derivative(flat)(s.k.ravel()))
 
         def reuse(carry):
             inner, _ = carry
@@ -127,6 +132,19 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
+
+
+def _differences(function: Callable) -> Callable:
+    """The Jacobian by one-sided differences: half of the digits, which is enough for Newton's method."""
+
+    def jacobian(k):
+        size = jnp.max(jnp.abs(k))
+        step = EPS**0.5 * jnp.where(size > 0.0, size, 1.0)
+        shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
+        values = jax.lax.map(lambda shift: function(k + shift), shifts)
+        return ((values[1:] - values[0]) / step).T
+
+    return jacobian
 
 
 @jax.custom_batching.custom_vmap
@@ -201,7 +219,8 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def scale(k):
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
-    solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), method.predict(state.k, state.before), scale)
+    guess = method.predict(state.k, state.before)
+    solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), guess, scale, system.space is None)
     new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
@@ -284,14 +303,8 @@ STEERED = 4 * EPS
 
 
 def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
-    """The end of a step: new state, what rounding keeps from it, energy, entropy, and a sum that is finite if they are.
-
-    x + low is the state; the increment is added with its rounding error caught (Neumaier's two-sum).
-    """
-    increment = method.increment(h, k) + low
-    new = x + increment
-    back = new - x
-    new_low = (x - (new - back)) + (increment - back)
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are."""
+    new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
     if system.energy_law == "conserved":
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
@@ -309,8 +322,9 @@ def _steering(system: System, x, low, energy, first_energy):
     size = jnp.dot(jnp.abs(gradient), jnp.abs(x))
     most = 0.25 * EPS * size
     amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
-    square = jnp.dot(gradient, gradient)
-    return -gradient * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
+    direction = system.raised(x, gradient)
+    square = jnp.dot(gradient, direction)
+    return -direction * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:

@@ -1,8 +1,10 @@
 """Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
 
 from .base import OneStepMethod, registered_methods
+from .charts import InCharts
 from .gauss import MetriplecticGauss
 from .midpoint import MetriplecticMidpoint
+from .reconstruction import WithAttitude
 from .reference import Reference
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
@@ -10,4 +12,13 @@ METHODS: dict[str, type] = {type(method).__name__: type(method) for method in re
 }
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""
 
-__all__ = ["METHODS", "MetriplecticGauss", "MetriplecticMidpoint", "OneStepMethod", "Reference", "registered_methods"]
+__all__ = [
+    "METHODS",
+    "InCharts",
+    "MetriplecticGauss",
+    "MetriplecticMidpoint",
+    "OneStepMethod",
+    "Reference",
+    "WithAttitude",
+    "registered_methods",
+]
