@@ -41,17 +41,21 @@ from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValu
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
+    InCharts,
     MetriplecticGauss,
     MetriplecticMidpoint,
     OneStepMethod,
     Reference,
     VariationalIntegrator,
+    WithAttitude,
     registered_methods,
 )
 from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
+    AttitudeSystem,
+    ChartSystem,
     ComposedSystem,
     ContactSystem,
     EulerPoincareSystem,
@@ -68,9 +72,11 @@ from .timeloop import integrate
 
 __all__ = [
     "Adaptive",
+    "AttitudeSystem",
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
     "ConvergenceError",
@@ -92,6 +98,7 @@ __all__ = [
     "FunctionError",
     "Gonzalez",
     "Herglotz",
+    "InCharts",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
@@ -120,6 +127,7 @@ __all__ = [
     "System",
     "ThermodynamicHerglotz",
     "VariationalIntegrator",
+    "WithAttitude",
     "ensemble",
     "flow",
     "integrate",

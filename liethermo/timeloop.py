@@ -21,12 +21,12 @@ from .engine.interpret import at_points
 from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
+from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, WithAttitude
 from .progress import Progress
 from .solution import Laws, Solution, Stats, Status
 from .stepwise import Adaptive, Dense, Event, Relaxed, stops_of
 from .stepwise import run as run_stepwise
-from .systems import System
+from .systems import AttitudeSystem, LiePoissonSystem, System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
 SMALL_DIM, SMALL_PROGRAM = 16, 4000
@@ -62,6 +62,7 @@ def integrate(
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
     save_to: str | os.PathLike | None = None,
+    attitude=None,
 ) -> Solution:
     """Integrate a system from a state over a span of time.
 
@@ -97,6 +98,8 @@ def integrate(
         Show a progress bar; by default where the standard error is a terminal.
     save_to : path, optional
         Write the solution here, also on failure and at most once a minute on the way.
+    attitude : array, shape (m, m), optional
+        Where the system has a group: its element at the start, the identity by default.
 
     Returns
     -------
@@ -119,6 +122,18 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
+    state = system.state(x0)
+    if reason := system.outside(state):
+        raise InputError(f"the run cannot start at this x0: {reason}")
+    if isinstance(system, LiePoissonSystem) and system.group is not None and isinstance(method, OneStepMethod):
+        assert system.reconstruction is not None
+        method = WithAttitude(method.on(system), system.reconstruction)
+        system = AttitudeSystem(system)
+        state = system.begin(state, attitude)
+    elif attitude is not None:
+        raise InputError("an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)")
+    if isinstance(method, OneStepMethod):
+        method = method.on(system)
     _prepared(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
@@ -127,10 +142,7 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    x = system.state(x0)
-    if reason := system.outside(x):
-        raise InputError(f"the run cannot start at this x0: {reason}")
-    run = _Run(system, method, x, table, save_to, engine)
+    run = _Run(system, method, state, table, save_to, engine)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
@@ -223,7 +235,8 @@ class _Run:
             self._append(*last)
         self.event_time = outcome.event_time
         if pieces:
-            self.dense = Dense(*(np.array(column) for column in zip(*pieces, strict=True)))
+            begins, lengths, x, k = (np.array(column) for column in zip(*pieces, strict=True))
+            self.dense = Dense(begins, lengths, x, k, None if self.system.space is None else self._along)
         state, now = outcome.state, self.times[-1]
         self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
         steps = int(state.step)
@@ -243,6 +256,9 @@ class _Run:
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 self.status = dataclasses.replace(self.status, message=text)
+
+    def _along(self, x, v) -> np.ndarray:
+        return np.asarray(jax.jit(jax.vmap(lambda x, v: self.method.along(self.system, x, v)))(x, v))
 
     def _append(self, t: float, state) -> None:
         self.times.append(t)
@@ -359,7 +375,7 @@ class _Run:
         invariants, laws = _prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
-        return Solution(
+        found = Solution(
             t=np.array(self.times),
             x=x,
             energy=energy,
@@ -375,6 +391,7 @@ class _Run:
             event_time=self.event_time,
             dense=self.dense,
         )
+        return system.presented(found)
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:

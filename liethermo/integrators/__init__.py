@@ -1,10 +1,12 @@
 """Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
 
 from .base import OneStepMethod, registered_methods
+from .charts import InCharts
 from .discrete import DiscreteSystem, FiniteDifference
 from .gauss import MetriplecticGauss
 from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
+from .reconstruction import WithAttitude
 from .reference import Reference
 from .variational import VariationalIntegrator
 
@@ -18,10 +20,12 @@ __all__ = [
     "DiscreteHerglotz",
     "DiscreteSystem",
     "FiniteDifference",
+    "InCharts",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "OneStepMethod",
     "Reference",
     "VariationalIntegrator",
+    "WithAttitude",
     "registered_methods",
 ]

@@ -1,6 +1,8 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
+from .attitude import AttitudeSystem
 from .base import System
+from .chart import ChartSystem
 from .composed import ComposedSystem, Subsystem
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
@@ -10,6 +12,8 @@ from .metriplectic import MetriplecticSystem
 from .simple_closed import SimpleClosedSystem
 
 __all__ = [
+    "AttitudeSystem",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
     "EulerPoincareSystem",
