@@ -42,16 +42,22 @@ from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValu
 from .graph_files import Graph, read_graph
 from .integrators import (
     DiscreteHerglotz,
+    FiniteDifference,
+    InCharts,
     MetriplecticGauss,
     MetriplecticMidpoint,
     OneStepMethod,
     Reference,
+    VariationalIntegrator,
+    WithAttitude,
     registered_methods,
 )
 from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
+    AttitudeSystem,
+    ChartSystem,
     ComposedSystem,
     ContactSystem,
     Copies,
@@ -60,6 +66,7 @@ from .systems import (
     Herglotz,
     LiePoissonSystem,
     MetriplecticSystem,
+    SimpleClosedSystem,
     Subsystem,
     System,
     ThermodynamicHerglotz,
@@ -68,9 +75,11 @@ from .timeloop import integrate
 
 __all__ = [
     "Adaptive",
+    "AttitudeSystem",
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
     "ConvergenceError",
@@ -87,6 +96,7 @@ __all__ = [
     "EulerPoincareSystem",
     "EvolutionSystem",
     "FileError",
+    "FiniteDifference",
     "FourBracket",
     "FrictionOperator",
     "Function",
@@ -94,6 +104,7 @@ __all__ = [
     "Gonzalez",
     "Graph",
     "Herglotz",
+    "InCharts",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
@@ -113,6 +124,7 @@ __all__ = [
     "Quadratic",
     "Reference",
     "Relaxed",
+    "SimpleClosedSystem",
     "Solution",
     "SpecError",
     "Stats",
@@ -120,6 +132,8 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "VariationalIntegrator",
+    "WithAttitude",
     "ensemble",
     "flow",
     "integrate",

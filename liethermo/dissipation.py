@@ -250,8 +250,8 @@ class ProjectedMetric(Dissipation):
 
     Parameters
     ----------
-    cometric : array, shape (n, n), or function from x, shape (n,), to one; None for the identity
-        Positive definite.
+    cometric : array, shape (n, n), or function from x, shape (n,), to one
+        Positive definite. By default the identity, or on a manifold the metric of the space.
     preserve : sequence of functions or energies
         Kept constant besides the energy.
     normalized : bool
@@ -277,7 +277,10 @@ class ProjectedMetric(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         G = _at(self.cometric, x)
-        raised = (lambda alpha: alpha) if G is None else (lambda alpha: G @ alpha)
+
+        def raised(alpha):
+            return system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
+
         if not dL and not self.normalized:
             GdH = raised(dH)
             return self.rate * (jnp.dot(GdH, dH) * raised(dS) - jnp.dot(GdH, dS) * GdH)
@@ -332,12 +335,12 @@ class FrictionOperator(Dissipation):
         return self
 
     def force(self, system, x, dH, dS, dL):
-        gradient, K = system.energy.gradient(x), _at(self.K, x)
-        overlap = jnp.dot(gradient, dH)
+        gradient, raised, K = system.raised(x, system.energy.gradient(x)), system.raised(x, dH), _at(self.K, x)
+        overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
-        safe = overlap > 1e-3 * jnp.dot(dH, dH)
-        along = jnp.where(safe, gradient, dH)
-        overlap = jnp.where(safe, overlap, jnp.dot(dH, dH))
+        safe = overlap > 1e-3 * square
+        along = jnp.where(safe, gradient, raised)
+        overlap = jnp.where(safe, overlap, square)
         along = along / jnp.where(overlap > 0.0, overlap, 1.0)
         image = K @ (dS - jnp.dot(along, dS) * dH)
         return self.rate * (image - jnp.dot(dH, image) * along)
@@ -429,7 +432,7 @@ class DoubleBracket(Dissipation):
     ----------
     rate : float, >= 0
     metric : array, shape (n, n), optional
-        The positive definite form that raises the index; the identity by default.
+        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space.
     """
 
     rate: jax.Array
@@ -458,8 +461,8 @@ class DoubleBracket(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         motion = system.poisson.sharp(x, dH)
-        raised = motion if self.metric is None else self.metric @ motion
-        return self.rate * system.poisson.sharp(x, raised)
+        lowered = system.lowered(x, motion) if self.metric is None else self.metric @ motion
+        return self.rate * system.poisson.sharp(x, lowered)
 
 
 class EulerPoincareForce(Dissipation):

@@ -297,6 +297,24 @@ def as_energy(function, role: str) -> Energy:
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
 
 
+class OfPoint(Energy):
+    """A function of the points of a space, as a function of their vectors, shape (n,)."""
+
+    energy: Energy
+    space: mf.Space = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(self.space.from_vector(x))
+
+
+def on_points(energy: Energy, space: mf.Space | None) -> Energy:
+    """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
+    if space is None or space.shape == (space.size,):
+        return energy
+    terms = tuple(term if isinstance(term, Quadratic) else OfPoint(term, space) for term in energy.terms)
+    return terms[0] if len(terms) == 1 else Sum(terms)
+
+
 def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
     A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
     for power, coefficient in polynomial.terms:

@@ -50,7 +50,7 @@ def flow(
     InputError
         If an argument cannot be used.
     """
-    method = MetriplecticMidpoint() if method is None else method
+    method = (MetriplecticMidpoint() if method is None else method).on(system)
     table = Timetable(t_span, step, save_every)
     x = system.state(x0)
     k = method.start(system, x)
@@ -85,7 +85,12 @@ def _stages(system: System, method: OneStepMethod, x, low, h: float, guess) -> j
         return method.slopes(system, x, low, h, k) - k
 
     def solve(misfit, guess):
-        solved = array.solve_stages(lambda k: misfit(k) + k, guess, lambda k: size / h + jnp.max(jnp.abs(k)))
+        solved = array.solve_stages(
+            lambda k: misfit(k) + k,
+            guess,
+            lambda k: size / h + jnp.max(jnp.abs(k)),
+            lambda k: method.jacobian(system, x, low, h, k),
+        )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 
     def solve_linear(linear, y):

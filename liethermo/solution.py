@@ -90,11 +90,15 @@ class Stats:
 
 @dataclass(frozen=True)
 class Laws:
-    """What the system promises: the law of the energy, of the entropy, and the functions it conserves."""
+    """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
+
+    ``ledger`` names those of the recorded functions that say what comes from outside.
+    """
 
     energy: str | None = "conserved"
     entropy: str | None = None
     conserved: tuple[str, ...] = ()
+    ledger: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,8 @@ class Solution:
         When the event of ``integrate(until=...)`` happened.
     dense : Dense or None
         The polynomials between the steps (``integrate(dense=True)``); not written to files.
+    attitude : ndarray, shape (times, m, m), or None
+        Elements of the group of the system, where it has one.
     """
 
     t: np.ndarray
@@ -131,6 +137,7 @@ class Solution:
     provenance: dict[str, Any] = field(default_factory=dict)
     event_time: float | None = None
     dense: Dense | None = None
+    attitude: np.ndarray | None = None
 
     def __call__(self, t) -> np.ndarray:
         """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.stepwise.Dense`.
@@ -160,6 +167,9 @@ class Solution:
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
         variables: dict[str, Any] = {"x": (("time", "component"), self.x), **series}
+        if self.attitude is not None:  # NetCDF has no complex numbers
+            parts = np.stack([self.attitude.real, self.attitude.imag][: 1 + np.iscomplexobj(self.attitude)], axis=-1)
+            variables["attitude"] = (("time", "row", "column", "part"), parts)
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
@@ -226,7 +236,7 @@ def load(path: str | os.PathLike) -> Solution:
         names = [str(name) for name in dataset["invariant_name"].values]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        stored["laws"]["conserved"] = tuple(stored["laws"]["conserved"])
+        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in ("conserved", "ledger")}
         return Solution(
             t=t,
             x=x,
@@ -238,6 +248,11 @@ def load(path: str | os.PathLike) -> Solution:
             laws=Laws(**stored["laws"]),
             provenance=stored["provenance"],
             event_time=json.loads(dataset.attrs.get("event_time", "null")),
+            attitude=_attitude(dataset["attitude"].values) if "attitude" in dataset else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
+
+
+def _attitude(parts: np.ndarray) -> np.ndarray:
+    return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]

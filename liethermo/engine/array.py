@@ -104,8 +104,11 @@ def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     return Solved(s.k, s.settled(scale(s.k)) & finite, finite, s.update, s.made, jnp.zeros_like(s.made))
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
-    """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against."""
+def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable) -> Solved:
+    """Solve ``k = slopes(k)`` from ``guess``.
+
+    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``.
+    """
     first = fixed_point(slopes, guess, scale)
     done = first.converged
     if guess.size > DENSE_LIMIT:
@@ -114,7 +117,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
     def better_start():
         """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
         nothing = jnp.zeros_like(guess)
-        misfit = [jnp.linalg.norm(slopes(k) - k) for k in (guess, nothing)]
+        misfit = jax.lax.map(lambda k: jnp.linalg.norm(slopes(k) - k), jnp.stack([guess, nothing]))
         return jnp.where(misfit[0] <= misfit[1], guess, nothing)
 
     def newton_goes_on(s: Iteration):
@@ -122,7 +125,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
 
     def newton(s: Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        inverse = _inverse(jax.jacfwd(flat)(s.k.ravel()))
+        inverse = _inverse(jacobian(s.k))
 
         def reuse(carry):
             inner, _ = carry
@@ -211,7 +214,11 @@ def begin(system: System, method: OneStepMethod, x) -> State:
 
 def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     """One step; where it fails the state is left as it was, with a status."""
-    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h)))
+
+    def jacobian(k):
+        return method.jacobian(system, state.x, state.low, h, k)
+
+    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h), jacobian))
 
 
 def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[Callable, jax.Array, Callable]:
@@ -311,14 +318,8 @@ STEERED = 4 * EPS
 
 
 def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
-    """The end of a step: new state, what rounding keeps from it, energy, entropy, and a sum that is finite if they are.
-
-    x + low is the state; the increment is added with its rounding error caught (Neumaier's two-sum).
-    """
-    increment = method.increment(h, k) + low
-    new = x + increment
-    back = new - x
-    new_low = (x - (new - back)) + (increment - back)
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are."""
+    new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
     if system.energy_law == "conserved" and "energy" in method.preserves:
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
@@ -336,8 +337,9 @@ def _steering(system: System, x, low, energy, first_energy):
     size = jnp.dot(jnp.abs(gradient), jnp.abs(x))
     most = 0.25 * EPS * size
     amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
-    square = jnp.dot(gradient, gradient)
-    return -gradient * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
+    direction = system.raised(x, gradient)
+    square = jnp.dot(gradient, direction)
+    return -direction * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:

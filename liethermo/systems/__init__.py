@@ -1,15 +1,20 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
+from .attitude import AttitudeSystem
 from .base import System
 from .bodies import Copies, Subsystem
+from .chart import ChartSystem
 from .composed import ComposedSystem
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
+from .simple_closed import SimpleClosedSystem
 
 __all__ = [
+    "AttitudeSystem",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
     "Copies",
@@ -19,6 +24,7 @@ __all__ = [
     "Legendre",
     "LiePoissonSystem",
     "MetriplecticSystem",
+    "SimpleClosedSystem",
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 AXIOM_TOLERANCE = 1e-10
 """Largest residual of an axiom, relative to the size of what should cancel: derivatives round at about 1e-13."""
 
+
 MATRIX_DIM = 200
 """Components up to which the matrices Pi and K are formed; of larger systems only what they do to dH and dS is looked \
 at."""
@@ -62,7 +63,7 @@ def check_system(system: System, points, samples: int, seed: int, scale: float) 
     if points is None:
         if samples < 1:
             raise InputError(f"samples must be a positive integer, not {samples}")
-        points = scale * np.random.default_rng(seed).standard_normal((samples, system.dim))
+        points = system.samples(samples, seed, scale)
     points = np.asarray(system.state(points, batch=True)).reshape(-1, system.dim)
     measured = at_points(_residuals, system, points)
     friction = measured.pop("friction", None)
@@ -90,6 +91,7 @@ def check_system(system: System, points, samples: int, seed: int, scale: float) 
 
 
 _AXIOMS = {
+    "tangent": ("tangent", "Pi or K leads out of the space: what they return is not a tangent vector"),
     "skew": ("Pi skew", "the Poisson tensor must be antisymmetric"),
     "jacobi": ("Jacobi", "Pi is not a Poisson tensor"),
     "casimir": (
@@ -130,16 +132,23 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
     """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix."""
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
+    found = {}
+    given = around = system
+    if system.space is not None:
+        velocity = system.vector_field(x)
+        found["tangent"] = relative(size(velocity - system.tangent(x, velocity)), size(velocity))
+        around, _ = system.local(x)
+        system, x = system.local(x, centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
     values = system.energy.value(x) + (0.0 if system.entropy is None else system.entropy.value(x))
-    found = {"domain": values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)}
+    found["domain"] = values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)
     if system.dim > MATRIX_DIM:
         speed = size(system.poisson.sharp(x, dH)) + size(rate)
         if system.entropy is not None:
             found["casimir"] = relative(size(system.poisson.sharp(x, dS)), size(dS))
     else:
-        matrices, speed = _matrix_residuals(system, x, dH, dS)
+        matrices, speed = _matrix_residuals(system, None if around is given else around, x, dH, dS)
         found, speed = found | matrices, speed + size(rate)
     if system.energy_law is not None:
         flow = jnp.dot(dH, rate)
@@ -158,20 +167,22 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
     return found | system.own_residuals(x)
 
 
-def _matrix_residuals(system: System, x, dH, dS):
+def _matrix_residuals(system: System, around: System | None, x, dH, dS):
     """Residuals of the axioms on the matrices Pi and K; and the size of the motion, for what cancels in it.
 
-    The motion itself may vanish at every point.
+    The motion itself may vanish at every point. On a manifold ``around`` is the system in a chart that is not centred.
     """
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     tensor = system.poisson.tensor(x)
     found = {
         "skew": relative(size(tensor + tensor.T), size(tensor)),
-        "jacobi": relative(
-            system.poisson.jacobi_residual(x), size(tensor) * size(jax.jacfwd(system.poisson.tensor)(x))
-        ),
     }
+    if system.smooth:
+        variation = size(jax.jacfwd((around or system).poisson.tensor)(x))
+        if around is not None:  # in normal coordinates it may be rounding alone: as seen over a unit of length, then
+            variation = variation + size(tensor)
+        found["jacobi"] = relative((around or system).poisson.jacobi_residual(x), size(tensor) * variation)
     if system.entropy is not None:
         found["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
     dissipation = system.dissipation

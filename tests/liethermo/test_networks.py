@@ -334,7 +334,7 @@ def test_a_large_system_is_checked_without_its_matrices():
 
 def test_dense_newton_is_not_begun_where_the_matrix_is_too_large(monkeypatch):
     monkeypatch.setattr(array, "DENSE_LIMIT", 10)
-    solved = array.solve_stages(lambda k: -3.0 * k + 1.0, jnp.ones((1, 11)), lambda k: jnp.max(jnp.abs(k)))
+    solved = array.solve_stages(lambda k: -3.0 * k + 1.0, jnp.ones((1, 11)), lambda k: jnp.max(jnp.abs(k)), None)
     assert not bool(solved.converged)
     assert int(solved.newton) == 0
 
