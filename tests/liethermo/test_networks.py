@@ -251,6 +251,7 @@ def test_the_sparse_engine_needs_a_sparsity():
         lt.integrate(coupled, [0.1, 0.2], (0.0, 1.0), 0.1, engine="sparse")
 
 
+@pytest.mark.slow
 def test_a_step_that_is_refused():
     """T = S: where a step finds no positive temperatures the run stops, with the trajectory so far and a reason."""
     n = 5
