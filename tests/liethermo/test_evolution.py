@@ -200,7 +200,8 @@ def test_observed_order():
     assert (np.abs(slopes - 2.0) < 0.2).all(), (errors, slopes)
 
 
-@pytest.mark.parametrize(("stages", "coarsest"), [(2, 80), pytest.param(3, 40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("stages", "coarsest"), [(2, 80), (3, 40)])
 def test_gauss(stages, coarsest):
     """Order 2s with both laws exact: V is corrected along q and S, the kinetic energy along q."""
     energy = lt.Kinetic(lambda q: 1.5 + jnp.sin(q)) + lt.Potential(Bumpy(jnp.array([2.0, 1.5]), jnp.array([1.0])))

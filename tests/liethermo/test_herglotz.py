@@ -35,7 +35,7 @@ LAGRANGIANS = {
     "quadratic": lt.Quadratic(A, [0.1, 0.2, -0.3, 0.4, -1.0], 0.7),
     "tangled": tangled,
 }
-SLOW = ("constant mass",)
+SLOW = ("constant mass", "kinetic minus potential")
 each_lagrangian = pytest.mark.parametrize(
     "L", [pytest.param(L, id=name, marks=pytest.mark.slow if name in SLOW else ()) for name, L in LAGRANGIANS.items()]
 )
@@ -106,6 +106,7 @@ def test_closed_forms_stay_closed():
     assert "min Delta(L)" in str(unknown.check())
 
 
+@pytest.mark.slow
 def test_both_laws_on_velocities():
     """The midpoint scheme on TQ x R, with a metric that depends on q, and its order."""
     L, x0 = lt.Kinetic(lambda q: 1.5 + jnp.sin(q)) - lt.Potential(warm), [0.5, 1.0, 0.2]
@@ -188,6 +189,7 @@ def quartic_run(steps, t=2.0):
     return lt.integrate(RECORDER, [1.0, 0.5, 0.0], (0.0, t), t / steps, method, save_every=steps // 40, engine="array")
 
 
+@pytest.mark.slow
 def test_observed_order_of_discrete_herglotz():
     """Order 1, by hand: (40) and (41) take S and the friction at the start of the step."""
 
