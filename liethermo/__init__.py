@@ -45,6 +45,7 @@ from .integrators import (
     MetriplecticMidpoint,
     OneStepMethod,
     Reference,
+    VariationalGauss,
     VariationalIntegrator,
     registered_methods,
 )
@@ -119,6 +120,7 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "VariationalGauss",
     "VariationalIntegrator",
     "ensemble",
     "flow",

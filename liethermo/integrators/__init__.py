@@ -7,6 +7,7 @@ from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
 from .reference import Reference
 from .variational import VariationalIntegrator
+from .variational_gauss import VariationalGauss
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
     "Reference": Reference
@@ -22,6 +23,7 @@ __all__ = [
     "MetriplecticMidpoint",
     "OneStepMethod",
     "Reference",
+    "VariationalGauss",
     "VariationalIntegrator",
     "registered_methods",
 ]
