@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import os
 import time
 import warnings
@@ -17,6 +18,7 @@ import numpy as np
 
 from .engine import array, compiled
 from .engine.interpret import at_points
+from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
@@ -27,8 +29,9 @@ from .stepwise import run as run_stepwise
 from .systems import System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
-SMALL_DIM = 8
-"""Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
+SMALL_DIM, SMALL_PROGRAM = 8, 1500
+"""Components of a state and operations of a step up to which numba compiles it about as fast as XLA does (5 s), so that
+"auto" always takes it. Beyond, its time grows as their square: half a minute for 2,700 operations."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
@@ -78,15 +81,15 @@ def integrate(
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
         Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
-        located to rounding on the collocation polynomial, reached by a step that ends there. ``solution.event_time``
+        located to rounding by a step that ends there. ``solution.event_time``
         and the status tell whether it happened.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
-        components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
-        uses what cannot be compiled.
+        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
+        with a warning, where the system uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -116,8 +119,7 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    if isinstance(method, OneStepMethod):
-        method.check(system)
+    _prepared(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -252,13 +254,21 @@ class _Run:
         x = self.states[0][0]
         if self.engine == "compiled":
             try:
-                return compiled.begin(self.system, self.method, x)
+                if self._affordable():
+                    return compiled.begin(self.system, self.method, x)
+                self.engine = "array"
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
                 warn_of_fallback(error, stacklevel=6)
                 self.engine = "array"
         return array.begin(self.system, self.method, x)
+
+    def _affordable(self) -> bool:
+        """Whether to compile: where it was asked for, where it is quick, or where a long run repays it."""
+        if not self.fallback or self.table.steps >= COMPILED_STEPS:
+            return True
+        return compiled.stepper_for(self.system, self.method)[0].operations <= SMALL_PROGRAM
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
@@ -346,7 +356,7 @@ class _Run:
         """What there is so far."""
         system = self.system
         x = np.concatenate(self.states)
-        invariants = system.invariants()
+        invariants, laws = _prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
         return Solution(
@@ -360,7 +370,7 @@ class _Run:
             },
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=laws_of(system, self.method, invariants),
+            laws=laws,
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
@@ -403,6 +413,15 @@ def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
     warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
 
 
+@remembered
+def _prepared(system: System, method) -> tuple[dict, Laws]:
+    """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    invariants = system.invariants()
+    return invariants, laws_of(system, method, invariants)
+
+
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
@@ -437,6 +456,7 @@ def _power_of_two(n: int) -> int:
     return 1 << max(0, n - 1).bit_length()
 
 
+@functools.cache
 def _version() -> str:
     try:
         return metadata.version("liethermo")

@@ -120,8 +120,8 @@ class VariationalIntegrator(OneStepMethod):
         ledger = jnp.stack([*discrete.received(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
         return jnp.concatenate([V, v_dot, s[None], ledger])[None]
 
-    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
-        return -jnp.eye(k.size)  # the slopes are Newton's method already: their derivative vanishes at the solution
+    def change(self, system: System, x, low, h, k, d) -> jax.Array:
+        return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]
