@@ -41,6 +41,7 @@ from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValu
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
+    LieVariational,
     MetriplecticGauss,
     MetriplecticMidpoint,
     OneStepMethod,
@@ -55,6 +56,7 @@ from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
     ComposedSystem,
     ContactSystem,
+    EulerPoincareClosedSystem,
     EulerPoincareSystem,
     EvolutionSystem,
     Herglotz,
@@ -82,6 +84,7 @@ __all__ = [
     "DoubleBracket",
     "Energy",
     "Ensemble",
+    "EulerPoincareClosedSystem",
     "EulerPoincareForce",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -100,6 +103,7 @@ __all__ = [
     "KillingDissipation",
     "Kinetic",
     "LiePoissonSystem",
+    "LieVariational",
     "LiethermoError",
     "MeanValue",
     "MetriplecticGauss",

@@ -1,3 +1,13 @@
 """The measurements, by name, in the order of the page."""
 
-NAMES = ("single_body", "general", "ensemble", "work_precision", "dimension", "bodies", "first_run", "memory")
+NAMES = (
+    "single_body",
+    "general",
+    "variational",
+    "ensemble",
+    "work_precision",
+    "dimension",
+    "bodies",
+    "first_run",
+    "memory",
+)

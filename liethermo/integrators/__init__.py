@@ -8,6 +8,7 @@ from .midpoint import MetriplecticMidpoint
 from .reference import Reference
 from .variational import VariationalIntegrator
 from .variational_gauss import VariationalGauss
+from .variational_lie import LieVariational
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
     "Reference": Reference
@@ -19,6 +20,7 @@ __all__ = [
     "DiscreteHerglotz",
     "DiscreteSystem",
     "FiniteDifference",
+    "LieVariational",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "OneStepMethod",

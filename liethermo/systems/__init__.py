@@ -3,6 +3,7 @@
 from .base import System
 from .composed import ComposedSystem, Subsystem
 from .euler_poincare import EulerPoincareSystem, Legendre
+from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
@@ -12,6 +13,7 @@ from .simple_closed import SimpleClosedSystem
 __all__ = [
     "ComposedSystem",
     "ContactSystem",
+    "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
     "Herglotz",
