@@ -28,12 +28,13 @@ C, COMPILED = "C", "compiled engine"
 def run(quick: bool) -> Report:
     """Time each scheme on Case 1 of the paper, 100,000 steps of a millisecond, one state kept."""
     steps, rounds = (2000, 1) if quick else (STEPS, 9)
-    tables, targets, skipped, furthest = [], [], {}, 0.0
+    tables, targets, furthest = [], [], 0.0
+    skipped: dict[str, str] = {}
     for number in SCHEMES:
         works, left_out = take_part(
             {
-                C: lambda number=number: functools.partial(program(number).integrate, X0, STEP, steps),
-                COMPILED: lambda number=number: by_library(number, steps, steps),
+                C: functools.partial(by_c, number, steps),
+                COMPILED: functools.partial(by_library, number, steps, steps),
             }
         )
         table, times = contest(f"Scheme {number}.", works, steps, rounds, C)
@@ -63,6 +64,10 @@ def program(number: int) -> Body:
     system = CASES[1]
     parameters = [system["mass"], system["stiffness"], FRICTION, 1.5 * system["moles"] * 8.31446261815324, 300.0]
     return Body("variational.c", parameters, f"-DSCHEME={number}")
+
+
+def by_c(number: int, steps: int) -> Callable:
+    return functools.partial(program(number).integrate, X0, STEP, steps)
 
 
 def by_library(number: int, steps: int, every: int) -> Callable[[], lt.Solution]:
