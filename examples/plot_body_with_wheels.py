@@ -2,9 +2,9 @@ r"""
 How does a body in space come to spin about one axis?
 =====================================================
 
-A rigid body with three wheels that rub in their bearings loses none of its angular momentum and none of its energy: what
-the motion loses heats the body. Its equations are Euler-Poincaré equations with entropy on :math:`so(3) + R^3`, and
-their variational principle, discretised through the Cayley map, keeps the spatial momentum exactly.
+A rigid body with three wheels that rub in their bearings loses none of its angular momentum and none of its energy:
+what the motion loses heats the body. Its equations are Euler-Poincaré equations with entropy on :math:`so(3) + R^3`,
+and their variational principle, discretised through the Cayley map, keeps the spatial momentum exactly.
 """
 
 import matplotlib.pyplot as plt
