@@ -13,7 +13,7 @@ import liethermo as lt
 from liethermo.models.gas_piston import gas_piston_equilibrium, gas_piston_state
 
 moles = (1.0, 2.0)
-piston = lt.models.gas_piston(moles, mass=2.0, conductance=(2.0, 2.0), friction=40.0)
+piston = lt.models.gas_piston(moles, mass=2.0, conductance=(5.0, 5.0), friction=40.0)
 x0 = gas_piston_state(0.5, temperatures=(400.0, 300.0, 250.0), moles=moles)
 solution = lt.integrate(piston, x0, t_span=(0.0, 60.0), step=0.01)
 print(solution.audit())

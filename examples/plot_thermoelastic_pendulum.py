@@ -32,7 +32,7 @@ for q, color, name in ((solution.x[:, :2], "#0072B2", "first"), (solution.x[:, 5
     left.plot(*q[~late].T, color=color, linewidth=0.5, alpha=0.4)
     left.plot(*q[late].T, color=color, label=name)
 left.set(aspect="equal", title="paths, the last five units dark", xticks=[], yticks=[])
-left.legend(frameon=False, loc="upper right")
+left.legend(frameon=False, loc="center")
 for r, T, color in zip(lengths, temperatures.T, ("#0072B2", "#E69F00"), strict=True):
     middle.plot(solution.t, r, color=color, linewidth=0.8)
     right.plot(solution.t, T, color=color, linewidth=0.8)

@@ -21,6 +21,7 @@ from .dissipation import (
     KillingDissipation,
     ProjectedMetric,
 )
+from .each import Each
 from .energy import Energy, Function, Quadratic
 from .ensembles import Ensemble, ensemble
 from .errors import (
@@ -38,9 +39,11 @@ from .errors import (
 )
 from .flow import flow
 from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
+from .graph_files import Graph, read_graph
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
+    InCharts,
     LieVariational,
     MetriplecticGauss,
     MetriplecticMidpoint,
@@ -48,14 +51,18 @@ from .integrators import (
     Reference,
     VariationalGauss,
     VariationalIntegrator,
+    WithAttitude,
     registered_methods,
 )
 from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
+    AttitudeSystem,
+    ChartSystem,
     ComposedSystem,
     ContactSystem,
+    Copies,
     EulerPoincareClosedSystem,
     EulerPoincareSystem,
     EvolutionSystem,
@@ -71,17 +78,21 @@ from .timeloop import integrate
 
 __all__ = [
     "Adaptive",
+    "AttitudeSystem",
     "Audit",
     "AxiomError",
     "CasimirError",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
     "ConvergenceError",
     "CoordinateIncrement",
+    "Copies",
     "DiscreteGradient",
     "DiscreteHerglotz",
     "Dissipation",
     "DoubleBracket",
+    "Each",
     "Energy",
     "Ensemble",
     "EulerPoincareClosedSystem",
@@ -95,7 +106,9 @@ __all__ = [
     "Function",
     "FunctionError",
     "Gonzalez",
+    "Graph",
     "Herglotz",
+    "InCharts",
     "IndefiniteError",
     "InnerProductDissipation",
     "InputError",
@@ -126,12 +139,14 @@ __all__ = [
     "ThermodynamicHerglotz",
     "VariationalGauss",
     "VariationalIntegrator",
+    "WithAttitude",
     "ensemble",
     "flow",
     "integrate",
     "load",
     "models",
     "plot",
+    "read_graph",
     "registered_methods",
     "suggest_step",
 ]

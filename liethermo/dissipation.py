@@ -16,12 +16,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
 
 from .energy import Energy, as_energy
 from .errors import IndefiniteError, InputError
+from .indices import union
 
 if TYPE_CHECKING:
     from .systems import System
@@ -52,6 +54,14 @@ class Dissipation(eqx.Module):
     def symmetric(self) -> bool:
         """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
         return True
+
+    def couplings(self, system: System) -> scipy.sparse.csr_array | None:
+        """Which components of the force depend on which components of the state and of the gradients it is handed.
+
+        A pattern, shape (n, n), for systems too large for a full Jacobian matrix; None where it is not known.
+        """
+        del system
+        return None
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -111,6 +121,9 @@ class Several(Dissipation):
     @property
     def symmetric(self) -> bool:
         return all(part.symmetric for part in self.parts)
+
+    def couplings(self, system):
+        return union(part.couplings(system) for part in self.parts)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -237,8 +250,8 @@ class ProjectedMetric(Dissipation):
 
     Parameters
     ----------
-    cometric : array, shape (n, n), or function from x, shape (n,), to one; None for the identity
-        Positive definite.
+    cometric : array, shape (n, n), or function from x, shape (n,), to one
+        Positive definite. By default the identity, or on a manifold the metric of the space.
     preserve : sequence of functions or energies
         Kept constant besides the energy.
     normalized : bool
@@ -264,7 +277,10 @@ class ProjectedMetric(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         G = _at(self.cometric, x)
-        raised = (lambda alpha: alpha) if G is None else (lambda alpha: G @ alpha)
+
+        def raised(alpha):
+            return system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
+
         if not dL and not self.normalized:
             GdH = raised(dH)
             return self.rate * (jnp.dot(GdH, dH) * raised(dS) - jnp.dot(GdH, dS) * GdH)
@@ -319,12 +335,12 @@ class FrictionOperator(Dissipation):
         return self
 
     def force(self, system, x, dH, dS, dL):
-        gradient, K = system.energy.gradient(x), _at(self.K, x)
-        overlap = jnp.dot(gradient, dH)
+        gradient, raised, K = system.raised(x, system.energy.gradient(x)), system.raised(x, dH), _at(self.K, x)
+        overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
-        safe = overlap > 1e-3 * jnp.dot(dH, dH)
-        along = jnp.where(safe, gradient, dH)
-        overlap = jnp.where(safe, overlap, jnp.dot(dH, dH))
+        safe = overlap > 1e-3 * square
+        along = jnp.where(safe, gradient, raised)
+        overlap = jnp.where(safe, overlap, square)
         along = along / jnp.where(overlap > 0.0, overlap, 1.0)
         image = K @ (dS - jnp.dot(along, dS) * dH)
         return self.rate * (image - jnp.dot(dH, image) * along)
@@ -416,7 +432,7 @@ class DoubleBracket(Dissipation):
     ----------
     rate : float, >= 0
     metric : array, shape (n, n), optional
-        The positive definite form that raises the index; the identity by default.
+        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space.
     """
 
     rate: jax.Array
@@ -445,8 +461,8 @@ class DoubleBracket(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         motion = system.poisson.sharp(x, dH)
-        raised = motion if self.metric is None else self.metric @ motion
-        return self.rate * system.poisson.sharp(x, raised)
+        lowered = system.lowered(x, motion) if self.metric is None else self.metric @ motion
+        return self.rate * system.poisson.sharp(x, lowered)
 
 
 class EulerPoincareForce(Dissipation):

@@ -15,15 +15,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
 
 from .engine.interpret import at_points, polynomial_degree
 from .errors import FunctionError, InputError
+from .indices import cliques, pattern, union
 
 if TYPE_CHECKING:
     from .gradients import DiscreteGradient, Path
+
+LARGEST_CLIQUE = 2_000
+"""Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
 
 COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
@@ -60,6 +65,17 @@ class Energy(eqx.Module):
     def stage_gradients(self, scheme: Callable, path: Path) -> jax.Array:
         """Those of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        """The pattern of the Hessian: which components of the gradient depend on which of the state; None if unknown.
+
+        The discrete gradients have it too.
+        """
+        del dim
+        return None
+
+    def check_places(self, dim: int, role: str) -> None:
+        """Raise unless the components that it depends on are those of a state of this dimension."""
 
     def on(self, coordinates: Sequence[int] | np.ndarray | Callable) -> Energy:
         """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
@@ -136,6 +152,12 @@ class Quadratic(Energy):
     def gradient(self, x) -> jax.Array:
         return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
 
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        if is_traced(self.A):
+            return None
+        places = np.nonzero(np.asarray(self.A))
+        return pattern(places[0], places[-1], dim)
+
     def __neg__(self) -> Energy:
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
 
@@ -195,6 +217,14 @@ class Pullback(Energy):
         path, back = path.through(self.of)
         return back(self.term.stage_gradients(scheme, path))
 
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        if self.function is not None or len(self.indices) > LARGEST_CLIQUE:
+            return None
+        return cliques([np.array(self.indices) % dim], dim)
+
+    def check_places(self, dim: int, role: str) -> None:
+        _check_coordinates(self, dim, role)
+
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.indices if self.function is None else self.function)
 
@@ -220,6 +250,12 @@ class Negative(Energy):
     def stage_gradients(self, scheme, path) -> jax.Array:
         return -self.term.stage_gradients(scheme, path)
 
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        return self.term.couplings(dim)
+
+    def check_places(self, dim: int, role: str) -> None:
+        self.term.check_places(dim, role)
+
     def __neg__(self) -> Energy:
         return self.term
 
@@ -236,6 +272,9 @@ class Sum(Energy):
     @property
     def is_quadratic(self) -> bool:
         return all(term.is_quadratic for term in self.summands)
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        return union(term.couplings(dim) for term in self.summands)
 
     def __neg__(self) -> Energy:
         return Sum(tuple(-term for term in self.summands))
@@ -256,6 +295,24 @@ def as_energy(function, role: str) -> Energy:
     if callable(function):
         return Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
+
+
+class OfPoint(Energy):
+    """A function of the points of a space, as a function of their vectors, shape (n,)."""
+
+    energy: Energy
+    space: mf.Space = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(self.space.from_vector(x))
+
+
+def on_points(energy: Energy, space: mf.Space | None) -> Energy:
+    """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
+    if space is None or space.shape == (space.size,):
+        return energy
+    terms = tuple(term if isinstance(term, Quadratic) else OfPoint(term, space) for term in energy.terms)
+    return terms[0] if len(terms) == 1 else Sum(terms)
 
 
 def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
@@ -293,8 +350,7 @@ def _value(energy: Energy, x):
 def check_scalar(energy: Energy, dim: int, role: str) -> None:
     """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has."""
     for term in energy.terms:
-        if isinstance(term, Pullback):
-            _check_coordinates(term, dim, role)
+        term.check_places(dim, role)
     state = jax.ShapeDtypeStruct((dim,), jnp.float64)
     try:
         result = jax.eval_shape(energy.value, state)

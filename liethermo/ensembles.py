@@ -199,6 +199,7 @@ def ensemble(
     states = np.broadcast_to(states, (size, states.shape[1]))
     times = Timetable(t_span, step, save_every if outputs == "trajectory" else None)
     family.check(states)
+    method = method.on(member)
     method.check(member)
     record = _Record(size, member, times, outputs)
 

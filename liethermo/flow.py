@@ -50,7 +50,7 @@ def flow(
     InputError
         If an argument cannot be used.
     """
-    method = MetriplecticMidpoint() if method is None else method
+    method = (MetriplecticMidpoint() if method is None else method).on(system)
     table = Timetable(t_span, step, save_every)
     x = system.state(x0)
     k = method.start(system, x)

@@ -241,22 +241,22 @@ class Path(NamedTuple):
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     """Of one term; ``along`` says which components of the slopes to correct along, by default all."""
-    gradients = jax.vmap(term.gradient)(path.points)
     if term.is_quadratic:
-        return gradients
+        return jax.vmap(term.gradient)(path.points)
     x, low, d, k, h, b = path.start, path.low, path.step, path.slopes, path.h, path.b
+    new, new_low = compensated(x, low + d)
+    further = () if path.further is None else (path.further[0],)
+    # one map for all points, as one is what a compiler has to work on
+    found = jax.vmap(term.gradient)(jnp.concatenate([path.points, *further, jnp.stack([x, new])]))
+    gradients, between, ends = found[: len(k)], found[len(k) : -2], found[-2:]
     mean, smooth = b @ gradients, jnp.zeros(())
     spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
     if path.finer is not None and path.further is not None:
-        points, slopes = path.further
-        between = jax.vmap(term.gradient)(points)
-        rates = jnp.sum(between * slopes, axis=1)
+        rates = jnp.sum(between * path.further[1], axis=1)
         smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
-    new, new_low = _rounded(x, low + d)
     before, after = _values(term, jnp.stack([x, new]))
     # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
-    ends = jax.vmap(term.gradient)(jnp.stack([x, new]))
     difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
     defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     direction = k if along is None else along * k
@@ -269,8 +269,8 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     return gradients + alpha * direction
 
 
-def _rounded(x, d):
-    """x + d as a double, and what rounding keeps from it (two-sum)."""
+def compensated(x, d) -> tuple[jax.Array, jax.Array]:
+    """x + d as a double, and what rounding keeps from it (Neumaier's two-sum)."""
     new = x + d
     back = new - x
     return new, (x - (new - back)) + (d - back)

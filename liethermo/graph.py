@@ -51,11 +51,11 @@ def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
         first, second = np.triu_indices(nodes, 1)
         return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
     first, second, weight = _listed(graph, nodes, what)
-    for i, j, k in zip(first, second, weight, strict=True):
-        if i == j:
-            raise InputError(f"{what} of {names[i]} with itself is {k:g}: leave the diagonal zero")
-        if not (k >= 0.0 and np.isfinite(k)):
-            raise InputError(f"{what} between {names[i]} and {names[j]} is {k:g}: it must be finite and >= 0")
+    for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
+        raise InputError(f"{what} of {names[first[e]]} with itself is {weight[e]:g}: leave the diagonal zero")
+    for e in np.flatnonzero(~((weight >= 0.0) & np.isfinite(weight)))[:1]:
+        ends = f"{names[first[e]]} and {names[second[e]]}"
+        raise InputError(f"{what} between {ends} is {weight[e]:g}: it must be finite and >= 0")
     kept = weight > 0.0
     return Edges(first[kept], second[kept], jnp.asarray(weight[kept]))
 

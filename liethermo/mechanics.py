@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .each import Each
 from .energy import Energy, Function, Pullback, Quadratic, is_traced
 from .engine.interpret import at_points
 
@@ -104,6 +105,8 @@ def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
 
 def is_free_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
     """Whether a term is known not to depend on some components, from its coordinates' derivatives at some states."""
+    if isinstance(term, Each):
+        return not np.isin(components, term.places).any()
     return isinstance(term, Pullback) and not at_points(_jacobian, term, points)[:, :, components].any()
 
 

@@ -122,6 +122,8 @@ class Solution:
         When the event of ``integrate(until=...)`` happened.
     dense : Dense or None
         The polynomials between the steps (``integrate(dense=True)``); not written to files.
+    attitude : ndarray, shape (times, m, m), or None
+        Elements of the group of the system, where it has one.
     """
 
     t: np.ndarray
@@ -135,6 +137,7 @@ class Solution:
     provenance: dict[str, Any] = field(default_factory=dict)
     event_time: float | None = None
     dense: Dense | None = None
+    attitude: np.ndarray | None = None
 
     def __call__(self, t) -> np.ndarray:
         """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.stepwise.Dense`.
@@ -164,6 +167,9 @@ class Solution:
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
         variables: dict[str, Any] = {"x": (("time", "component"), self.x), **series}
+        if self.attitude is not None:  # NetCDF has no complex numbers
+            parts = np.stack([self.attitude.real, self.attitude.imag][: 1 + np.iscomplexobj(self.attitude)], axis=-1)
+            variables["attitude"] = (("time", "row", "column", "part"), parts)
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
@@ -242,6 +248,11 @@ def load(path: str | os.PathLike) -> Solution:
             laws=Laws(**stored["laws"]),
             provenance=stored["provenance"],
             event_time=json.loads(dataset.attrs.get("event_time", "null")),
+            attitude=_attitude(dataset["attitude"].values) if "attitude" in dataset else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
+
+
+def _attitude(parts: np.ndarray) -> np.ndarray:
+    return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]

@@ -140,10 +140,10 @@ class Event:
                 raise InputError("Relaxed(tol) watches the entropy production, and this system produces no entropy")
             self._function = evaluator(_excess, (system, np.float64(until.tol)), system.dim)
         elif callable(until):
-            self._function = evaluator(_scalar, until, system.dim)
+            self._function = evaluator(_of_points, (system, until), system.dim)
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
-        if np.shape(self(np.zeros(system.dim))) != ():
+        if np.shape(self(system.samples(1)[0])) != ():
             raise FunctionError("the event function must return one number")
 
     def __call__(self, x: np.ndarray) -> float:
@@ -159,8 +159,9 @@ def _excess(model, x):
     return system.entropy_production(x) - tol
 
 
-def _scalar(function, x):
-    return function(x)
+def _of_points(model, x):
+    system, function = model
+    return function(system.points(x))
 
 
 @dataclass(frozen=True)
@@ -176,12 +177,15 @@ class Dense:
         States at the starts.
     k : ndarray, shape (steps, s, n)
         Slopes at the stages.
+    along : function or None
+        On a manifold, from states and displacements, shapes (m, n), to states.
     """
 
     start: np.ndarray
     h: np.ndarray
     x: np.ndarray
     k: np.ndarray
+    along: Callable | None = None
 
     def __call__(self, t) -> np.ndarray:
         t = np.asarray(t, dtype=np.float64)
@@ -191,7 +195,11 @@ class Dense:
             raise InputError(f"the solution is known from t = {first:g} to {last:g}, not at {t}")
         i = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
         weights = integrated(self.k.shape[1], (t - self.start[i]) / self.h[i])
-        return self.x[i] + self.h[i][..., None] * np.einsum("...s,...sn->...n", weights, self.k[i])
+        x, v = self.x[i], self.h[i][..., None] * np.einsum("...s,...sn->...n", weights, self.k[i])
+        if self.along is None:
+            return x + v
+        n = x.shape[-1]
+        return np.asarray(self.along(x.reshape(-1, n), v.reshape(-1, n))).reshape(x.shape)
 
 
 @dataclass
@@ -256,7 +264,7 @@ def run(
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0
             if event and event.happens(value, after):
-                h, new = _located(event, advance, state, new, h, value, after)
+                h, new = _located(event, advance, system, method, state, new, h, value, after)
                 if h > UNDERFLOW * (end - span[0]):
                     keep(t, t + h, h, state, new)
                     outcome.state = new
@@ -298,7 +306,7 @@ def _first_step(state, length: float) -> float:
     return min(length, 0.01 * size / speed) if speed > 0.0 and size > 0.0 else 1e-3 * length
 
 
-def _located(event: Event, advance: Callable, state, new, h: float, before: float, after: float):
+def _located(event: Event, advance: Callable, system, method, state, new, h: float, before: float, after: float):
     """The step that ends where the event happens, to rounding: its size and the state it leads to.
 
     Looked for among steps from the same state, so that the event is as accurate as the method and the laws hold there;
@@ -313,7 +321,9 @@ def _located(event: Event, advance: Callable, state, new, h: float, before: floa
             return after if theta else before
         end = advance(state, theta * h)
         found = event(np.asarray(end.x)) if int(end.status) == array.RUNNING else math.nan
-        return found if math.isfinite(found) else event(x + h * integrated(len(k), theta) @ k)
+        if math.isfinite(found):
+            return found
+        return event(np.asarray(method.along(system, x, h * integrated(len(k), theta) @ k)))
 
     theta = float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
     return theta * h, advance(state, theta * h)
@@ -350,7 +360,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     InputError
         Where nothing moves at x0, so that any step will do.
     """
-    method = MetriplecticMidpoint() if method is None else method
+    method = (MetriplecticMidpoint() if method is None else method).on(system)
     x = np.asarray(system.state(x0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:

@@ -13,11 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 
 from .dissipation import Dissipation, Law
 from .graph import Edges
+from .indices import Indices, as_pattern, cliques
 
 
 class HeatConduction(Dissipation):
@@ -33,19 +35,23 @@ class HeatConduction(Dissipation):
         Of bodies, with their conductances (power / temperature).
     """
 
-    first: tuple[int, ...] = eqx.field(static=True)
-    second: tuple[int, ...] = eqx.field(static=True)
+    first: Indices = eqx.field(static=True)
+    second: Indices = eqx.field(static=True)
     conductance: jax.Array
 
     def __init__(self, graph: Edges):
-        self.first, self.second = tuple(graph.first.tolist()), tuple(graph.second.tolist())
+        self.first, self.second = Indices(graph.first), Indices(graph.second)
         self.conductance = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        S, (i, j) = _places(system).S, (np.array(self.first), np.array(self.second))
+        S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
         T, along = _positive(dH[S]), dS[S]
         heat = self.conductance * (along[i] * T[j] - along[j] * T[i])
         return jnp.zeros_like(x).at[S[i]].add(heat / T[i]).at[S[j]].add(-heat / T[j])
+
+    def couplings(self, system):
+        S = _places(system).S
+        return cliques(np.stack([S[np.asarray(self.first)], S[np.asarray(self.second)]], axis=1), system.dim)
 
 
 class LinearFriction(Dissipation):
@@ -71,7 +77,10 @@ class LinearFriction(Dissipation):
         R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
         v, T = dH[p], _positive(dH[S])
         flux = _apply(R, (v * dS[S] - T * dS[p]) / T)
-        return jnp.zeros_like(x).at[p].set(-T * flux).at[S].add(v * flux)
+        return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
+
+    def couplings(self, system):
+        return _within(_places(system), system.dim)
 
 
 class Drag(Dissipation):
@@ -87,12 +96,12 @@ class Drag(Dissipation):
         Of bodies with the same number of degrees of freedom, with coefficients c (mass / time).
     """
 
-    first: tuple[int, ...] = eqx.field(static=True)
-    second: tuple[int, ...] = eqx.field(static=True)
+    first: Indices = eqx.field(static=True)
+    second: Indices = eqx.field(static=True)
     coefficient: jax.Array
 
     def __init__(self, graph: Edges):
-        self.first, self.second = tuple(graph.first.tolist()), tuple(graph.second.tolist())
+        self.first, self.second = Indices(graph.first), Indices(graph.second)
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
@@ -104,6 +113,12 @@ class Drag(Dissipation):
         flux = self.coefficient[edge] * along * (2.0 * T_i * T_j / (T_i + T_j))
         made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
         return made.at[p_i].add(-flux).at[p_j].add(flux)
+
+    def couplings(self, system):
+        places = _places(system)
+        i, j, _ = _pairs(self.first, self.second, places)
+        S_i, S_j = places.S[places.owner[i]], places.S[places.owner[j]]
+        return cliques(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
 
 
 class ContactFriction(Dissipation):
@@ -134,7 +149,10 @@ class ContactFriction(Dissipation):
         places = _places(system)
         mine = np.flatnonzero(np.isin(places.owner, self.bodies))
         p, S = places.p[mine], places.S[places.owner[mine]]
-        return jnp.zeros_like(x).at[p].set(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
+        return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
+
+    def couplings(self, system):
+        return _within(_places(system), system.dim)
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
@@ -158,10 +176,19 @@ def _of_body(places: mf.contact.Places, mine: np.ndarray) -> np.ndarray:
     return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
 
 
-def _pairs(first: tuple[int, ...], second: tuple[int, ...], places: mf.contact.Places):
+def _pairs(first: Indices, second: Indices, places: mf.contact.Places):
     """For each edge and component: the numbers of the two momenta, and of the edge."""
+    i, j = np.asarray(first), np.asarray(second)
     starts = np.searchsorted(places.owner, np.arange(len(places.S)))
-    sizes = np.bincount(places.owner, minlength=len(places.S))[list(first)]
-    edge = np.repeat(np.arange(len(first)), sizes)
+    sizes = np.bincount(places.owner, minlength=len(places.S))[i]
+    edge = np.repeat(np.arange(len(i)), sizes)
     within = np.arange(len(edge)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return starts[np.array(first)][edge] + within, starts[np.array(second)][edge] + within, edge
+    return starts[i][edge] + within, starts[j][edge] + within, edge
+
+
+def _within(places: mf.contact.Places, dim: int) -> scipy.sparse.csr_array:
+    """The pattern in which all components of a body depend on each other, and on none of another body."""
+    starts = np.concatenate([[0], places.S[:-1] + 1])
+    body = np.repeat(np.arange(len(starts)), places.S + 1 - starts)
+    member = as_pattern(scipy.sparse.coo_array((np.ones(dim, dtype=bool), (np.arange(dim), body)), (dim, len(starts))))
+    return as_pattern(member @ member.T)

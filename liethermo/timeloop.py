@@ -20,13 +20,14 @@ from .engine import array, compiled
 from .engine.interpret import at_points
 from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
+from .engine.sparse import SparseEngine
 from .errors import ConvergenceError, InputError, NonFiniteError
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
+from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, WithAttitude
 from .progress import Progress
 from .solution import Laws, Solution, Stats, Status
 from .stepwise import Adaptive, Dense, Event, Relaxed, stops_of
 from .stepwise import run as run_stepwise
-from .systems import System
+from .systems import AttitudeSystem, LiePoissonSystem, System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
 SMALL_DIM, SMALL_PROGRAM = 16, 4000
@@ -35,6 +36,12 @@ three seconds), so that "auto" always takes it."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
+
+SPARSE_DIM = 200
+"""Components from which a system that knows its sparsity is solved by it."""
+
+MOST_LISTED = 1_000
+"""Components up to which the first state is listed in the provenance; an attribute of a file cannot be of any size."""
 
 COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
@@ -58,10 +65,11 @@ def integrate(
     save_at=None,
     until: Relaxed | Callable | None = None,
     dense: bool = False,
-    engine: Literal["auto", "array", "compiled"] = "auto",
+    engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool | None = None,
     save_to: str | os.PathLike | None = None,
+    attitude=None,
 ) -> Solution:
     """Integrate a system from a state over a span of time.
 
@@ -85,11 +93,13 @@ def integrate(
         and the status tell whether it happened.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
-    engine : {"auto", "array", "compiled"}
+    engine : {"auto", "array", "compiled", "sparse"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 16
         components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
-        with a warning, where the system uses what cannot be compiled.
+        with a warning, where the system uses what cannot be compiled. "sparse" solves stiff steps of large systems with
+        sparse matrices; "auto" takes it from 200 components on, where the system knows which of its components act on
+        which (networks do).
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -97,6 +107,8 @@ def integrate(
         Show a progress bar; by default where the standard error is a terminal.
     save_to : path, optional
         Write the solution here, also on failure and at most once a minute on the way.
+    attitude : array, shape (m, m), optional
+        Where the system has a group: its element at the start, the identity by default.
 
     Returns
     -------
@@ -117,8 +129,20 @@ def integrate(
         raise InputError(
             f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
         )
-    check_choice("engine", engine, ("auto", "array", "compiled"))
+    check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
+    state = system.state(x0)
+    if reason := system.outside(state):
+        raise InputError(f"the run cannot start at this x0: {reason}")
+    if isinstance(system, LiePoissonSystem) and system.group is not None and isinstance(method, OneStepMethod):
+        assert system.reconstruction is not None
+        method = WithAttitude(method.on(system), system.reconstruction)
+        system = AttitudeSystem(system)
+        state = system.begin(state, attitude)
+    elif attitude is not None:
+        raise InputError("an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)")
+    if isinstance(method, OneStepMethod):
+        method = method.on(system)
     _prepared(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
@@ -127,10 +151,7 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    x = system.state(x0)
-    if reason := system.outside(x):
-        raise InputError(f"the run cannot start at this x0: {reason}")
-    run = _Run(system, method, x, table, save_to, engine)
+    run = _Run(system, method, state, table, save_to, engine)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
@@ -163,8 +184,30 @@ class _Run:
         self.dense: Dense | None = None
         wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
         small = system.unrollable and system.dim <= wanted and jax.default_backend() == "cpu"
-        self.engine = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
+        self.engine = ("compiled" if small else "array") if engine == "auto" else engine
+        self.sparse: SparseEngine | None = None
+        if engine == "sparse" or (engine == "auto" and system.dim >= SPARSE_DIM):
+            self.sparse = self._sparse(needed=engine == "sparse")
         self.fallback = engine == "auto"
+
+    def _sparse(self, needed: bool) -> SparseEngine | None:
+        """The sparse engine, where the system and the method can have it."""
+        if not isinstance(self.method, OneStepMethod):
+            return None
+        if self.system.sparsity() is None:
+            if needed:
+                raise InputError(
+                    f"the sparse engine cannot run a {type(self.system).__name__} that does not know its sparsity: a "
+                    "ComposedSystem of lt.Copies joined by lt.Each does"
+                )
+            return None
+        self.engine = "sparse"
+        return SparseEngine(self.system, self.method)
+
+    @property
+    def _driver(self) -> Any:
+        """The engine."""
+        return self.sparse or (compiled if self.engine == "compiled" else array)
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -173,6 +216,8 @@ class _Run:
         every = self.table.every or 1
         saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
+        if self.sparse is not None:
+            capacity = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
         state, interrupted = None, False
         self.values = [self._energies(self.states[0])]
         try:
@@ -217,13 +262,13 @@ class _Run:
             self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-        engine = compiled if self.engine == "compiled" else array
-        outcome = run_stepwise(self.system, self.method, engine, state, (start, end), step, stops, event, keep)
+        outcome = run_stepwise(self.system, self.method, self._driver, state, (start, end), step, stops, event, keep)
         if last is not None:
             self._append(*last)
         self.event_time = outcome.event_time
         if pieces:
-            self.dense = Dense(*(np.array(column) for column in zip(*pieces, strict=True)))
+            begins, lengths, x, k = (np.array(column) for column in zip(*pieces, strict=True))
+            self.dense = Dense(begins, lengths, x, k, None if self.system.space is None else self._along)
         state, now = outcome.state, self.times[-1]
         self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
         steps = int(state.step)
@@ -243,6 +288,9 @@ class _Run:
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 self.status = dataclasses.replace(self.status, message=text)
+
+    def _along(self, x, v) -> np.ndarray:
+        return np.asarray(jax.jit(jax.vmap(lambda x, v: self.method.along(self.system, x, v)))(x, v))
 
     def _append(self, t: float, state) -> None:
         self.times.append(t)
@@ -272,8 +320,7 @@ class _Run:
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
-        engine = compiled if self.engine == "compiled" else array
-        state, (x, energy, entropy, reached) = engine.advance(
+        state, (x, energy, entropy, reached) = self._driver.advance(
             self.system, self.method, state, h, saves, every, capacity
         )
         kept = int(np.asarray(reached).sum())
@@ -359,7 +406,7 @@ class _Run:
         invariants, laws = _prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
-        return Solution(
+        found = Solution(
             t=np.array(self.times),
             x=x,
             energy=energy,
@@ -375,6 +422,7 @@ class _Run:
             event_time=self.event_time,
             dense=self.dense,
         )
+        return system.presented(found)
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:
@@ -393,7 +441,7 @@ class _Run:
             "step": self.step if isinstance(self.step, float) else dataclasses.asdict(self.step),
             "t_span": [self.table.start, self.table.end],
             "save_every": self.table.every,
-            "x0": np.asarray(self.states[0][0]).tolist(),
+            "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,
             "system": type(self.system).__name__,
             "algebra": None if algebra is None else algebra.name,
             "dissipation": None if self.system.dissipation is None else type(self.system.dissipation).__name__,

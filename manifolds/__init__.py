@@ -1,4 +1,4 @@
-"""Geometry for thermodynamic integrators: Lie algebras, their groups, Casimirs and Poisson structures.
+"""Geometry for thermodynamic integrators: Lie algebras and groups, Casimirs, Poisson structures, state spaces.
 
 Importing this package switches JAX to 64-bit floating point: the laws are kept to rounding, and single precision would
 round them away.
@@ -32,6 +32,7 @@ from .contact import (  # noqa: E402
     LagrangianContact,
     SplitContact,
 )
+from .coordinates import Coordinates, Place, coordinates_around  # noqa: E402
 from .errors import (  # noqa: E402
     AntisymmetryError,
     ClosureError,
@@ -40,10 +41,13 @@ from .errors import (  # noqa: E402
     JacobiError,
     LieAlgebraError,
     ManifoldsError,
+    OffManifoldError,
     ParameterError,
     RepresentationError,
     ShapeError,
+    SpaceError,
 )
+from .geomstats_bridge import GeomstatsSpace, from_geomstats  # noqa: E402
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
 from .lie_group import (  # noqa: E402
     GL,
@@ -56,26 +60,68 @@ from .lie_group import (  # noqa: E402
     Sp,
     registered_groups,
 )
-from .poisson import Canonical, LiePoisson, PoissonStructure, PoissonTensor  # noqa: E402
+from .poisson import (  # noqa: E402
+    Canonical,
+    LiePoisson,
+    NoPoisson,
+    PoissonMap,
+    PoissonStructure,
+    PoissonTensor,
+)
 from .polynomial import Polynomial  # noqa: E402
+from .retraction import (  # noqa: E402
+    CayleyRetraction,
+    Chart,
+    EuclideanRetraction,
+    GroupRetraction,
+    MidpointRetraction,
+    Retraction,
+    RiemannianRetraction,
+    retraction,
+)
+from .spaces import (  # noqa: E402
+    SPD,
+    Euclidean,
+    GroupSpace,
+    Hyperbolic,
+    Power,
+    Product,
+    Space,
+    SpecialEuclidean,
+    SpecialOrthogonal,
+    SpecialUnitary,
+    Sphere,
+    Stiefel,
+    registered_spaces,
+)
 
 __all__ = [
     "GL",
     "SE",
     "SL",
     "SO",
+    "SPD",
     "SU",
     "AntisymmetryError",
     "Canonical",
     "CanonicalContact",
+    "CayleyRetraction",
+    "Chart",
     "ClosureError",
     "ComponentError",
     "ContactForm",
     "ContactStructure",
+    "Coordinates",
     "Cosymplectic",
     "DomainError",
+    "Euclidean",
+    "EuclideanRetraction",
     "ExtendedPhaseSpace",
+    "GeomstatsSpace",
+    "GroupRetraction",
+    "GroupSpace",
     "Heisenberg",
+    "Hyperbolic",
     "JacobiError",
     "LagrangianContact",
     "LieAlgebra",
@@ -83,24 +129,44 @@ __all__ = [
     "LiePoisson",
     "ManifoldsError",
     "MatrixGroup",
+    "MidpointRetraction",
+    "NoPoisson",
     "NoPolynomialCasimirWarning",
+    "OffManifoldError",
     "ParameterError",
+    "Place",
+    "PoissonMap",
     "PoissonStructure",
     "PoissonTensor",
     "Polynomial",
+    "Power",
+    "Product",
     "RepresentationError",
+    "Retraction",
+    "RiemannianRetraction",
     "ShapeError",
     "Sp",
+    "Space",
+    "SpaceError",
+    "SpecialEuclidean",
+    "SpecialOrthogonal",
+    "SpecialUnitary",
+    "Sphere",
     "SplitContact",
+    "Stiefel",
     "abelian",
     "aff",
     "bianchi",
+    "coordinates_around",
     "direct_sum",
+    "from_geomstats",
     "galilei",
     "gl",
     "heisenberg",
     "registered",
     "registered_groups",
+    "registered_spaces",
+    "retraction",
     "se",
     "semidirect_sum",
     "sl",

@@ -16,7 +16,7 @@ def is_traced(*values) -> bool:
 
 def real_components(x, dim: int, what: str) -> jax.Array:
     """``x`` as a real array of doubles with last axis ``dim``."""
-    array = jnp.asarray(_as_numeric(x, what))
+    array = jnp.asarray(as_numeric(x, what))
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise ComponentError(f"{what} must be real, not {array.dtype}: take its real part if that is meant")
     if array.ndim == 0 or array.shape[-1] != dim:
@@ -26,14 +26,25 @@ def real_components(x, dim: int, what: str) -> jax.Array:
 
 def square_matrices(x, size: int, what: str) -> jax.Array:
     """``x`` as an array of doubles (or complex doubles) with last axes ``(size, size)``."""
-    array = jnp.asarray(_as_numeric(x, what))
+    array = jnp.asarray(as_numeric(x, what))
     if array.shape[-2:] != (size, size):
         raise ShapeError(f"{what} must have last axes ({size}, {size}), but its shape is {array.shape}")
     complex_input = jnp.issubdtype(array.dtype, jnp.complexfloating)
     return array.astype(jnp.complex128 if complex_input else jnp.float64)
 
 
-def _as_numeric(x, what: str):
+def first(failed: np.ndarray) -> tuple[int, ...] | None:
+    """Index of the first true entry, or None."""
+    return tuple(int(i) for i in np.argwhere(failed)[0]) if failed.any() else None
+
+
+def at(index: tuple[int, ...]) -> str:
+    """An index as a message shows it after the name of an array: nothing where there is one entry alone."""
+    return f"[{', '.join(map(str, index))}]" if index else ""
+
+
+def as_numeric(x, what: str):
+    """``x`` as an array of numbers, of NumPy or JAX."""
     if isinstance(x, jax.Array):
         return x
     try:

@@ -1,19 +1,21 @@
-"""Formulas of particular groups: exp, log and Cayley of SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
+"""Formulas of particular groups: exp, log, Cayley of SO(2), SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
 
 The exponentials are combinations of the Stumpff functions of the squared angle, entire functions with no division at
-zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there.
+zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there. The
+logarithms are written with :func:`arc`, which does the same for them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .lie_algebra import LieAlgebra
-from .matrix_functions import determinant, inverse, largest
+from .matrix_functions import determinant, inverse, largest, orthonormalized
 
 HALF_TURN_MARGIN = 1e-8
 """A logarithm is taken of eigenvalues at angles up to pi minus this; beyond, its sign is decided by noise."""
@@ -24,13 +26,48 @@ def stumpff(order: int, z) -> jax.Array:
 
     With ``z = t**2``: cos t, sin t / t, (1 - cos t) / t**2, (t - sin t) / t**3.
     """
-    small = z < 1.0
-    t = jnp.sqrt(jnp.where(small, 1.0, z))  # both branches see arguments where they are smooth, so no NaN gradient
-    far = (jnp.cos, _sinc, lambda t: 0.5 * _sinc(t / 2) ** 2, lambda t: (t - jnp.sin(t)) / t**3)[order](t)
-    near = jnp.zeros_like(t)
-    for k in reversed(range(10)):  # the first term left out is below 1/20! at z = 1
-        near = 1.0 / math.factorial(2 * k + order) - jnp.where(small, z, 0.0) * near
-    return jnp.where(small, near, far)
+    far = (jnp.cos, _sinc, lambda t: 0.5 * _sinc(t / 2) ** 2, lambda t: (t - jnp.sin(t)) / t**3)[order]
+    return _piecewise(_stumpff_series(order, -1.0), far, z, 1.0)
+
+
+def hyperbolic_stumpff(order: int, z) -> jax.Array:
+    """``c_p(-z) = sum_k z^k / (2k + p)!`` for p = 0, 1, 2 and z >= 0, to rounding.
+
+    With ``z = t**2``: cosh t, sinh t / t, (cosh t - 1) / t**2.
+    """
+    far = (jnp.cosh, _sinhc, lambda t: 0.5 * _sinhc(t / 2) ** 2)[order]
+    return _piecewise(_stumpff_series(order, 1.0), far, z, 1.0)
+
+
+def arc(z, cosine) -> jax.Array:
+    """``atan2(s, c) / s`` with ``z = s**2``: the angle over the sine, for sine and cosine of any common scale.
+
+    Smooth where z = 0 and c > 0; not finite where z = 0 and c < 0, at the angle pi.
+    """
+    small = (cosine > 0) & (z < 0.01 * cosine**2)
+    s = jnp.sqrt(jnp.where(small, 1.0, z))
+    c = jnp.where(small, cosine, 1.0)
+    near = _series([(-1.0) ** k / (2 * k + 1) for k in range(9)], jnp.where(small, z, 0.0) / c**2) / c
+    return jnp.where(small, near, jnp.arctan2(s, cosine) / s)
+
+
+def hyperbolic_arc(z) -> jax.Array:
+    """``arcsinh(s) / s`` with ``z = s**2``, smooth at 0."""
+    terms = [(-0.25) ** k * math.comb(2 * k, k) / (2 * k + 1) for k in range(9)]
+    return _piecewise(terms, lambda s: jnp.arcsinh(s) / s, z, 0.01)
+
+
+def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``cos(t) I + sin(t)/t X``."""
+    z = _square(x)[..., None]
+    return stumpff(0, z) * jnp.eye(2) + stumpff(1, z) * algebra.hat(x)
+
+
+def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """The angle, by way of its sine and cosine."""
+    sine, cosine = algebra.vee((g - g.swapaxes(-1, -2)) / 2), jnp.trace(g, axis1=-2, axis2=-1)[..., None] / 2
+    defined = jnp.arctan2(jnp.abs(sine), cosine) <= math.pi - HALF_TURN_MARGIN
+    return jnp.where(defined, arc(sine**2, cosine) * sine, jnp.nan)
 
 
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -40,26 +77,20 @@ def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Rotation vector by way of the unit quaternion, accurate at every angle below pi - HALF_TURN_MARGIN.
-
-    ``4 q q^T`` is linear in the rotation; its row with the largest diagonal entry gives q without cancellation
-    [Shepperd 1978].
-    """
-    trace = jnp.trace(g, axis1=-2, axis2=-1)[..., None, None]
-    outer = g + g.swapaxes(-1, -2) + (1.0 - trace) * jnp.eye(3)
-    skew = (g - g.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
-    outer = jnp.concatenate([skew[..., None, :], outer], axis=-2)
-    outer = jnp.concatenate([jnp.concatenate([1.0 + trace, skew[..., None]], axis=-2), outer], axis=-1)
-    largest = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    q = jnp.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
-    q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
-    return _rotation_vector(q[..., :1], q[..., 1:], math.pi - HALF_TURN_MARGIN)
+    """Rotation vector by way of the quaternion, accurate at every angle below pi - HALF_TURN_MARGIN."""
+    return _rotation_vector(*_quaternion(g), math.pi - HALF_TURN_MARGIN)
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
-    X = algebra.hat(x)
-    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x)[..., None] / 4)
+    X = algebra.hat(x)[..., :3, :3]
+    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
+
+
+def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """``2 tan(a/2)`` times the axis, for the angle a: ``2 v / w`` of the quaternion (w, v)."""
+    w, v = _quaternion(g)
+    return jnp.where(_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
 
 
 def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -82,6 +113,18 @@ def se3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.concatenate([w, t - turned / 2 + d * jnp.cross(w, turned)], axis=-1)
 
 
+def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """That of the rotation, R, and the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
+    rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
+    return affine(rotation, 0.5 * (rotation @ u + u))
+
+
+def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """That of the rotation, and ``(I - W/2) t``."""
+    w, t = so3_inverse_cayley(algebra, g[..., :3, :3]), g[..., :3, 3]
+    return jnp.concatenate([w, t - jnp.cross(w, t) / 2], axis=-1)
+
+
 def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
     z = _square(x)[..., None] / 4
@@ -90,9 +133,15 @@ def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
-    a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
-    w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
-    return _rotation_vector(w[..., None], v, 2 * (math.pi - HALF_TURN_MARGIN))
+    return _rotation_vector(*_unit_quaternion(g), 2 * (math.pi - HALF_TURN_MARGIN))
+
+
+def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """``4 tan(a/4)`` times the axis, for the angle a: ``4 v / (1 + w)`` of the unit quaternion (w, v)."""
+    w, v = _unit_quaternion(g)
+    square = jnp.where(w > 0, 1.0, _square(v))
+    x = 4 * v * jnp.where(w > 0, 1 / jnp.where(w > 0, 1 + w, 1.0), (1 - w) / square)  # 1 + w may cancel
+    return jnp.where(_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -173,6 +222,25 @@ def heisenberg_inverse(g) -> jax.Array:
     return jnp.eye(g.shape[-1]) - N + N @ N
 
 
+# -- one Newton step to the group ---------------------------------------------------------------------------------
+
+
+def unchanged(g) -> jax.Array:
+    """g itself."""
+    return g
+
+
+def unitary_restored(g) -> jax.Array:
+    """Orthonormal rows, and determinant 1."""
+    g = orthonormalized(g)
+    return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
+
+
+def rigid_restored(g) -> jax.Array:
+    """An orthonormal linear part."""
+    return affine(orthonormalized(g[..., :-1, :-1]), g[..., :-1, -1:])
+
+
 def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
     """Homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
     top = jnp.concatenate([linear, translation], axis=-1)
@@ -187,14 +255,67 @@ def _sinc(t: jax.Array) -> jax.Array:
     return jnp.sin(t) / t
 
 
+def _sinhc(t: jax.Array) -> jax.Array:
+    return jnp.sinh(t) / t
+
+
+def _series(coefficients: list[float], z) -> jax.Array:
+    """``sum_k coefficients[k] z^k``."""
+    total = jnp.zeros_like(z)
+    for coefficient in reversed(coefficients):
+        total = coefficient + z * total
+    return total
+
+
+def _stumpff_series(order: int, sign: float) -> list[float]:
+    """Enough terms for |z| <= 1: the first one left out is below 1/20!."""
+    return [sign**k / math.factorial(2 * k + order) for k in range(10)]
+
+
+def _piecewise(coefficients: list[float], far: Callable, z, radius: float) -> jax.Array:
+    """A power series in z up to a radius, ``far(sqrt z)`` beyond.
+
+    Both sides see arguments where they are smooth, so no NaN gradient.
+    """
+    small = z < radius
+    near = _series(coefficients, jnp.where(small, z, 0.0))
+    return jnp.where(small, near, far(jnp.sqrt(jnp.where(small, 1.0, z))))
+
+
 def _square(x: jax.Array) -> jax.Array:
     """``|x|^2``, shape (..., 1)."""
     return jnp.sum(x**2, axis=-1, keepdims=True)
 
 
+def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Quaternion (w, v) of a rotation, w >= 0, of some norm between 1/2 and 4.
+
+    ``4 q q^T`` is linear in the rotation; its row with the largest diagonal entry gives q without cancellation
+    [Shepperd 1978].
+    """
+    trace = jnp.trace(g, axis1=-2, axis2=-1)[..., None, None]
+    outer = g + g.swapaxes(-1, -2) + (1.0 - trace) * jnp.eye(3)
+    skew = (g - g.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
+    outer = jnp.concatenate([skew[..., None, :], outer], axis=-2)
+    outer = jnp.concatenate([jnp.concatenate([1.0 + trace, skew[..., None]], axis=-2), outer], axis=-1)
+    best = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)[..., None]
+    q = jnp.where((jnp.arange(4) == best)[..., None], outer, 0.0).sum(axis=-2)  # no index that varies
+    q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
+    return q[..., :1], q[..., 1:]
+
+
+def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The unit quaternion (w, v) of ``g = w - i v . sigma`` in SU(2)."""
+    a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
+    w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
+    return w[..., None], v
+
+
+def _angle(w: jax.Array, v: jax.Array) -> jax.Array:
+    """Twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
+    return 2 * jnp.arctan2(jnp.sqrt(_square(v)), w)
+
+
 def _rotation_vector(w: jax.Array, v: jax.Array, limit: float) -> jax.Array:
     """Twice the angle of the quaternion (w, v), of any norm, times its axis; NaN above the limit."""
-    size = jnp.linalg.norm(v, axis=-1, keepdims=True)
-    angle = 2 * jnp.arctan2(size, w)
-    x = jnp.where(size > 0, angle / jnp.where(size > 0, size, 1.0), 2.0 / w) * v
-    return jnp.where(angle <= limit, x, jnp.nan)
+    return jnp.where(_angle(w, v) <= limit, 2 * arc(_square(v), w) * v, jnp.nan)

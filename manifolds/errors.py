@@ -23,6 +23,24 @@ class DomainError(ManifoldsError, ValueError):
     """A map evaluated outside its domain, such as the logarithm of a rotation by pi."""
 
 
+class OffManifoldError(DomainError):
+    """A point off its state space, or a vector that is not tangent to it.
+
+    Attributes
+    ----------
+    residual, tolerance : float
+        How far it is away, relative to its size, and how far it may be.
+    """
+
+    def __init__(self, message: str, *, residual: float, tolerance: float):
+        super().__init__(message)
+        self.residual, self.tolerance = residual, tolerance
+
+
+class SpaceError(ManifoldsError, TypeError):
+    """An operation that a state space does not have, or an object that cannot be one."""
+
+
 class LieAlgebraError(ManifoldsError, ValueError):
     """Data that do not define a Lie algebra, or an operation this algebra does not have.
 

@@ -22,12 +22,14 @@ import numpy as np
 from . import catalogue
 from . import closed_forms as closed
 from . import matrix_functions as general
-from ._arrays import is_traced, real_components, square_matrices
+from ._arrays import at, first, is_traced, real_components, square_matrices
 from .errors import ComponentError, DomainError, LieAlgebraError
 from .lie_algebra import LieAlgebra
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
+
+_LOG_NEEDS = f"principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}"
 
 _registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
 
@@ -63,9 +65,11 @@ class MatrixGroup:
     defect : callable
         ``g -> array``, shape (...): how far g is from the group relative to its size, of the order of the smallest
         relative change of g that brings it there.
-    inverse_map, exp_map, log_map, cayley_map : callable or None
+    inverse_map, exp_map, log_map, cayley_map, inverse_cayley_map : callable or None
         ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
-        or None where the Cayley map leaves the group.
+        or None where the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
+    restore_map : callable
+        ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it, where it has a formula.
     """
 
     name: str
@@ -75,6 +79,8 @@ class MatrixGroup:
     exp_map: Callable = general.exp
     log_map: Callable = general.log
     cayley_map: Callable | None = general.cayley
+    inverse_cayley_map: Callable = general.inverse_cayley
+    restore_map: Callable = closed.unchanged
 
     @property
     def dim(self) -> int:
@@ -106,7 +112,7 @@ class MatrixGroup:
         g = self._element(g, "g")
         inverse = _compiled(self.inverse_map, g)
         if (index := _first_failure(inverse, 2)) is not None:
-            raise DomainError(f"{self.name}: g{_at(index)} has no inverse: it is singular or not finite")
+            raise DomainError(f"{self.name}: g{at(index)} has no inverse: it is singular or not finite")
         return inverse
 
     def belongs(self, g, tolerance: float = 1e-10) -> jax.Array:
@@ -165,7 +171,7 @@ class MatrixGroup:
         g = self._element(g, "g")
         x = _log(self, g)
         if (index := _first_failure(x, 1)) is not None:
-            raise DomainError(f"log on {self.name}: g{_at(index)} {self._why_not_in_domain(np.asarray(g[index]))}")
+            raise DomainError(f"log on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}")
         return x
 
     def cayley(self, x) -> jax.Array:
@@ -186,16 +192,30 @@ class MatrixGroup:
         DomainError
             If X has an eigenvalue 2, or for GL(n) also -2. Under tracing the result is NaN instead.
         """
-        if self.cayley_map is None:
-            raise LieAlgebraError(
-                f"the Cayley map does not take {self.algebra.name} into {self.name}: det (I - X/2)^-1 (I + X/2) is "
-                "not 1 when X^3 has a trace; use exp"
-            )
+        self._need_cayley()
         x = self._components(x, "x")
         g = _cayley(self, x)
         if (index := _first_failure(g, 2)) is not None:
-            raise DomainError(f"cayley on {self.name}: x{_at(index)} {self._why_no_cayley(np.asarray(x[index]))}")
+            raise DomainError(f"cayley on {self.name}: x{at(index)} {self._why_no_cayley(np.asarray(x[index]))}")
         return g
+
+    def inverse_cayley(self, g) -> jax.Array:
+        """Inverse of the Cayley map, ``2 (g + I)^-1 (g - I)``, shape (..., dim).
+
+        Raises
+        ------
+        LieAlgebraError
+            For SL(n) and SU(n) with n > 2, as for :meth:`cayley`.
+        DomainError
+            If g is not in the group or has the eigenvalue -1. Under tracing the result is NaN instead.
+        """
+        self._need_cayley()
+        g = self._element(g, "g")
+        x = _inverse_cayley(self, g)
+        if (index := _first_failure(x, 1)) is not None:
+            why = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
+            raise DomainError(f"inverse_cayley on {self.name}: g{at(index)} {why}")
+        return x
 
     def Ad(self, g) -> jax.Array:
         """Adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
@@ -206,8 +226,13 @@ class MatrixGroup:
             If g is not in the group (not checked under tracing).
         """
         g = self._element(g, "g")
-        if not is_traced(g) and (index := _first(~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE)))) is not None:
-            raise DomainError(f"Ad on {self.name}: g{_at(index)} {self._why_not_in_domain(np.asarray(g[index]))}")
+        if not is_traced(g):
+            with jax.ensure_compile_time_eval():  # g may be a constant in a program being traced
+                outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
+                if (index := first(outside)) is not None:
+                    raise DomainError(
+                        f"Ad on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
+                    )
         return _adjoint_action(self, g)
 
     def Ad_star(self, g, mu) -> jax.Array:
@@ -241,7 +266,7 @@ class MatrixGroup:
             )
         return matrix.astype(self.algebra._known_basis().dtype)
 
-    def _why_not_in_domain(self, g: np.ndarray) -> str:
+    def _why_not_in_domain(self, g: np.ndarray, needs: str = _LOG_NEEDS, image: str = "logarithm") -> str:
         if not np.isfinite(g).all():
             return "has entries that are not finite"
         defect = float(self.defect(g))
@@ -254,9 +279,16 @@ class MatrixGroup:
         worst = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
             f"has the eigenvalue {worst:.6g} at the angle {abs(np.angle(worst)):.10f}, and det g = "
-            f"{np.linalg.det(g):.3g}; the principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}: "
-            "take the logarithm of g relative to a nearer element h, log(compose(inverse(h), g))"
+            f"{np.linalg.det(g):.3g}; the {needs}: take the {image} of g relative to a nearer element h, that is of "
+            "compose(inverse(h), g)"
         )
+
+    def _need_cayley(self) -> None:
+        if self.cayley_map is None:
+            raise LieAlgebraError(
+                f"the Cayley map does not take {self.algebra.name} into {self.name}: det (I - X/2)^-1 (I + X/2) is "
+                "not 1 when X^3 has a trace; use exp"
+            )
 
     def _why_no_cayley(self, x: np.ndarray) -> str:
         if not np.isfinite(x).all():
@@ -275,36 +307,47 @@ class MatrixGroup:
 @register((2,), (3,), (4,))
 def SO(n: int) -> MatrixGroup:
     """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
-    algebra, name = catalogue.so(n), f"SO({n})"
+    group = MatrixGroup(
+        f"SO({n})",
+        catalogue.so(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        restore_map=general.orthonormalized,
+    )
+    if n == 2:
+        return replace(group, exp_map=closed.so2_exp, log_map=closed.so2_log)
     if n == 3:
-        return MatrixGroup(
-            name,
-            algebra,
-            closed.unitary_defect,
-            closed.unitary_inverse,
-            closed.so3_exp,
-            closed.so3_log,
-            closed.so3_cayley,
-        )
-    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse)
+        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log)
+        return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
+    return group
 
 
 @register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
     """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
-    algebra, name = catalogue.se(n), f"SE({n})"
+    group = MatrixGroup(
+        f"SE({n})", catalogue.se(n), closed.rigid_defect, closed.rigid_inverse, restore_map=closed.rigid_restored
+    )
     if n == 3:
-        return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse, closed.se3_exp, closed.se3_log)
-    return MatrixGroup(name, algebra, closed.rigid_defect, closed.rigid_inverse)
+        group = replace(group, exp_map=closed.se3_exp, log_map=closed.se3_log)
+        return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
+    return group
 
 
 @register((2,), (3,))
 def SU(n: int) -> MatrixGroup:
     """Unitary complex matrices of determinant 1."""
-    algebra, name = catalogue.su(n), f"SU({n})"
+    group = MatrixGroup(
+        f"SU({n})",
+        catalogue.su(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        restore_map=closed.unitary_restored,
+    )
     if n == 2:
-        return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, closed.su2_exp, closed.su2_log)
-    return MatrixGroup(name, algebra, closed.unitary_defect, closed.unitary_inverse, cayley_map=None)
+        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
+        return replace(group, inverse_cayley_map=closed.su2_inverse_cayley)
+    return replace(group, cayley_map=None)
 
 
 @register((2,), (3,))
@@ -337,6 +380,7 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
         closed.heisenberg_exp,
         closed.heisenberg_log,
         closed.heisenberg_exp,
+        closed.heisenberg_log,
     )
 
 
@@ -362,6 +406,12 @@ def _cayley(group: MatrixGroup, x):
     return jnp.where((group.defect(g) <= MEMBERSHIP_TOLERANCE)[..., None, None], g, jnp.nan)
 
 
+@partial(jax.jit, static_argnums=0)
+def _inverse_cayley(group: MatrixGroup, g):
+    x = group.inverse_cayley_map(group.algebra, g)
+    return jnp.where((group.defect(g) <= MEMBERSHIP_TOLERANCE)[..., None], x, jnp.nan)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _principal_log(group: MatrixGroup, g):
     member = group.defect(g) <= MEMBERSHIP_TOLERANCE
@@ -384,12 +434,4 @@ def _first_failure(result, core: int) -> tuple[int, ...] | None:
     """Batch index of the first result that is not finite, its last ``core`` axes one element; None while tracing."""
     if is_traced(result):
         return None
-    return _first(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))
-
-
-def _first(failed: np.ndarray) -> tuple[int, ...] | None:
-    return tuple(int(i) for i in np.argwhere(failed)[0]) if failed.any() else None
-
-
-def _at(index: tuple[int, ...]) -> str:
-    return f"[{', '.join(map(str, index))}]" if index else ""
+    return first(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))

@@ -66,6 +66,14 @@ def cayley(algebra: LieAlgebra, x) -> jax.Array:
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None, None], g, jnp.nan)
 
 
+def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
+    """``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
+    identity = jnp.eye(g.shape[-1])
+    x = algebra.vee(2 * solve(g + identity, g - identity))
+    condition = largest(g + identity) * largest(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
+    return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None], x, jnp.nan)
+
+
 def log(algebra: LieAlgebra, g) -> jax.Array:
     """Principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
 
@@ -81,7 +89,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
     def halve(state):
         s, halvings, converged = state
-        root, success = _square_root(s)
+        root, _, success = _square_root(s)
         act = far(state)
         return jnp.where(act[..., None, None], root, s), halvings + act, converged & (success | ~act)
 
@@ -98,11 +106,50 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     return jnp.where(converged[..., None], x, jnp.nan)
 
 
-def _square_root(a):
-    """Principal square root, and whether it converged: Denman and Beavers' iteration [Higham 2008, eq. 6.15].
+def polar(a) -> jax.Array:
+    """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
+    _, inverse_root, success = _square_root(a.conj().swapaxes(-1, -2) @ a)
+    u = a @ inverse_root
+    for _ in range(2):  # the root squares the condition number of a
+        u = orthonormalized(u)
+    success &= largest(u.conj().swapaxes(-1, -2) @ u - jnp.eye(a.shape[-1])) < 1e-12
+    return jnp.where(success[..., None, None], u, jnp.nan)
 
-    The iterates (y, z) tend to (a^1/2, a^-1/2). An eigenvalue at the angle pi - d costs log2(1/d) steps more and
-    loses as many bits.
+
+def orthonormalized(u) -> jax.Array:
+    """One step of Newton and Schulz towards :func:`polar`: it squares the distance of ``u^H u`` from I."""
+    return 1.5 * u - 0.5 * u @ (u.conj().swapaxes(-1, -2) @ u)
+
+
+def complement(u) -> jax.Array:
+    """Columns that complete the orthonormal ones of u, shape (..., n, p), to a basis, shape (..., n, n - p).
+
+    By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
+    """
+    n, p = u.shape[-2:]
+    axes, normals = jnp.eye(n), []
+
+    def reflect(a, normal):
+        normal = normal[..., :, None]
+        weights = (normal * a).sum(axis=-2, keepdims=True) * (2 / (normal**2).sum(axis=-2, keepdims=True))
+        return a - normal * weights
+
+    for k in range(p):
+        column = jnp.where(jnp.arange(n) < k, 0.0, u[..., :, k])
+        size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
+        normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
+        u = reflect(u, normals[-1])
+    rest = axes[:, p:]
+    for normal in reversed(normals):
+        rest = reflect(rest, normal)
+    return rest
+
+
+def _square_root(a):
+    """Principal square root, its inverse, whether they converged: Denman and Beavers' iteration.
+
+    The iterates (y, z) tend to (a^1/2, a^-1/2) [Higham 2008, eq. 6.15]. An eigenvalue at the angle pi - d costs
+    log2(1/d) steps more and loses as many bits.
     """
 
     def unfinished(state):
@@ -116,7 +163,7 @@ def _square_root(a):
 
     roots = jnp.stack([a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)])
     roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
-    return roots[0], change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
+    return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
 _MOST_ROOT_STEPS = 33

@@ -133,3 +133,42 @@ class PoissonTensor(PoissonStructure):
 
     def tensor(self, x) -> jax.Array:
         return jnp.asarray(self.matrix(x)) if callable(self.matrix) else self.matrix
+
+
+class PoissonMap(PoissonStructure):
+    """A structure given by what it does: a function from x and a covector alpha, shapes (n,), to ``Pi(x) alpha``.
+
+    For large n, where the matrix would be mostly zeros. Nothing is checked, as in :class:`PoissonTensor`.
+    """
+
+    function: Callable
+    size: int = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        return self.size
+
+    def tensor(self, x) -> jax.Array:
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.size))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return jnp.asarray(self.function(x, alpha))
+
+
+class NoPoisson(PoissonStructure):
+    """``Pi = 0``: nothing moves by itself, and every function is a Casimir."""
+
+    size: int = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        return self.size
+
+    def tensor(self, x) -> jax.Array:
+        return jnp.zeros((self.size, self.size))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return jnp.zeros_like(alpha)
+
+    def jacobi_residual(self, x) -> jax.Array:
+        return jnp.zeros(())

@@ -188,6 +188,14 @@ REPRESENTATIVE = [mf.so(3), mf.se(3), mf.sl(2), mf.su(3)]
 """Compact, semidirect, noncompact and irrational: enough for what does not depend on the algebra."""
 
 
+def slow(case):
+    """A parameter of a test, or a set of them, for the slow tier."""
+    import pytest
+
+    values, name = (case.values, case.id) if hasattr(case, "values") else ((case,), None)
+    return pytest.param(*values, id=name, marks=pytest.mark.slow)
+
+
 def combinations(algebras) -> list:
     """All (algebra, dissipation) pairs that apply: those without a Casimir have no entropy to produce."""
     import pytest

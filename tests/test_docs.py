@@ -41,9 +41,13 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
         exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
 
 
+SLOW = ("plot_orders", "plot_spin_relaxation", "plot_spin_chain", "plot_covariance_relaxation", "plot_attitude")
+"""Examples that compute or compile for long."""
+
+
 def _examples():
     for path in EXAMPLES:
-        yield pytest.param(path, id=_name(path), marks=pytest.mark.slow if path.stem == "plot_orders" else ())
+        yield pytest.param(path, id=_name(path), marks=pytest.mark.slow if path.stem in SLOW else ())
 
 
 @pytest.mark.parametrize("example", list(_examples()))

@@ -8,6 +8,7 @@ NAMES = (
     "work_precision",
     "dimension",
     "bodies",
+    "network",
     "first_run",
     "memory",
 )

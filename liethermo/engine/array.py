@@ -46,6 +46,10 @@ PLATEAU = 1e3 * EPS
 
 Rounding in the vector field leaves a few eps; a conditioning of 100 is allowed for."""
 
+DENSE_LIMIT = 12_000
+"""Unknowns of a step up to which a full Jacobian matrix is formed (1.2 GB); larger ones have fixed-point iteration \
+alone, unless the system knows its sparsity."""
+
 
 class Solved(NamedTuple):
     """Outcome of the stage equations.
@@ -61,7 +65,9 @@ class Solved(NamedTuple):
     newton: jax.Array
 
 
-class _Iteration(NamedTuple):
+class Iteration(NamedTuple):
+    """An iteration on the stage equations under way."""
+
     k: jax.Array
     update: jax.Array
     best: jax.Array
@@ -70,19 +76,32 @@ class _Iteration(NamedTuple):
     made: jax.Array  # iterations so far
 
     @classmethod
-    def begin(cls, k) -> _Iteration:
+    def begin(cls, k) -> Iteration:
         infinite, zero, none = jnp.asarray(jnp.inf), jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
         return cls(k, infinite, infinite, none, zero, none)
 
-    def after(self, k) -> _Iteration:
+    def after(self, k) -> Iteration:
         update = jnp.max(jnp.abs(k - self.k))
         rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
         stalled = jnp.where(update < SHRINKING * self.best, 0, self.stalled + 1)
-        return _Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
+        return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
 
     def settled(self, scale) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk."""
         return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
+
+
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
+    """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
+
+    def goes_on(s: Iteration):
+        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
+        hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
+        return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
+
+    s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k)), Iteration.begin(guess))
+    finite = jnp.isfinite(s.update)
+    return Solved(s.k, s.settled(scale(s.k)) & finite, finite, s.update, s.made, jnp.zeros_like(s.made))
 
 
 def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable) -> Solved:
@@ -90,25 +109,21 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
 
     ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``.
     """
-
-    def fixed_point_goes_on(s: _Iteration):
-        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
-        hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
-        return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
-
-    first = jax.lax.while_loop(fixed_point_goes_on, lambda s: s.after(slopes(s.k)), _Iteration.begin(guess))
-    done = first.settled(scale(first.k)) & jnp.isfinite(first.update)
+    first = fixed_point(slopes, guess, scale)
+    done = first.converged
+    if guess.size > DENSE_LIMIT:
+        return first
 
     def better_start():
         """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
         nothing = jnp.zeros_like(guess)
-        misfit = [jnp.linalg.norm(slopes(k) - k) for k in (guess, nothing)]
+        misfit = jax.lax.map(lambda k: jnp.linalg.norm(slopes(k) - k), jnp.stack([guess, nothing]))
         return jnp.where(misfit[0] <= misfit[1], guess, nothing)
 
-    def newton_goes_on(s: _Iteration):
+    def newton_goes_on(s: Iteration):
         return ~done & ~s.settled(scale(s.k)) & (s.made < NEWTON_LIMIT) & jnp.isfinite(jnp.sum(s.k))
 
-    def newton(s: _Iteration):
+    def newton(s: Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
         inverse = _inverse(jacobian(s.k))
 
@@ -125,11 +140,11 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
         return jax.lax.while_loop(goes_on, reuse, (s, jnp.zeros_like(s.made)))[0]
 
     start = jax.lax.cond(done, lambda: guess, better_start)
-    second = jax.lax.while_loop(newton_goes_on, newton, _Iteration.begin(start))
+    second = jax.lax.while_loop(newton_goes_on, newton, Iteration.begin(start))
     k = jnp.where(done, first.k, second.k)
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
-    residual = jnp.where(done, first.update, second.update)
-    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
+    residual = jnp.where(done, first.residual, second.update)
+    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made)
 
 
 @jax.custom_batching.custom_vmap
@@ -199,17 +214,28 @@ def begin(system: System, method: OneStepMethod, x) -> State:
 
 def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     """One step; where it fails the state is left as it was, with a status."""
-    x, low = state.x, state.low
+
+    def jacobian(k):
+        return method.jacobian(system, state.x, state.low, h, k)
+
+    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h), jacobian))
+
+
+def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[Callable, jax.Array, Callable]:
+    """What a step has to solve, ``k = slopes(k)``: the slopes, a guess of k, and the size of what is rounded."""
+
+    def slopes(k):
+        return method.slopes(system, state.x, state.low, h, k)
 
     def scale(k):
-        return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
+        return jnp.max(jnp.abs(state.x)) / h + jnp.max(jnp.abs(k))
 
-    solved = solve_stages(
-        lambda k: method.slopes(system, x, low, h, k),
-        method.predict(state.k, state.before),
-        scale,
-        lambda k: method.jacobian(system, x, low, h, k),
-    )
+    return slopes, method.predict(state.k, state.before), scale
+
+
+def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
+    """The state after a step whose equations are solved, or as it was, with a status, where they are not."""
+    x, low = state.x, state.low
     new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
@@ -292,14 +318,8 @@ STEERED = 4 * EPS
 
 
 def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
-    """The end of a step: new state, what rounding keeps from it, energy, entropy, and a sum that is finite if they are.
-
-    x + low is the state; the increment is added with its rounding error caught (Neumaier's two-sum).
-    """
-    increment = method.increment(h, k) + low
-    new = x + increment
-    back = new - x
-    new_low = (x - (new - back)) + (increment - back)
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are."""
+    new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
     if system.energy_law == "conserved" and "energy" in method.preserves:
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
@@ -317,8 +337,9 @@ def _steering(system: System, x, low, energy, first_energy):
     size = jnp.dot(jnp.abs(gradient), jnp.abs(x))
     most = 0.25 * EPS * size
     amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
-    square = jnp.dot(gradient, gradient)
-    return -gradient * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
+    direction = system.raised(x, gradient)
+    square = jnp.dot(gradient, direction)
+    return -direction * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:

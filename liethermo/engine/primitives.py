@@ -497,6 +497,11 @@ def _pad(b, eqn, x, filling):
     return result
 
 
+def _unstack(x, params):
+    axis = params["axis"]
+    return [part.squeeze(axis) for part in np.split(x, x.shape[axis], axis)]  # arrays, of no dimension even
+
+
 def _split(x, params):
     return np.split(x, np.cumsum([int(n) for n in params["sizes"]])[:-1], axis=params["axis"])
 
@@ -615,7 +620,7 @@ RULES: dict[str, Rule] = {
     "split": _move(_split),
     "concatenate": lambda b, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
     "stack": lambda b, eqn, *xs: np.stack(xs, axis=eqn.params["axis"]),
-    "unstack": _move(lambda x, params: list(np.moveaxis(x, params["axis"], 0))),
+    "unstack": _move(_unstack),
     "tile": _move(lambda x, params: np.tile(x, params["reps"])),
     "pad": _pad,
     "iota": _iota,

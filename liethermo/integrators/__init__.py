@@ -1,10 +1,12 @@
 """Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
 
 from .base import OneStepMethod, registered_methods
+from .charts import InCharts
 from .discrete import DiscreteSystem, FiniteDifference
 from .gauss import MetriplecticGauss
 from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
+from .reconstruction import WithAttitude
 from .reference import Reference
 from .variational import VariationalIntegrator
 from .variational_gauss import VariationalGauss
@@ -20,6 +22,7 @@ __all__ = [
     "DiscreteHerglotz",
     "DiscreteSystem",
     "FiniteDifference",
+    "InCharts",
     "LieVariational",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
@@ -27,5 +30,6 @@ __all__ = [
     "Reference",
     "VariationalGauss",
     "VariationalIntegrator",
+    "WithAttitude",
     "registered_methods",
 ]

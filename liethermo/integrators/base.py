@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
+from ..gradients import compensated
 from ..systems import System
 from .tableaus import at_start
 
@@ -64,6 +65,26 @@ class OneStepMethod(eqx.Module):
     @abstractmethod
     def increment(self, h, k) -> jax.Array:
         """``x' - x``, shape (n,), from the solved slopes."""
+
+    def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
+        """The state at the end of the step as x' + low', the increment added with its rounding error caught."""
+        return compensated(x, low + self.increment(h, k))
+
+    def along(self, system: System, x, v) -> jax.Array:
+        """The state that a displacement v leads to from x: where the step is on its way, outside of the laws."""
+        return x + v
+
+    def on(self, system: System) -> OneStepMethod:
+        """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold."""
+        return self
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        """The gradients of the energy that the step uses at its stages, shape (stages, n)."""
+        raise InputError(f"{self} does not say which velocities it moves with, so attitudes cannot be reconstructed")
+
+    def pulled(self, local) -> OneStepMethod:
+        """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
+        return self
 
     def check(self, system: System) -> None:
         """Raise InputError where the method cannot be used on a system; called when a run starts."""

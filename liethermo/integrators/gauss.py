@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
+
 from ..dissipation import Dissipation, Several
-from ..energy import Energy, as_energy, check_scalar
+from ..energy import Energy, as_energy, check_scalar, on_points
 from ..engine.interpret import at_points
 from ..errors import InputError
 from ..gradients import stage_gradients
-from ..systems import System
+from ..systems import ChartSystem, System
 from .base import OneStepMethod, collocation_error, register
+from .charts import in_charts
 from .tableaus import MOST_STAGES, beyond, finer, gauss
 
 
@@ -33,6 +36,9 @@ class MetriplecticGauss(OneStepMethod):
     state; an iteration costs s gradients of H and S; of each that is not quadratic two values and a gradient at the end
     of the step besides, and s + 1 gradients between the nodes where s is 1 or 2.
 
+    On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
+    same laws. See :class:`InCharts`.
+
     Parameters
     ----------
     stages : int
@@ -40,17 +46,34 @@ class MetriplecticGauss(OneStepMethod):
         made exact too.
     preserve : sequence of functions or energies
         Further functions to hold exactly. The system has to conserve them (checked when a run starts).
+    retraction : str or manifolds.Retraction, optional
+        On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
     """
 
     number: int = eqx.field(static=True)
     functions: tuple[Energy, ...]
+    retraction: str | mf.Retraction | None = eqx.field(static=True)
 
-    def __init__(self, stages: int = 2, preserve: Sequence = ()):
+    def __init__(self, stages: int = 2, preserve: Sequence = (), retraction: str | mf.Retraction | None = None):
         if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
             raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
         self.number = stages
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
+        self.retraction = retraction
+
+    def on(self, system: System) -> OneStepMethod:
+        method = self._with(lambda C: on_points(C, system.space))
+        return in_charts(method, system, self.retraction, "exp")
+
+    def pulled(self, local: ChartSystem) -> OneStepMethod:
+        return self._with(local.pulled)
+
+    def _with(self, change: Callable) -> MetriplecticGauss:
+        """The method with its preserved functions changed."""
+        if not self.functions:
+            return self
+        return eqx.tree_at(lambda m: m.functions, self, tuple(map(change, self.functions)))
 
     @property
     def stages(self) -> int:
@@ -75,7 +98,7 @@ class MetriplecticGauss(OneStepMethod):
                     "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"
                 )
         held = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
-        points = np.random.default_rng(0).standard_normal((8, system.dim))
+        points = system.samples(8)
         ranks = np.linalg.matrix_rank(np.nan_to_num(at_points(_gradients, tuple(held), points)), tol=1e-9)
         if self.functions and ranks.max() >= system.dim:
             raise InputError(
@@ -97,6 +120,7 @@ class MetriplecticGauss(OneStepMethod):
 
     def _slope(self, system: System, u, dH, dS, dL, dC) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
+        system = system.here(u)
         entropy = None if system.entropy is None or system.entropy.is_quadratic else system.entropy
         if entropy is None and not dC:  # Pi dS = 0 as it stands
             return system.field(u, dH, dS, dL)
@@ -118,6 +142,10 @@ class MetriplecticGauss(OneStepMethod):
             return part.force(system, u, dH, dS, own)
         off = _projector([(dH, system.energy.gradient(u)), *held])
         return off(part.force(system, u, dH, off(dS), own))
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        A, b, _ = gauss(self.number)
+        return stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number))
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
+
+import manifolds as mf
 
 from ..gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
 from .base import OneStepMethod, collocation_error, register
+from .charts import in_charts
 
 
 class MetriplecticMidpoint(OneStepMethod):
@@ -21,15 +25,26 @@ class MetriplecticMidpoint(OneStepMethod):
     equation of the size of the state per step; a general energy costs two values and three gradients an iteration with
     ``"gonzalez"``, two and five with ``"mean_value"``, and about 3n gradients with ``"coordinate_increment"``.
 
+    On a manifold it is ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the
+    chart around z [BFM §4.4]: see :class:`InCharts`.
+
     Parameters
     ----------
     gradient : {"gonzalez", "mean_value", "coordinate_increment", "symmetric_coordinate_increment"} or DiscreteGradient
+    retraction : str or manifolds.Retraction, optional
+        On a manifold: ``"midpoint"`` by default, the paper's ``exp~_h`` (4.8); or as :func:`manifolds.retraction` names
+        them. Of those with z at the start of the step the chart's own midpoint is taken, so that the order is 2 still.
     """
 
     gradient: DiscreteGradient
+    retraction: str | mf.Retraction | None = eqx.field(static=True)
 
-    def __init__(self, gradient: str | DiscreteGradient = "gonzalez"):
+    def __init__(self, gradient: str | DiscreteGradient = "gonzalez", retraction: str | mf.Retraction | None = None):
         self.gradient = discrete_gradient(gradient)
+        self.retraction = retraction
+
+    def on(self, system: System) -> OneStepMethod:
+        return in_charts(self, system, self.retraction, "midpoint")
 
     @property
     def stages(self) -> int:
@@ -50,6 +65,9 @@ class MetriplecticMidpoint(OneStepMethod):
         dS = None if system.entropy is None else system.entropy.gradient(z)
         dL = tuple(self.gradient(L, x, d, low) for L in system.preserved)
         return system.field(z, dH, dS, dL)[None]
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        return self.gradient(system.energy, x, h * k[0], low)[None]
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)

@@ -82,8 +82,8 @@ class LieVariational(OneStepMethod):
         xi_dot = k[0, :-1] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
         return jnp.stack([jnp.append(xi_dot, y[-1]), jnp.append(y[:-1], 0.0)])
 
-    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
-        return -jnp.eye(k.size)  # the slopes are Newton's method already
+    def change(self, system: System, x, low, h, k, d) -> jax.Array:
+        return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]

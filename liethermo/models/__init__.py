@@ -8,6 +8,7 @@ from __future__ import annotations
 from .body_with_wheels import body_with_wheels
 from .cylinder import cylinder
 from .gas_piston import gas_piston
+from .heat_grid import heat_grid
 from .mass_spring_gas import mass_spring_gas
 from .oscillator import damped_oscillator
 from .rigid_body import free_rigid_body, rigid_body
@@ -20,6 +21,7 @@ __all__ = [
     "damped_oscillator",
     "free_rigid_body",
     "gas_piston",
+    "heat_grid",
     "mass_spring_gas",
     "moving_thermo_particles",
     "rigid_body",

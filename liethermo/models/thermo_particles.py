@@ -12,25 +12,30 @@ import numpy as np
 from ..energy import Function, Quadratic
 from ..graph import edges
 from ..mechanics import Kinetic
-from ..systems import ComposedSystem, Subsystem
+from ..systems import ComposedSystem, Copies, Subsystem
 from .parameters import positive, whole
 
 
-class Warmth(eqx.Module):
+def warmth(x, capacity):
     """Internal energy ``c exp(S / c)`` of the last component S of a state: c is the heat capacity."""
+    return capacity * jnp.exp(x[-1] / capacity)
+
+
+class Warmth(eqx.Module):
+    """The same, of one body."""
 
     capacity: jax.Array
 
     def __call__(self, x):
-        return self.capacity * jnp.exp(x[-1] / self.capacity)
+        return warmth(x, self.capacity)
 
 
 def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) -> ComposedSystem:
     """Bodies at rest that exchange heat: ``H = sum c_a exp(S_a / c_a)`` in the state (S_1, S_2, …) [SML Example 2].
 
     ``S_a' = sum_b k_ab (T_b - T_a) / T_a`` with ``T_a = exp(S_a / c_a)``, so ``c_a T_a' = sum_b k_ab (T_b - T_a)``: all
-    tend to the mean temperature ``sum c_a T_a / sum c_a``. Figs. 3 and 4 start at the temperatures (273.15, 300), with
-    c = 1, k = 1, h = 0.1.
+    tend to the mean temperature ``sum c_a T_a / sum c_a``. There can be 1e5 of them, on a sparse graph. Figs. 3 and 4
+    start at the temperatures (273.15, 300), with c = 1, k = 1, h = 0.1.
 
     Parameters
     ----------
@@ -40,7 +45,7 @@ def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) 
         k_ab (power / temperature).
     """
     c = positive(capacities, "capacities", len(capacities))
-    return ComposedSystem([Subsystem(Warmth(c_a), 1) for c_a in c], conductance=conductance)
+    return ComposedSystem(Copies(len(c), warmth, 1, c), conductance=conductance)
 
 
 def thermo_particles_solution(t, temperatures, capacities=(1.0, 1.0), conductance=1.0) -> np.ndarray:

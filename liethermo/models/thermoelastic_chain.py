@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..each import Each
 from ..energy import Energy, Function, Quadratic
 from ..errors import InputError
 from ..mechanics import Kinetic
-from ..systems import ComposedSystem, Subsystem
+from ..systems import ComposedSystem, Copies
 from .parameters import positive, whole
 
 
@@ -41,17 +42,15 @@ class Thermospring(eqx.Module):
         return elastic + self.capacity * (T - self.temperature)
 
 
-class _Span(eqx.Module):
-    """The squared length of a spring and its entropy, from a state; the first spring hangs at the origin."""
+def _hanging(y):
+    """The squared length of the first spring and its entropy, from (q_1, S_1)."""
+    return jnp.stack([jnp.sum(y[:-1] ** 2), y[-1]])
 
-    body: int = eqx.field(static=True)
-    dimension: int = eqx.field(static=True)
 
-    def __call__(self, x):
-        size = 2 * self.dimension + 1
-        mine = x[self.body * size : (self.body + 1) * size]
-        before = x[(self.body - 1) * size :][: self.dimension] if self.body > 0 else jnp.zeros(self.dimension)
-        return jnp.stack([jnp.sum((mine[: self.dimension] - before) ** 2), mine[-1]])
+def _between(y):
+    """Those of a spring between two bodies, from (q, q', S')."""
+    n = len(y) // 2
+    return jnp.stack([jnp.sum((y[n : 2 * n] - y[:n]) ** 2), y[-1]])
 
 
 def thermoelastic_chain(
@@ -101,22 +100,29 @@ def thermoelastic_chain(
     heavy = not (isinstance(gravity, float | int) and gravity == 0.0)
     if heavy:
         body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * gravity))
+    size = 2 * n + 1
+    q = size * np.arange(N)[:, None] + np.arange(n)
+    S = size * np.arange(1, N + 1)[:, None] - 1
+    springs: list[Energy] = [Function(spring).on(_hanging).on([*q[0], *S[0]])]
+    if N > 1:
+        springs.append(Each(Function(spring).on(_between), np.hstack([q[:-1], q[1:], S[1:]])))
     return ComposedSystem(
-        {f"spring {a + 1}": Subsystem(body, 2 * n + 1) for a in range(N)},
-        coupling=[Function(spring).on(_Span(a, n)) for a in range(N)],
+        Copies(N, body, size, name="spring"),
+        coupling=springs,
         conductance=[(a, a + 1, conductance) for a in range(N - 1)],
         connected=False,  # a conductance of zero is meant
         momentum_maps={} if heavy else _angular_momentum(N, n),
     )
 
 
-def _angular_momentum(N: int, n: int) -> dict[str, Quadratic]:
+def _angular_momentum(N: int, n: int) -> dict[str, Energy]:
     """``sum q x p``: one function for each pair of axes."""
-    size, maps = 2 * n + 1, {}
+    size = 2 * n + 1
+    maps: dict[str, Energy] = {}
     for i, j in zip(*np.triu_indices(n, 1), strict=True):
-        A = np.zeros((N * size, N * size))
-        for start in range(0, N * size, size):
-            for a, b, sign in (i, j, 1.0), (j, i, -1.0):
-                A[start + a, start + n + b] = A[start + n + b, start + a] = sign
-        maps[f"angular momentum {'xyz'[i]}{'xyz'[j]}"] = Quadratic(A)
+        A = np.zeros((4, 4))
+        for a, b, sign in (0, 3, 1.0), (1, 2, -1.0):  # of (q_i, q_j, p_i, p_j)
+            A[a, b] = A[b, a] = sign
+        places = size * np.arange(N)[:, None] + np.array([i, j, n + i, n + j])
+        maps[f"angular momentum {'xyz'[i]}{'xyz'[j]}"] = Each(Quadratic(A), places)
     return maps

@@ -1,7 +1,10 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
+from .attitude import AttitudeSystem
 from .base import System
-from .composed import ComposedSystem, Subsystem
+from .bodies import Copies, Subsystem
+from .chart import ChartSystem
+from .composed import ComposedSystem
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
@@ -11,8 +14,11 @@ from .metriplectic import MetriplecticSystem
 from .simple_closed import SimpleClosedSystem
 
 __all__ = [
+    "AttitudeSystem",
+    "ChartSystem",
     "ComposedSystem",
     "ContactSystem",
+    "Copies",
     "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar, recognised
+from ..energy import Energy, as_energy, check_scalar, on_points, recognised
 from ..engine.interpret import at_points
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 
 
 class System(eqx.Module):
-    """A metriplectic system on R^n [BFM §2.3]; see the subclasses for how to build one.
+    """A metriplectic system on R^n or on a manifold [BFM §2.3]; see the subclasses for how to build one.
+
+    On a manifold states, covectors and velocities are the arrays of the space, flat and real
+    (``space.to_vector``): covectors act on tangent vectors alone, and velocities are tangent.
 
     A system is a pytree: its parameters (those of ``lt.Quadratic``, the rates, the arrays of ``equinox`` modules
     used as functions) are leaves, which can be swept, batched and differentiated.
@@ -36,6 +40,8 @@ class System(eqx.Module):
         Further functions that are claimed to be conserved, by name.
     dim : int
         Number of state components.
+    space : manifolds.Space or None
+        The state space, where it is not R^n.
     """
 
     poisson: mf.PoissonStructure
@@ -44,24 +50,28 @@ class System(eqx.Module):
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
     dim: int = eqx.field(static=True)
+    space: mf.Space | None = eqx.field(static=True)
 
     production_name: ClassVar[str] = "dS/dt"
     domain: ClassVar[str] = ""
     """What a state of the system has to have beyond finite components, in words."""
 
-    def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate) -> None:
+    def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
-        self.poisson, self.dim = poisson, dim
-        self.energy = as_energy(energy, "the energy")
-        self.entropy = None if entropy is None else as_energy(entropy, "the entropy")
+        self.poisson, self.dim, self.space = poisson, dim, space
+        self.energy = on_points(as_energy(energy, "the energy"), space)
+        self.entropy = None if entropy is None else on_points(as_energy(entropy, "the entropy"), space)
         if not isinstance(momentum_maps, Mapping):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
-        self.momentum_maps = {name: as_energy(J, f"momentum map {name!r}") for name, J in momentum_maps.items()}
+        self.momentum_maps = {
+            name: on_points(as_energy(J, f"momentum map {name!r}"), space) for name, J in momentum_maps.items()
+        }
         check_scalar(self.energy, dim, "the energy")
-        self.energy = recognised(self.energy, dim)
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
-            self.entropy = recognised(self.entropy, dim)
+        if space is None:  # in a chart no function is quadratic
+            self.energy = recognised(self.energy, dim)
+            self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
         for name, J in self.momentum_maps.items():
             check_scalar(J, dim, f"momentum map {name!r}")
         if dissipation is not None and not isinstance(dissipation, Dissipation):
@@ -81,7 +91,26 @@ class System(eqx.Module):
     @property
     def unrollable(self) -> bool:
         """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
-        return True
+        return self.space is None or (self.space.smooth and self.space.dtype.kind != "c")
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the vector field can be differentiated twice and more."""
+        return self.space is None or self.space.smooth
+
+    def sparsity(self) -> scipy.sparse.csr_array | None:
+        """Which components of the field depend on which of the state, discrete gradients included; None if not known.
+
+        A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
+        """
+        return None
+
+    def weights(self, x) -> jax.Array:
+        """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
+
+        Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
+        """
+        return jnp.ones_like(x)
 
     # -- dynamics -------------------------------------------------------------------------------------------------
 
@@ -112,6 +141,51 @@ class System(eqx.Module):
             return jnp.zeros((self.dim, self.dim))
         force, dH, dL = self.dissipation.force, self.energy.gradient(x), self._preserved_gradients(x)
         return jax.jacfwd(lambda dS: force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
+
+    # -- the manifold ---------------------------------------------------------------------------------------------
+
+    def points(self, x) -> jax.Array:
+        """State vectors, shape (..., n), as points of the space, shape (..., *space.shape)."""
+        return jnp.asarray(x) if self.space is None else self.space.from_vector(x)
+
+    def raised(self, x, alpha) -> jax.Array:
+        """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
+        if self.space is None:
+            return alpha
+        return self.space.to_vector(self.space._sharp(self.points(x), self.points(alpha).conj()))
+
+    def lowered(self, x, v) -> jax.Array:
+        """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
+        if self.space is None:
+            return v
+        return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
+
+    def tangent(self, x, w) -> jax.Array:
+        """The tangent vector nearest to an array, shape (n,); itself on R^n."""
+        if self.space is None:
+            return w
+        return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
+
+    def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
+        """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
+        if self.space is None:
+            return scale * np.random.default_rng(seed).standard_normal((count, self.dim))
+        return np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+
+    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+        """This system near a state in as many coordinates as it has dimensions, and those of the state.
+
+        With ``centred``, for use at that state alone.
+        """
+        return self, x
+
+    def presented(self, solution: Any) -> Any:
+        """A solution of this system, as its user is to see it."""
+        return solution
+
+    def here(self, x) -> System:
+        """The same system, for use at one state: what its Pi and K have in common there is computed once."""
+        return self
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
@@ -145,7 +219,7 @@ class System(eqx.Module):
         """Whether each function is constant along the vector field, at random points inside its domain."""
         if not functions:
             return []
-        points = np.random.default_rng(0).standard_normal((8, self.dim))
+        points = self.samples(8)
         rates, sizes = at_points(_rates_of_change, (self, functions), points)
         inside = np.isfinite(rates)
         return [
@@ -167,9 +241,11 @@ class System(eqx.Module):
     def state(self, x, batch: bool = False) -> jax.Array:
         """``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
+        On a manifold it may have the shape of points too, and has to be one.
+
         Raises
         ------
-        InputError
+        InputError, manifolds.OffManifoldError
         """
         if not isinstance(x, jax.Array):
             try:
@@ -178,6 +254,8 @@ class System(eqx.Module):
                 raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
             if x.dtype.kind not in "fiubc":
                 raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
+        if self.space is not None and x.shape[-len(self.space.shape) :] == self.space.shape:
+            x = self.space.to_vector(x)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
@@ -189,6 +267,8 @@ class System(eqx.Module):
         if not np.isfinite(numbers).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
             raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
+        if self.space is not None:
+            self.space.point(self.points(numbers))
         return real_array(x)
 
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0) -> CheckReport:
@@ -233,7 +313,9 @@ class System(eqx.Module):
 
     def _vector_field(self, x) -> jax.Array:
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
-        return self.field(x, self.energy.gradient(x), dS, self._preserved_gradients(x))
+        gradients = self.energy.gradient(x), dS, *self._preserved_gradients(x)
+        dH, dS, *dL = (alpha if self.space is None else self.lowered(x, self.raised(x, alpha)) for alpha in gradients)
+        return self.field(x, dH, dS, tuple(dL))
 
     def _preserved_gradients(self, x) -> tuple[jax.Array, ...]:
         return tuple(L.gradient(x) for L in self.preserved)

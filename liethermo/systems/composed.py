@@ -10,52 +10,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, semidefinite
-from ..energy import Energy, Function, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..dissipation import Dissipation
+from ..energy import Energy, Function, Quadratic, check_scalar, is_traced
 from ..errors import InputError
 from ..graph import Edges, edges, parts
+from ..indices import as_pattern, pattern, union
 from ..mechanics import is_free_of, is_mechanical
 from ..thermal import ContactFriction, Drag, HeatConduction, LinearFriction
 from .base import System
-
-
-class Subsystem(eqx.Module):
-    """One body of a composed system: its energy in its own state (q, p, S), and its friction.
-
-    Parameters
-    ----------
-    energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy; or None
-        With ``lt.Kinetic`` and ``lt.Potential`` as terms where that is its form; None where it is all in the coupling.
-    dim : int
-        2n + 1 components; 1 for a body at rest, whose state is S alone.
-    friction : optional
-        A coefficient R of linear friction, ``p' = -R v`` and ``S' = v . R v / T`` (mass / time): a number, an array of
-        shape (n,) for a diagonal matrix or (n, n), positive semidefinite, or a function from the state of the body to
-        one. Or "contact": the friction ``p' = -p T`` of an evolution field [SML 7]. None by default.
-    name : str, optional
-        For messages.
-    """
-
-    energy: Energy
-    friction: jax.Array | Callable | str | None
-    dim: int = eqx.field(static=True)
-    name: str | None = eqx.field(static=True)
-
-    def __init__(self, energy, dim: int, friction=None, name: str | None = None):
-        if isinstance(dim, bool) or not isinstance(dim, int) or dim < 1 or dim % 2 == 0:
-            raise InputError(f"dim counts the components of a state (q, p, S): 2n + 1, and 1 for S alone, not {dim!r}")
-        self.dim, self.name = dim, name
-        energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
-        check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}")
-        self.energy = recognised(energy, dim)
-        self.friction = _checked_friction(friction, dim, name or "a subsystem")
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        return self.dim // 2
+from .bodies import Copies, Subsystem, named
 
 
 class ComposedSystem(System):
@@ -71,9 +38,12 @@ class ComposedSystem(System):
     one; likewise linear friction. A step on which a temperature is not positive is refused: the run stops with a status
     that says so. (Contact friction is the exception: see :class:`EvolutionSystem` for what it asks of H_a.)
 
+    Networks of 1e5 bodies are made of :class:`Copies`, with :class:`liethermo.Each` as the potential of what joins
+    them. A step then costs as much as there are bodies and edges; a stiff one is solved by sparse Newton iteration.
+
     Parameters
     ----------
-    subsystems : sequence of Subsystem, or dict of them by name
+    subsystems : sequence of Subsystem or Copies, or dict of them by name
     coupling : function of q, or of (q, S), or an Energy of the whole state; or a sequence of such
         V, with q the positions of all subsystems in one array and S their entropies, shape (N,). An Energy may have
         coordinates of its own (``lt.Function(e).on(...)``), such as the squared distance of two bodies.
@@ -97,19 +67,20 @@ class ComposedSystem(System):
     ----------
     poisson : manifolds.ExtendedPhaseSpace
         ``poisson.places`` has the indices of all q, p and S in a state.
-    subsystems : tuple of Subsystem
+    subsystems : tuple of Subsystem or Copies
     names : tuple of str
+        Of the bodies.
     """
 
     poisson: mf.ExtendedPhaseSpace
-    subsystems: tuple[Subsystem, ...]
-    names: tuple[str, ...] = eqx.field(static=True)
+    subsystems: tuple[Subsystem | Copies, ...]
+    labels: tuple[str, ...] = eqx.field(static=True)
 
     domain: ClassVar[str] = "positive temperatures"
 
     def __init__(
         self,
-        subsystems: Sequence[Subsystem] | Mapping[str, Subsystem],
+        subsystems: Sequence[Subsystem | Copies] | Mapping[str, Subsystem | Copies] | Copies,
         coupling=None,
         conductance=None,
         drag=None,
@@ -117,8 +88,10 @@ class ComposedSystem(System):
         momentum_maps=(),
         validate: bool = True,
     ):
-        self.names, self.subsystems = _named(subsystems)
-        structure = mf.ExtendedPhaseSpace(tuple(body.degrees_of_freedom for body in self.subsystems))
+        self.labels, self.subsystems = named(subsystems)
+        structure = mf.ExtendedPhaseSpace(
+            tuple(n for body in self.subsystems for n in (body.degrees_of_freedom,) * body.count)
+        )
         energy = self._energy(structure, coupling)
         check_scalar(energy, structure.dim, "the energy")
         entropy = Quadratic(jnp.zeros(structure.dim), jnp.zeros(structure.dim).at[structure.places.S].set(1.0))
@@ -127,10 +100,24 @@ class ComposedSystem(System):
 
     # -- in parts -------------------------------------------------------------------------------------------------
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(
+            name
+            for label, body in zip(self.labels, self.subsystems, strict=True)
+            for name in ([label] if isinstance(body, Subsystem) else [f"{label} {i}" for i in range(body.count)])
+        )
+
     def split(self, x) -> tuple[jax.Array, ...]:
-        """The states of the subsystems, shapes (..., dim_a), in a state or a batch of states."""
-        ends = np.cumsum([body.dim for body in self.subsystems])[:-1]
-        return tuple(jnp.split(self.state(x, batch=True), ends, axis=-1))
+        """The states of the subsystems, shapes (..., dim_a), in a state or a batch of states.
+
+        Of :class:`Copies` in one array, shape (..., count, dim_a).
+        """
+        found = jnp.split(self.state(x, batch=True), self._starts[1:-1], axis=-1)
+        return tuple(
+            part if isinstance(body, Subsystem) else part.reshape(*part.shape[:-1], body.count, body.dim)
+            for part, body in zip(found, self.subsystems, strict=True)
+        )
 
     def entropies(self, x) -> jax.Array:
         """The S_a, shape (..., N)."""
@@ -153,12 +140,28 @@ class ComposedSystem(System):
         return factors
 
     def outside(self, x) -> str:
-        cold = [
-            f"the temperature of {name} is {T:.4g}"
-            for name, T in zip(self.names, self.temperatures(x).tolist(), strict=True)
-            if not T > 0.0
-        ]
-        return f"{' and '.join(cold)}: it has to be positive" if cold else ""
+        T = np.asarray(self.temperatures(x))
+        cold = np.flatnonzero(~(T > 0.0))
+        if not cold.size:
+            return ""
+        names = self.names
+        found = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MOST_NAMED]]
+        if cold.size > MOST_NAMED:
+            found.append(f"of {cold.size - MOST_NAMED} more likewise")
+        return f"{' and '.join(found)}: it has to be positive"
+
+    def sparsity(self) -> scipy.sparse.csr_array | None:
+        parts = [_motion(self.poisson), *([] if self.dissipation is None else [self.dissipation.couplings(self)])]
+        through, hessian = union(parts), self.energy.couplings(self.dim)
+        if through is None or hessian is None:
+            return None
+        itself = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
+        return as_pattern((through + itself) @ (hessian + itself))
+
+    def weights(self, x) -> jax.Array:
+        """The temperatures at the entropies: ``T S'`` is a flow of energy, linear in temperatures where S' is not."""
+        S = self._places.S
+        return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
 
     # -- how it is put together -----------------------------------------------------------------------------------
 
@@ -166,11 +169,13 @@ class ComposedSystem(System):
     def _places(self) -> mf.contact.Places:
         return self.poisson.places
 
+    @property
+    def _starts(self) -> np.ndarray:
+        """Where each of the subsystems begins in a state, and the end."""
+        return np.cumsum([0, *(body.count * body.dim for body in self.subsystems)])
+
     def _energy(self, structure: mf.ExtendedPhaseSpace, coupling) -> Energy:
-        ends = np.cumsum([body.dim for body in self.subsystems])
-        terms = [
-            body.energy.on(np.arange(end - body.dim, end)) for body, end in zip(self.subsystems, ends, strict=True)
-        ]
+        terms = [body.energy_from(int(at)) for body, at in zip(self.subsystems, self._starts[:-1], strict=True)]
         if coupling is not None:
             terms += [
                 _potential(V, structure) for V in (coupling if isinstance(coupling, list | tuple) else [coupling])
@@ -178,17 +183,25 @@ class ComposedSystem(System):
         return sum(terms[1:], terms[0])
 
     def _dissipation(self, structure, energy, conductance, drag, connected) -> Dissipation | None:
-        dofs, frictions = structure.degrees_of_freedom, [body.friction for body in self.subsystems]
         found: list[Dissipation] = []
-        if bodies := tuple(a for a, R in enumerate(frictions) if isinstance(R, str)):
+        dofs = structure.degrees_of_freedom
+        first = np.cumsum([0, *(body.count for body in self.subsystems)])
+        bodies = tuple(
+            a
+            for body, i in zip(self.subsystems, first[:-1].tolist(), strict=True)
+            for a in range(i, i + body.count)
+            if isinstance(body.friction, str)
+        )
+        if bodies:
             found.append(ContactFriction(bodies, self._pays(energy, structure, bodies)))
-        diagonals = [R if isinstance(R, jax.Array) and R.ndim == 1 else None for R in frictions]
-        if any(R is not None for R in diagonals):  # all in one
-            rates = [jnp.zeros(n) if R is None else R for R, n in zip(diagonals, dofs, strict=True)]
-            found.append(LinearFriction(jnp.concatenate(rates)))
-        for a, R in enumerate(frictions):
-            if not (R is None or isinstance(R, str) or R is diagonals[a]):
-                found.append(LinearFriction(R, body=a))
+        rates = [_rates(body) for body in self.subsystems]
+        if any(R is not None for R in rates):  # all that are diagonal in one
+            none = [jnp.zeros(body.count * body.degrees_of_freedom) for body in self.subsystems]
+            all_rates = [z if R is None else R for R, z in zip(rates, none, strict=True)]
+            found.append(LinearFriction(jnp.concatenate(all_rates)))
+        for body, R, a in zip(self.subsystems, rates, first[:-1].tolist(), strict=True):
+            if R is None and not (body.friction is None or isinstance(body.friction, str)):
+                found.append(LinearFriction(body.friction, body=a))
         if conductance is not None:
             graph = edges(conductance, len(dofs), "the conductance", self.names)
             if connected:
@@ -204,29 +217,33 @@ class ComposedSystem(System):
         """Whether contact friction in some bodies is known to produce entropy: see :func:`is_mechanical`."""
         if is_traced(energy):
             return False
-        own = sum(len(body.energy.terms) for body in self.subsystems)
+        own = sum(len(body.energy_from(0).terms) for body in self.subsystems)
         momenta = structure.places.p[np.isin(structure.places.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
-        return all(is_mechanical(self.subsystems[a].energy, self.subsystems[a].dim) for a in bodies) and all(
-            is_free_of(term, points, momenta) for term in energy.terms[own:]
-        )
+        return all(
+            isinstance(body.energy, Energy) and is_mechanical(body.energy, body.dim)
+            for body in self.subsystems
+            if isinstance(body.friction, str)
+        ) and all(is_free_of(term, points, momenta) for term in energy.terms[own:])
+
+
+MOST_NAMED = 3
+"""Bodies that a message names."""
+
+
+def _motion(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
+    """The pattern of the Poisson tensor."""
+    q, p, _, _ = structure.places
+    return pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-def _named(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem, ...]]:
-    if isinstance(subsystems, Mapping):
-        names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
-    else:
-        bodies = tuple(subsystems)
-        names = tuple(getattr(body, "name", None) or f"body {i}" for i, body in enumerate(bodies))
-    for name, body in zip(names, bodies, strict=True):
-        if not isinstance(body, Subsystem):
-            raise InputError(f"{name} must be an lt.Subsystem, not {type(body).__name__}")
-    if not bodies:
-        raise InputError("a composed system has at least one subsystem")
-    return names, bodies
+def _rates(body: Subsystem | Copies) -> jax.Array | None:
+    """The diagonal friction of a subsystem, an entry for each momentum."""
+    R = body.friction
+    return R.ravel() if isinstance(R, jax.Array) and (R.ndim == 1 or isinstance(body, Copies)) else None
 
 
 def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
@@ -261,33 +278,6 @@ class _Apart(eqx.Module):
         return self.V(y[: self.positions], y[self.positions :])
 
 
-def _checked_friction(friction, dim: int, name: str):
-    n = dim // 2
-    if friction is None:
-        return None
-    if n == 0:
-        raise InputError(f"{name} has no momenta, so it cannot have friction")
-    if isinstance(friction, str):
-        if friction != "contact":
-            raise InputError(f"friction of {name} is a coefficient or 'contact', not {friction!r}")
-        return friction
-    if callable(friction):
-        shape = jax.eval_shape(lambda x: jnp.asarray(friction(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-        if shape not in ((), (n,), (n, n)):
-            raise InputError(f"friction of {name} must return shape (), ({n},) or ({n}, {n}), not {shape}")
-        return friction
-    R = jnp.asarray(friction, dtype=jnp.float64)
-    if R.ndim == 0:
-        R = jnp.full(n, R)
-    if R.shape not in ((n,), (n, n)):
-        raise InputError(f"friction of {name} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
-    if R.ndim == 2:
-        return semidefinite(R, f"the friction of {name}")
-    if not is_traced(R) and not (np.asarray(R) >= 0.0).all():
-        raise InputError(f"friction of {name} must be >= 0, not {np.min(np.asarray(R)):g}: it would cool the body")
-    return R
-
-
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
     part = parts(graph, len(names))
     if part.max() > 0:
@@ -299,9 +289,11 @@ def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
 
 
 def _need_velocities(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
-    for i, j in zip(graph.first, graph.second, strict=True):
-        if dofs[i] != dofs[j] or dofs[i] == 0:
-            raise InputError(
-                f"drag between {names[i]} and {names[j]} needs velocities of the same kind, but they have {dofs[i]} "
-                f"and {dofs[j]} degrees of freedom"
-            )
+    n = np.array(dofs)
+    bad = np.flatnonzero((n[graph.first] != n[graph.second]) | (n[graph.first] == 0))
+    if bad.size:
+        i, j = graph.first[bad[0]], graph.second[bad[0]]
+        raise InputError(
+            f"drag between {names[i]} and {names[j]} needs velocities of the same kind, but they have {dofs[i]} "
+            f"and {dofs[j]} degrees of freedom"
+        )

@@ -62,7 +62,7 @@ class EulerPoincareSystem(LiePoissonSystem):
     algebra : manifolds.LieAlgebra
     lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
         Its Hessian must be invertible (regular Lagrangian).
-    entropy, dissipation, momentum_maps, validate
+    entropy, dissipation, momentum_maps, validate, group, reconstruction
         As for :class:`LiePoissonSystem`; functions of mu.
     force : function from xi to a covector, optional
         F of (3.2): conserves the energy whatever it is. For a force that raises an entropy use ``dissipation``.
@@ -79,6 +79,8 @@ class EulerPoincareSystem(LiePoissonSystem):
         force: Callable | None = None,
         momentum_maps=(),
         validate: bool = True,
+        group: mf.MatrixGroup | None = None,
+        reconstruction: str | None = None,
     ):
         self.lagrangian = as_energy(lagrangian, "the Lagrangian")
         check_scalar(self.lagrangian, algebra.dim, "the Lagrangian")
@@ -86,7 +88,7 @@ class EulerPoincareSystem(LiePoissonSystem):
             forced = EulerPoincareForce(force)
             dissipation = forced if dissipation is None else dissipation + forced
         energy = _hamiltonian(self.lagrangian, algebra.dim)
-        super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate)
+        super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)
 
     @property
     def unrollable(self) -> bool:

@@ -8,6 +8,7 @@ import warnings
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 
@@ -34,16 +35,23 @@ class LiePoissonSystem(System):
         Conserved quantities of a symmetry: checked by :meth:`check`, recorded and audited along runs.
     validate : bool
         Test the axioms at a few random points and refuse a system that fails.
+    group : manifolds.MatrixGroup, optional
+        A group of this algebra: :func:`liethermo.integrate` then returns attitudes g(t) with ``g' = g hat(grad H(mu))``
+        beside mu(t). Velocities are the body's, so that the spatial momentum is ``Ad_star(inverse(g), mu)``.
+    reconstruction : {"cayley", "exp"}, optional
+        How; by default by Cayley's map where the group has one. See :class:`liethermo.WithAttitude`.
 
     Raises
     ------
     CasimirError
         If the entropy is not a Casimir.
     IndefiniteError, AxiomError, FunctionError, InputError
-        If the dissipation or a function does not fit.
+        If the dissipation, a function or the group does not fit.
     """
 
     algebra: mf.LieAlgebra = eqx.field(static=True)
+    group: mf.MatrixGroup | None = eqx.field(static=True)
+    reconstruction: str | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -53,10 +61,13 @@ class LiePoissonSystem(System):
         dissipation: Dissipation | None = None,
         momentum_maps=(),
         validate: bool = True,
+        group: mf.MatrixGroup | None = None,
+        reconstruction: str | None = None,
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
+        self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
         self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
 
     def field(self, x, dH, dS, dL=()):
@@ -68,6 +79,26 @@ class LiePoissonSystem(System):
 
     def _casimirs(self) -> dict[str, Energy]:
         return _recorded_casimirs(self.algebra)
+
+
+def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
+    """The way to reconstruct attitudes in a group of the algebra; None without a group."""
+    if group is None:
+        if reconstruction is not None:
+            raise InputError("a reconstruction needs a group to live in: give group=..., such as manifolds.SO(3)")
+        return None
+    if not isinstance(group, mf.MatrixGroup):
+        raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), not {type(group).__name__}")
+    ours, theirs = algebra.structure_constants, group.algebra.structure_constants
+    if ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0.0, atol=1e-12):
+        raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
+    if reconstruction is None:
+        return "exp" if group.cayley_map is None else "cayley"
+    if reconstruction not in ("cayley", "exp"):
+        raise InputError(f"the reconstruction is 'cayley' or 'exp', not {reconstruction!r}")
+    if reconstruction == "cayley":
+        group._need_cayley()
+    return reconstruction
 
 
 @functools.cache

@@ -1,30 +1,41 @@
-"""Metriplectic systems on R^n with any Poisson structure."""
+"""Metriplectic systems on R^n, or on a manifold, with any Poisson structure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
 
 import manifolds as mf
 
 from ..dissipation import Dissipation
 from ..errors import InputError
 from .base import System, square_field
+from .chart import ChartSystem
 
 
 class MetriplecticSystem(System):
-    """``x' = Pi(x) grad H + K(x) grad S`` on R^n [BFM 2.3].
+    """``x' = Pi(x) grad H + K(x) grad S`` on R^n or on a manifold [BFM 2.3, §4.4].
 
     Parameters
     ----------
     poisson : manifolds.PoissonStructure, or function from x, shape (n,), to a skew (n, n) matrix, or a constant matrix
+        None for a system that only relaxes.
     energy, entropy : function from x, shape (n,), to a scalar, or an Energy
     dissipation : Dissipation, optional
     dim : int
-        Number of state components; needed where ``poisson`` is a plain function.
+        Number of state components; needed where ``poisson`` is a plain function or None, and no space is given.
     momentum_maps : dict of functions, or a sequence of them
     validate : bool
         Test the axioms at a few random points and refuse a system that fails. Turn off where the functions are not
         defined at normally distributed points, and use ``system.check(points=...)``.
+    space : manifolds.Space, optional
+        The manifold that the states live on; native, a product, or from ``manifolds.from_geomstats``. Energy, entropy
+        and momentum maps are then functions of its points, shape (*space.shape), and their gradients may be those of
+        the ambient array: only their action on tangent vectors matters. What is handed to a Poisson structure or to a
+        dissipation are flat real arrays, shape (space.size,), as ``space.to_vector`` makes them: a state x, and
+        covectors that Pi(x) and K(x) have to take to tangent vectors.
 
     Raises
     ------
@@ -33,21 +44,44 @@ class MetriplecticSystem(System):
 
     def __init__(
         self,
-        poisson: mf.PoissonStructure | Callable,
+        poisson: mf.PoissonStructure | Callable | None,
         energy,
         entropy=None,
         dissipation: Dissipation | None = None,
         dim: int | None = None,
         momentum_maps=(),
         validate: bool = True,
+        space: mf.Space | None = None,
     ):
-        if not isinstance(poisson, mf.PoissonStructure):
-            poisson = mf.PoissonTensor(poisson, dim)
-        if poisson.dim is None:
+        if space is not None:
+            if not isinstance(space, mf.Space):
+                raise InputError(
+                    f"the space is a manifolds.Space such as manifolds.Sphere(2), not {type(space).__name__}; "
+                    "for a manifold of geomstats give manifolds.from_geomstats(...)"
+                )
+            mf.RiemannianRetraction(space)  # raises for a space without exp or log
+            dim = space.size if dim is None else dim
+        if dim is None and (poisson is None or (callable(poisson) and not isinstance(poisson, mf.PoissonStructure))):
             raise InputError(
-                "the dimension of the state is not known: give dim=n beside a Poisson tensor that is a function"
+                "the dimension of the state is not known: give dim=n beside a Poisson tensor that is a function or None"
+            )
+        if not isinstance(poisson, mf.PoissonStructure):
+            poisson = mf.PoissonTensor(poisson, dim) if poisson is not None else mf.NoPoisson(dim)  # type: ignore[arg-type]
+        if poisson.dim is None:
+            raise InputError("the Poisson structure does not say how many coordinates it has: give it its dimension")
+        if space is not None and poisson.dim != space.size:
+            raise InputError(
+                f"the Poisson structure has {poisson.dim} coordinates, but a point of {space.name} has {space.size} "
+                "real components, and it acts on those"
             )
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         square_field(poisson.tensor, poisson.dim, "the Poisson tensor")
-        self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate)
+        self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space)
+
+    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+        """Around a state of a manifold, in the coordinates of its exponential map; itself on R^n."""
+        if self.space is None:
+            return self, x
+        around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
+        return ChartSystem(self, around, around.centre() if centred else None), jnp.zeros(self.space.dim)

@@ -155,6 +155,7 @@ def test_both_laws_or_a_reason(seed, h):
     assert solution.status.ok or (h > 0.1 and solution.status.message)
 
 
+@pytest.mark.slow
 def test_observed_order_of_two_particles():
     """Against the exact relaxation ``T_b - T_a = (T_b - T_a)(0) exp(-k (1/c_a + 1/c_b) t)``."""
     c = np.array([1.0, 3.0])
@@ -226,7 +227,8 @@ class AtTheMidpoint(HeatConduction):
 
 
 @pytest.mark.parametrize(
-    ("conduction", "energy", "entropy"), [(ConstantFactor, True, False), (AtTheMidpoint, False, True)]
+    ("conduction", "energy", "entropy"),
+    [pytest.param(ConstantFactor, True, False, marks=pytest.mark.slow), (AtTheMidpoint, False, True)],
 )
 def test_conduction_that_keeps_one_law_alone(conduction, energy, entropy):
     """Skewness without Fourier's factor keeps the energy only, its sign without skewness the entropy only."""

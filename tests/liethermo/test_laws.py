@@ -13,15 +13,16 @@ from tests.cases import (
     build,
     combinations,
     energy_of,
+    slow,
     state_of,
     tolerance,
 )
 
 METHODS = list(lt.registered_methods())
 EACH_METHOD = [  # of the Gauss methods, whose programs take longest to compile, one stands for all by default
-    pytest.param(method, id=str(method), marks=pytest.mark.slow if slow else ())
+    pytest.param(method, id=str(method), marks=pytest.mark.slow if costly else ())
     for method in METHODS
-    for slow in [isinstance(method, lt.MetriplecticGauss) and method.stages != 2]
+    for costly in [isinstance(method, lt.MetriplecticGauss) and method.stages != 2]
 ]
 STEPS, STEP = 40, 0.05
 
@@ -63,7 +64,7 @@ def test_every_algebra(g):
     assert_laws(system, run(system, state_of(g, 0)), lt.MetriplecticMidpoint())
 
 
-@pytest.mark.parametrize(("g", "case"), combinations([mf.so(3), mf.se(3)]))
+@pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow, combinations([mf.se(3)]))])
 def test_every_dissipation(g, case):
     system = build(g, case)
     for seed in range(3):
@@ -71,7 +72,9 @@ def test_every_dissipation(g, case):
 
 
 @pytest.mark.parametrize("method", EACH_METHOD)
-@pytest.mark.parametrize("name", ["killing", "projected_preserve", "friction_operator", "double_bracket", "force"])
+@pytest.mark.parametrize(
+    "name", ["killing", "projected_preserve", *map(slow, ["friction_operator", "double_bracket", "force"])]
+)
 def test_every_method(method, name):
     g = mf.sl(2)
     system = build(g, next(case for case in DISSIPATIONS if case.name == name))

@@ -189,7 +189,7 @@ CASES = {
     "split": (lambda a: jnp.split(a, [1, 3], axis=2), c3),
     "concatenate": (lambda a, b: jnp.concatenate([a, b, 2.0 * a], axis=1), x, y),
     "stack": (lambda a, b: [jnp.stack([a, b], axis=i) for i in range(3)], x, y),
-    "unstack": (lambda a: lax.unstack(a, axis=1), c3),
+    "unstack": (lambda a: [*lax.unstack(a, axis=1), *lax.unstack(a[0, 0])], c3),
     "tile": (lambda a: [jnp.tile(a, (2, 1, 3)), jnp.tile(a, 2)], x),
     "pad": (lambda a: [lax.pad(a, 7.0, c) for c in [((1, 2, 0), (0, 1, 2)), ((-1, 1, 1), (2, -2, 0))]], x),
     "iota": (lambda a: a * lax.broadcasted_iota(jnp.float64, (2, 3), 1), x),

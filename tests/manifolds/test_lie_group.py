@@ -147,8 +147,9 @@ def test_derivative_of_the_coadjoint_action_is_ad_star(G):
 
 def test_cayley(G):
     if G.name in ("SL(3)", "SU(3)"):
-        with pytest.raises(mf.LieAlgebraError, match=r"does not take s[lu].3. into S[LU]\(3\).*use exp"):
-            G.cayley(np.zeros(G.dim))
+        for call in (lambda: G.cayley(np.zeros(G.dim)), lambda: G.inverse_cayley(G.identity)):
+            with pytest.raises(mf.LieAlgebraError, match=r"does not take s[lu].3. into S[LU]\(3\).*use exp"):
+                call()
         return
     x = elements(G, 3)
     g, X = G.cayley(x), np.asarray(G.algebra.hat(x))
@@ -156,6 +157,7 @@ def test_cayley(G):
     assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
     assert close(g, np.linalg.solve(one - X / 2, one + X / 2), "product")
     assert close(G.cayley(-x), G.inverse(g), "product")
+    assert close(G.inverse_cayley(g), x, "product")
     x = x[:1] * SIZES[:, None]
     errors = np.abs(G.cayley(x) - G.exp(x)).max(axis=(-2, -1))
     if G.algebra.is_nilpotent() and not G.algebra.is_abelian():  # X^3 = 0, and the two agree
@@ -352,9 +354,42 @@ def test_poles_of_the_cayley_map(group, x, eigenvalue):
         group.cayley([np.zeros(group.dim), x])
 
 
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_inverse_cayley_near_the_half_turn(n):
+    """2 tan(a/2) grows without bound, and with it the condition of the map."""
+    group, x = mf.SO(n), np.eye(mf.SO(n).dim)[0]
+    for length in (1e2, 1e4, 1e6):
+        found = group.inverse_cayley(group.cayley(length * x))
+        assert close(found, length * x, "half_turn_condition", length**2)
+    half_turn = np.diag([-1.0, -1.0, *[1.0] * (n - 2)])
+    with pytest.raises(
+        mf.DomainError, match=r"g\[1\] has the eigenvalue -1.*inverse Cayley map needs no eigenvalue -1"
+    ):
+        group.inverse_cayley([np.eye(n), half_turn])
+
+
+def test_inverse_cayley_beyond_a_rotation_by_pi():
+    """SU(2) covers the rotations twice: there the inverse Cayley map reaches angles up to 2 pi."""
+    group = mf.SU(2)
+    x = np.array([[0.0, 0.0, length] for length in (1e-9, 1.0, 4.0, 4.1, 40.0)])
+    assert close(
+        group.inverse_cayley(group.cayley(x)) / (1 + x[:, 2:] ** 2 / 16), x / (1 + x[:, 2:] ** 2 / 16), "member"
+    )
+    with pytest.raises(mf.DomainError, match="inverse_cayley"):
+        group.inverse_cayley(-np.eye(2))
+
+
 def test_adjoint_action_off_the_group():
     with pytest.raises(mf.DomainError, match=r"Ad on SO\(3\): g is not in the group: relative distance 1,"):
         mf.SO(3).Ad([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_an_element_that_is_constant_in_a_compiled_program_is_checked_while_it_is_traced():
+    group, mu = mf.SO(3), np.array([1.0, 2.0, 3.0])
+    g, outside = group.exp([0.3, -0.2, 0.5]), 2 * group.identity
+    assert close(jax.jit(lambda mu: group.Ad_star(g, mu))(mu), group.Ad_star(g, mu), "member")
+    with pytest.raises(mf.DomainError, match="not in the group"):
+        jax.jit(lambda mu: group.Ad_star(outside, mu))(mu)
 
 
 def test_random_elements():

@@ -1,0 +1,101 @@
+"""Heat between many bodies: how time and memory of a step grow with their number, where steps are stiff too."""
+
+from __future__ import annotations
+
+import functools
+import time
+
+import numpy as np
+import scipy.sparse
+
+import liethermo as lt
+from liethermo.models.heat_grid import grid_graph
+
+from .. import child as process
+from .. import laws
+from ..report import Report, Table, Target, ratio
+from .memory import STATUS, _resident
+
+SIZES = (1_000, 10_000, 100_000)
+MILD, STIFF = 0.02, 100.0
+"""Steps in units of the time in which two neighbours exchange their heat: for fixed-point and for Newton iteration."""
+
+STEPS = 5
+GRAPHS = ("plane grid", "grid in space", "random, 4 neighbours")
+
+
+def run(quick: bool) -> Report:
+    """One table: graphs, sizes and steps."""
+    graphs, sizes = (GRAPHS[:1], (100,)) if quick else (GRAPHS, SIZES)
+    rows: list[list] = []
+    seconds: dict[tuple[str, int, float], float] = {}
+    for graph in graphs:
+        for nodes in sizes:
+            for h in (MILD, STIFF):
+                found = process.call("network", graph, str(nodes), str(h), one_core=True)
+                seconds[graph, nodes, h] = found["step"]
+                row = [graph, found["nodes"], h, found["first"], found["step"], found["iterations"], found["peak"]]
+                rows.append([*row, *laws.Laws(*found["laws"]).cells()])
+    columns = {
+        "Graph": "text",
+        "Bodies": "count",
+        "Step": "number",
+        "The first call": "seconds",
+        "A step": "seconds",
+        "Iterations a step": "number",
+        "Peak memory": "gigabytes",
+    }
+    caption = (
+        f"Runs of {STEPS} steps on one core, each row in a new process. The first call compiles; the time of a step is "
+        "that of a later one. Steps are in units of c/k."
+    )
+    text = (
+        "Bodies with c = 1 and random temperatures, k = 1 along the edges, by the midpoint scheme with Gonzalez's "
+        "gradient. The short steps are solved by fixed-point iteration, the long ones by Newton's method with a sparse "
+        "Jacobian matrix, factorised for plane grids and used by Krylov iteration for the others."
+    )
+    few, many = (seconds.get((GRAPHS[0], nodes, STIFF)) for nodes in SIZES[1:])
+    targets = [
+        Target("stiff step of a plane grid of 10⁵ bodies", 10.0, many, "seconds"),
+        Target("growth of its time from 10⁴ to 10⁵ bodies", 20.0, ratio(many, few)),
+    ]
+    return Report("Networks", text, [Table(caption, columns | laws.COLUMNS, rows)], targets)
+
+
+def child(graph: str, nodes: str, h: str) -> dict:
+    """The part that runs in a process of its own."""
+    matrix = _graph(graph, int(nodes))
+    count = matrix.shape[0]
+    system = lt.models.thermo_particles([1.0] * count, matrix)
+    x0 = np.log(np.random.default_rng(0).uniform(250.0, 350.0, count))
+    work = functools.partial(
+        lt.integrate, system, x0, (0.0, STEPS * float(h)), float(h), save_every=STEPS, engine="sparse"
+    )
+    times, solution = [time.perf_counter()], work()
+    for _ in range(2):
+        times.append(time.perf_counter())
+        solution = work()
+    times.append(time.perf_counter())
+    kept = laws.of_solution(solution)
+    return {
+        "nodes": count,
+        "first": times[1] - times[0],
+        "step": (times[3] - times[2]) / STEPS,
+        "iterations": solution.stats.iterations_per_step,
+        "peak": _resident() if STATUS.is_file() else None,
+        "laws": [kept.energy_drift, kept.least_entropy_increment],
+    }
+
+
+def _graph(kind: str, nodes: int) -> scipy.sparse.csr_array:
+    if kind == "random, 4 neighbours":
+        rng = np.random.default_rng(1)
+        ends = np.concatenate([np.arange(nodes), rng.permutation(nodes)])  # a ring, so that it is connected, and more
+        other = np.concatenate([np.roll(np.arange(nodes), 1), rng.permutation(nodes)])
+        upper = scipy.sparse.coo_array((np.ones(2 * nodes), (ends, other)), (nodes, nodes)).tocsr()
+        graph = scipy.sparse.csr_array(upper + upper.T)
+        graph.setdiag(0.0)
+        graph.eliminate_zeros()
+        return graph
+    axes = 2 if kind == "plane grid" else 3
+    return grid_graph((round(nodes ** (1 / axes)),) * axes)

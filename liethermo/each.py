@@ -1,0 +1,145 @@
+"""Energies of many bodies: one function at many places of a large state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from .energy import Energy, Function, check_scalar, recognised
+from .engine.interpret import polynomial_degree
+from .errors import FunctionError, InputError
+from .indices import Indices, cliques
+
+
+class Each(Energy):
+    """``sum_e phi(x[places_e], a_e)``: one function at many places of the state, with parameters of its own at each.
+
+    Springs between bodies, the bodies themselves: written once, evaluated at all places together, at a cost that grows
+    with their number and not with the square of the state. Every summand has a discrete gradient of its own, corrected
+    along its own components only; so a component feels no more of the others than in the exact gradient, and stiff
+    systems of any size can be solved by sparse Newton iteration.
+
+    Parameters
+    ----------
+    phi : function or Energy
+        From the components at one place, shape (r,), and the parameters there, to a scalar; or an Energy of those
+        components, the same at every place.
+    places : array of int, shape (m, r)
+        Indices into the state.
+    *parameters : arrays, shape (m, ...)
+        One entry for each place.
+
+    Raises
+    ------
+    FunctionError, InputError
+    """
+
+    phi: Energy | Callable
+    parameters: tuple[jax.Array, ...]
+    places: Indices = eqx.field(static=True)
+    quadratic: bool = eqx.field(static=True)
+
+    def __init__(self, phi, places, *parameters):
+        self.places = places if isinstance(places, Indices) else _checked_places(places)
+        self.parameters = tuple(jnp.asarray(a, dtype=jnp.float64) for a in parameters)
+        m, r = self.places.shape
+        for a in self.parameters:
+            if a.shape[:1] != (m,):
+                raise InputError(f"parameters have an entry for each of the {m} places, but these have shape {a.shape}")
+        if isinstance(phi, Energy):
+            if parameters:
+                raise InputError("an Energy is the same at every place: parameters are for a function")
+            check_scalar(phi, r, "the energy at a place")
+            self.phi = recognised(phi, r)
+            self.quadratic = self.phi.is_quadratic
+            return
+        if not callable(phi):
+            raise FunctionError(f"phi is a function or an Energy, not {type(phi).__name__}")
+        self.phi = phi
+        first = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
+        check_scalar(Function(lambda y: phi(y, *first)), r, "the function at a place")
+        self.quadratic = polynomial_degree(_value_at, (phi, first), r) <= 2
+
+    @property
+    def terms(self) -> tuple[Energy, ...]:
+        if isinstance(self.phi, Energy) and len(self.phi.terms) > 1:
+            return tuple(Each(term, self.places) for term in self.phi.terms)
+        return (self,)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.quadratic
+
+    def value(self, x) -> jax.Array:
+        return jnp.sum(jax.vmap(lambda y, *a: self._at(a).value(y))(self._gathered(x), *self.parameters))
+
+    def gradient(self, x) -> jax.Array:
+        return self._spread(
+            jax.vmap(lambda y, *a: self._at(a).gradient(y))(self._gathered(x), *self.parameters), x.shape[0]
+        )
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        def one(y, step, kept, *a):
+            return self._at(a).discrete_gradient(scheme, y, step, kept)
+
+        y, step, kept = map(self._gathered, (x, d, jnp.zeros_like(x) + low))
+        return self._spread(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        def one(start, low, step, points, slopes, further, *a):
+            mine = path._replace(start=start, low=low, step=step, points=points, slopes=slopes, further=further)
+            return self._at(a).stage_gradients(scheme, mine)
+
+        n = path.start.shape[0]
+        ends = map(self._gathered, (path.start, jnp.zeros_like(path.start) + path.low, path.step))
+        stages = map(self._gathered, (path.points, path.slopes))
+        further = None if path.further is None else tuple(map(self._gathered, path.further))
+        axes = (0, 0, 0, 1, 1, None if further is None else 1, *(0 for _ in self.parameters))
+        found = jax.vmap(one, in_axes=axes, out_axes=1)(*ends, *stages, further, *self.parameters)
+        return jax.vmap(lambda g: self._spread(g, n))(found)
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        return cliques(self.places, dim)
+
+    def check_places(self, dim: int, role: str) -> None:
+        numbers = np.asarray(self.places)
+        if numbers.size and not (numbers.min() >= 0 and numbers.max() < dim):
+            outside = int(numbers[(numbers < 0) | (numbers >= dim)][0])
+            raise InputError(f"{role} has a term at component {outside} of a state with {dim} components")
+
+    def _at(self, parameters) -> Energy:
+        """The summand with these parameters."""
+        if isinstance(self.phi, Energy):
+            return self.phi
+        return Function(lambda y: self.phi(y, *parameters), quadratic=self.quadratic)
+
+    def _gathered(self, x) -> jax.Array:
+        """The components at each place, shape (..., n) to (..., m, r)."""
+        if (run := self.places.run) is not None:
+            return x[..., run].reshape(*x.shape[:-1], *self.places.shape)
+        return x[..., np.asarray(self.places)]
+
+    def _spread(self, gradients, n: int) -> jax.Array:
+        """The sum of covectors at the places, shape (m, r) to (n,)."""
+        if (run := self.places.run) is not None:
+            return jnp.zeros(n).at[run].add(gradients.ravel())
+        return jnp.zeros(n).at[np.asarray(self.places)].add(gradients)
+
+
+def _value_at(model, y):
+    phi, parameters = model
+    return jnp.asarray(phi(y, *parameters))
+
+
+def _checked_places(places) -> Indices:
+    numbers = np.asarray(places)
+    if numbers.ndim != 2 or numbers.dtype.kind not in "iu" or 0 in numbers.shape:
+        raise InputError(
+            f"places are integers of shape (m, r), the r components that each of m summands depends on, not {places!r}"
+        )
+    return Indices(numbers)

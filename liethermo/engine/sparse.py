@@ -1,0 +1,203 @@
+"""The sparse engine: systems of any size that know which of their components act on which.
+
+A step is tried by fixed-point iteration, as by the array engine; a stiff one is solved by Newton's method with a sparse
+Jacobian matrix. Its entries come from few derivatives: columns that no row has in common are taken in one, and the rows
+of hubs, which have many neighbours, are taken by themselves [Curtis, Powell & Reid 1974; Coleman & Verma 1998]. The
+Newton iteration runs on the host, where SciPy factorises; all else is the array engine's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..integrators import OneStepMethod
+from ..systems import System
+from . import array
+from .linear import Compression, Inverse
+
+LIMIT = 80
+"""Newton iterations: cheap ones, most of which use factors that are there already."""
+
+HALVINGS = 12
+"""Times that a Newton step is halved before the iteration is given up."""
+
+STALE = 0.1
+"""Contraction rate above which the Jacobian matrix is taken afresh; it is kept from step to step otherwise."""
+
+
+class SparseEngine:
+    """The engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
+
+    It offers what the modules :mod:`.array` and :mod:`.compiled` do.
+
+    Raises
+    ------
+    ValueError
+        If the system does not know its sparsity.
+    """
+
+    def __init__(self, system: System, method: OneStepMethod):
+        self.system, self.method = system, method
+        pattern = system.sparsity()
+        if pattern is None:
+            raise ValueError(f"{type(system).__name__} does not know its sparsity")
+        self._pattern = pattern
+        self._compression: Compression | None = None
+        self._inverse: Inverse | None = None
+        self._h = np.nan
+
+    def begin(self, system: System, method: OneStepMethod, x) -> array.State:
+        """As :func:`.array.begin`."""
+        return array.begin(system, method, x)
+
+    def advance(self, system: System, method: OneStepMethod, state, h, saves, every, capacity: int):
+        """As :func:`.array.advance`; it keeps no more than it reaches."""
+        del system, method, capacity
+        kept: list[array.State] = []
+        for _ in range(int(saves)):
+            for _ in range(int(every)):
+                state = self.step(state, h)
+                if int(state.status) != array.RUNNING:
+                    break
+            if int(state.status) != array.RUNNING:
+                break
+            kept.append(state)
+        x = np.array([np.asarray(s.x) for s in kept]).reshape(len(kept), self.system.dim)
+        energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
+        return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
+
+    def stepping(self, system: System, method: OneStepMethod):
+        """As :func:`.array.stepping`."""
+        del system, method
+        return self.step
+
+    def step(self, state: array.State, h) -> array.State:
+        """One step; where it fails the state is left as it was, with a status."""
+        h = jnp.asarray(h, dtype=jnp.float64)
+        solved = _fixed_point(self.system, self.method, state, h)
+        if not bool(solved.converged):
+            solved = self._newton(state, h, int(solved.fixed_point))
+        return _conclude(self.system, self.method, state, h, solved)
+
+    # -- Newton's method ------------------------------------------------------------------------------------------
+
+    def _newton(self, state: array.State, h, before: int) -> array.Solved:
+        k, misfit, scale = _better_start(self.system, self.method, state, h)
+        s, renew = array.Iteration.begin(k), float(h) != self._h
+        while not bool(s.settled(scale)) and int(s.made) < LIMIT:
+            if renew or self._inverse is None:
+                self._inverse, self._h = self._inverted(state, h, s.k), float(h)
+                if self._inverse is None:
+                    break
+            found = self._improved(state, h, s, misfit, scale, self._inverse, HALVINGS if renew else 1)
+            if found is None and renew:
+                break
+            renew = found is None
+            if found is not None:
+                s, misfit, scale = found
+                renew = float(s.rate) > STALE and float(s.update) > array.PLATEAU * float(scale)
+        defined = bool(jnp.isfinite(misfit).all())
+        return array.Solved(
+            k=s.k,
+            converged=jnp.asarray(bool(s.settled(scale)) and defined),
+            defined=jnp.asarray(defined),
+            residual=s.update,
+            fixed_point=jnp.asarray(before),
+            newton=s.made,
+        )
+
+    def _improved(self, state, h, s: array.Iteration, misfit, scale, inverse: Inverse, attempts: int):
+        """After a Newton step, halved until the equations are solved better than before; None if that fails.
+
+        At the rounding plateau they are not, and a whole step is taken.
+        """
+        step = inverse(np.asarray(misfit).ravel()).reshape(s.k.shape)
+        if not np.isfinite(step).all():
+            return None
+        size = float(jnp.linalg.norm(misfit))
+        for _ in range(attempts):
+            k = s.k - step
+            found, new_scale = _misfit(self.system, self.method, state, h, k)
+            new_size = float(jnp.linalg.norm(found))
+            rounding = float(np.abs(step).max()) <= array.PLATEAU * float(scale)
+            if new_size < size or (rounding and np.isfinite(new_size)):
+                return s.after(k), found, new_scale
+            step = 0.5 * step
+        return None
+
+    def _inverted(self, state, h, k) -> Inverse | None:
+        """The inverse of the Jacobian matrix of the misfit; None where there is none."""
+        if self._compression is None:
+            self._compression = Compression(self._pattern, self.method.stages)
+
+        def push(seed):
+            return _pushed(self.system, self.method, state, h, k, seed)
+
+        def pull(seed):
+            return _pulled(self.system, self.method, state, h, k, seed)
+
+        try:
+            return Inverse(self._compression.matrix(push, pull), self._compression.width)
+        except np.linalg.LinAlgError:
+            return None
+
+
+# -- on the device ----------------------------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def _fixed_point(system: System, method: OneStepMethod, state: array.State, h) -> array.Solved:
+    return array.fixed_point(*array.equations(system, method, state, h))
+
+
+@eqx.filter_jit
+def _conclude(system: System, method: OneStepMethod, state: array.State, h, solved: array.Solved) -> array.State:
+    return array.conclude(system, method, state, h, solved)
+
+
+def _equations(system: System, method: OneStepMethod, state: array.State, h):
+    """The misfit ``w (slopes(k) - k)``, a guess of k, and the size that the plateau is measured against.
+
+    With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
+    """
+    slopes, guess, scale = array.equations(system, method, state, h)
+
+    def misfit(k):
+        middle = state.x + (state.low + 0.5 * method.increment(h, k))
+        return system.weights(middle) * (slopes(k) - k)
+
+    return misfit, guess, scale
+
+
+@eqx.filter_jit
+def _misfit(system: System, method: OneStepMethod, state: array.State, h, k) -> tuple[Any, Any]:
+    misfit, _, scale = _equations(system, method, state, h)
+    return misfit(k), scale(k)
+
+
+@eqx.filter_jit
+def _better_start(system: System, method: OneStepMethod, state: array.State, h):
+    """The predicted slopes, or a step of nothing where that solves the equations better; with misfit and scale."""
+    misfit, guess, scale = _equations(system, method, state, h)
+    starts = [guess, jnp.zeros_like(guess)]
+    misfits = [misfit(k) for k in starts]
+    predicted = jnp.linalg.norm(misfits[0]) <= jnp.linalg.norm(misfits[1])
+    k, found = (jnp.where(predicted, *pair) for pair in (starts, misfits))
+    return k, found, scale(k)
+
+
+@eqx.filter_jit
+def _pushed(system: System, method: OneStepMethod, state: array.State, h, k, seed):
+    misfit = _equations(system, method, state, h)[0]
+    return jax.jvp(misfit, (k,), (jnp.asarray(seed),))[1]
+
+
+@eqx.filter_jit
+def _pulled(system: System, method: OneStepMethod, state: array.State, h, k, seed):
+    misfit = _equations(system, method, state, h)[0]
+    return jax.vjp(misfit, k)[1](jnp.asarray(seed))[0]

@@ -1,0 +1,151 @@
+"""Graphs from files: edge lists as CSV, and GraphML."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import scipy.sparse
+
+from .errors import FileError, InputError
+from .graph import edges
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A weighted graph with names for its nodes.
+
+    Attributes
+    ----------
+    names : tuple of str
+    matrix : scipy.sparse.csr_array, shape (nodes, nodes)
+        Symmetric: what :class:`liethermo.ComposedSystem` takes as a conductance.
+    """
+
+    names: tuple[str, ...]
+    matrix: scipy.sparse.csr_array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequence[str] | int | None = None) -> Graph:
+    """Read a graph of conductances from a file.
+
+    A ``.csv`` file has a line for each edge, each pair once, and column titles in its first line: ``source``,
+    ``target`` and the weight. A ``.graphml`` file declares its nodes, and its edges carry the weight as an attribute;
+    networkx reads it (``pip install liethermo[graphs]``).
+
+    Parameters
+    ----------
+    path : path
+    weight : str
+        The column or attribute with the weights.
+    nodes : sequence of str, or int, optional
+        The names of the nodes, in the order that states have; a number n stands for "0" to "n - 1". An edge to any
+        other is an error. By default those that the file has: as declared in GraphML, in the order of their first edges
+        in CSV (in numerical order, where all are whole numbers).
+
+    Returns
+    -------
+    Graph
+
+    Raises
+    ------
+    FileError
+        If the file is missing or of another kind, or GraphML is asked for and networkx is not there.
+    InputError
+        If an edge leads to a node that is missing, is given twice, or has no weight, or one that is negative or not
+        finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"there is no file {path}")
+    readers = {".csv": _csv, ".graphml": _graphml}
+    if path.suffix.lower() not in readers:
+        raise FileError(f"{path} is neither .csv nor .graphml, the kinds of graph that can be read")
+    found, listed = readers[path.suffix.lower()](path, weight)
+    names = _names(found, nodes, path)
+    number = {name: i for i, name in enumerate(names)}
+    numbered = []
+    for where, source, target, k in listed:
+        for end in (source, target):
+            if end not in number:
+                raise InputError(f"{path}, {where}: there is no node {end!r} among the {len(names)} of the graph")
+        numbered.append((number[source], number[target], k))
+    try:
+        graph = edges(numbered, len(names), f"the {weight}", names)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    size = len(names)
+    upper = scipy.sparse.coo_array((np.asarray(graph.weight), (graph.first, graph.second)), (size, size))
+    return Graph(names, scipy.sparse.csr_array(upper + upper.T))
+
+
+_Listed = list[tuple[str, str, str, float]]
+
+
+def _csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
+    """The nodes in the order of their first edges, and the edges with where they stand."""
+    listed: _Listed = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            titles = reader.fieldnames or []
+            lacking = [title for title in ("source", "target", weight) if title not in titles]
+            if lacking:
+                raise InputError(f"{path} has no column {lacking[0]!r} in its first line, but {', '.join(titles)}")
+            for row in reader:
+                where = f"line {reader.line_num}"
+                source, target = ((row[title] or "").strip() for title in ("source", "target"))
+                if not (source and target):
+                    raise InputError(f"{path}, {where}: an edge has two nodes, but one of them is missing")
+                listed.append((where, source, target, _number(row[weight], weight, f"{path}, {where}")))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"{path} cannot be read as CSV: {error}") from error
+    names = tuple(dict.fromkeys(end for _, source, target, _ in listed for end in (source, target)))
+    return (tuple(sorted(names, key=int)) if all(name.isdecimal() for name in names) else names), listed
+
+
+def _graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
+    try:
+        import networkx
+    except ImportError as error:
+        raise FileError(f"networkx, which reads {path}, is not installed: pip install liethermo[graphs]") from error
+    try:
+        graph = networkx.read_graphml(path)
+        declared = _declared(path)
+    except (networkx.NetworkXError, ElementTree.ParseError, OSError, KeyError, ValueError) as error:
+        raise FileError(f"{path} cannot be read as GraphML: {error}") from error
+    listed: _Listed = []
+    for source, target, data in graph.edges(data=True):
+        where = f"the edge from {source} to {target}"
+        listed.append((where, source, target, _number(data.get(weight), weight, f"{path}, {where}")))
+    return declared, listed
+
+
+def _declared(path: Path) -> tuple[str, ...]:
+    """The nodes that a GraphML file declares: networkx makes up those that only an edge names."""
+    elements = ElementTree.parse(path).iter()
+    return tuple(element.attrib["id"] for element in elements if element.tag.rsplit("}")[-1] == "node")
+
+
+def _names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
+    names = tuple(found or ()) if nodes is None else tuple(map(str, range(nodes) if isinstance(nodes, int) else nodes))
+    if not names:
+        raise InputError(f"{path} has no nodes")
+    if len(set(names)) < len(names):
+        raise InputError("nodes have names of their own, but one is given twice")
+    return names
+
+
+def _number(text, weight: str, where: str) -> float:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: the {weight} is {text!r}, not a number") from None

@@ -1,0 +1,178 @@
+"""Methods of vector spaces on manifolds: in the chart of a retraction, around another point at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import manifolds as mf
+
+from ..errors import InputError
+from ..gradients import EPS
+from ..systems import ChartSystem, System
+from .base import OneStepMethod, collocation_error
+
+
+class InCharts(OneStepMethod):
+    """A method as it runs on a manifold, step by step in coordinates around a point z: :class:`liethermo.ChartSystem`.
+
+    The step from x to x' is one from R^dim to R^dim, from the coordinates of x to those of x'. So the laws that the
+    method keeps hold on the manifold, exactly; and x' is a point of it to rounding, as charts give points: nothing is
+    projected. The order is that of the method, as a change of coordinates does not alter it.
+
+    With a retraction whose base point is at the start of the step, z = x [EQUATIONS §4]. With one whose base point is
+    in the middle, z is the midpoint of x and x' [BFM 4.8]; a method of one stage takes Pi and K there as they are, and
+    with the discrete gradient in the chart around z, which is (4.9)-(4.10), this is the integrator of BFM §4.4.
+
+    Made by :func:`liethermo.integrate` from the method it is given. Slopes are tangent vectors at x, as vectors of
+    shape (n,).
+
+    Attributes
+    ----------
+    method : OneStepMethod
+    retraction : manifolds.Retraction
+    """
+
+    method: OneStepMethod
+    retraction: mf.Retraction = eqx.field(static=True)
+
+    @property
+    def stages(self) -> int:
+        return self.method.stages
+
+    @property
+    def order(self) -> int:
+        return self.method.order
+
+    @property
+    def preserves(self) -> frozenset[str]:
+        return self.method.preserves & {"energy", "entropy_law"}
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        step = self._step(system, x, low, h, k)
+        return step.back(step.method.slopes(step.system, step.start, step.low, h, step.k))
+
+    def increment(self, h, k) -> jax.Array:
+        """The displacement, a tangent vector at x."""
+        return self.method.increment(h, k)
+
+    def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
+        """The point at the end of the step; NaN where the step is longer than the domain of the retraction."""
+        step = self._step(system, x, low, h, k)
+        end = step.start + (step.low + self.method.increment(h, step.k))
+        inside = self._reach(system, x, self.increment(h, k)) < 1.0
+        new = jnp.where(inside, self.retraction.space.to_vector(step.system.coordinates.point(end)), jnp.nan)
+        return new, jnp.zeros_like(new)
+
+    def along(self, system: System, x, v) -> jax.Array:
+        return self.retraction.space.to_vector(self.retraction.chart._point(system.points(x), system.points(v)))
+
+    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+        """By one-sided differences, half of the digits, which is enough for Newton's method.
+
+        The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
+        what is hardly ever needed.
+        """
+        size = jnp.max(jnp.abs(k))
+        step = EPS**0.5 * jnp.where(size > 0.0, size, 1.0)
+        shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
+        misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
+        values = jax.lax.map(lambda shift: misfit(k.ravel() + shift), shifts)
+        return ((values[1:] - values[0]) / step).T
+
+    def check(self, system: System) -> None:
+        self.method.check(system)
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        return collocation_error(system, x, low, h, k)
+
+    def explain(self, system: System, x, k, h) -> str:
+        reach = float(self._reach(system, x, self.increment(h, k)))
+        if not reach >= 0.5:
+            return ""
+        radius = self.retraction.space.injectivity_radius(system.points(x))
+        return (
+            f"the last step was {reach:.3g} times as long as the domain of {self.retraction} allows (injectivity "
+            f"radius {radius:.6g}), and none may be longer: try a step of {0.25 * h / reach:.2g}"
+        )
+
+    def _reach(self, system: System, x, v) -> jax.Array:
+        """Length of a displacement from x relative to the domain of the retraction."""
+        point = system.points(x)
+        return self.retraction._reach(point, self.retraction.space._project_tangent(point, system.points(v)))
+
+    def _step(self, system: System, x, low, h, k) -> _Step:
+        """The step in coordinates around z."""
+        chart, space, x = self.retraction.chart, self.retraction.space, system.points(x)
+        vectors = space.from_vector(k)
+        around = mf.coordinates_around(chart, x)
+        own = jax.vmap(around.components)(vectors)
+        low = around.components(system.points(low))
+        if isinstance(self.retraction, mf.Chart):
+            local = ChartSystem(system, around)
+
+            def back(slopes):
+                return space.to_vector(jax.vmap(around.vector)(slopes))
+
+            return _Step(local, self.method.pulled(local), jnp.zeros_like(low), low, own, back)
+
+        half = 0.5 * around.vector(self.method.increment(h, own))
+        z = chart._point(x, half)
+        carried = chart._carry(x, half, half)
+        around_z = mf.coordinates_around(chart, z)
+
+        def there(c):
+            return around_z.components(chart._carry(x, half, around.vector(c)))
+
+        def back_there(c):
+            return space.to_vector(chart._carry(z, -carried, around_z.vector(c)))
+
+        local = ChartSystem(system, around_z, around_z.centre() if self.stages == 1 else None)
+        own = jax.vmap(there)(own)
+        start = -0.5 * self.method.increment(h, own)
+        return _Step(local, self.method.pulled(local), start, there(low), own, jax.vmap(back_there))
+
+    def predict(self, k, before) -> jax.Array:
+        return 2.0 * k - before  # whatever the method's own: the chart has changed
+
+    def __str__(self) -> str:
+        return f"{self.method} with {self.retraction}"
+
+
+class _Step(NamedTuple):
+    """A step in coordinates: the system there and the method, where it starts, the slopes, and the way back to x."""
+
+    system: ChartSystem
+    method: OneStepMethod
+    start: jax.Array
+    low: jax.Array
+    k: jax.Array
+    back: Callable
+
+
+def in_charts(
+    method: OneStepMethod, system: System, retraction: str | mf.Retraction | None, default: str
+) -> OneStepMethod:
+    """The method on a system: itself on R^n.
+
+    Raises
+    ------
+    InputError
+        If the retraction is none of the system's space.
+    SpaceError
+        If the space lacks what the retraction is made of.
+    """
+    if system.space is None:
+        if retraction is not None:
+            raise InputError("a retraction is for a system on a manifold, and this one is on R^n")
+        return method
+    if not isinstance(retraction, mf.Retraction):
+        retraction = mf.retraction(system.space, default if retraction is None else retraction)
+    if retraction.space != system.space:
+        other = retraction.space.name
+        raise InputError(f"the retraction is one of {other}, but the system is on {system.space.name}")
+    return InCharts(method, retraction)

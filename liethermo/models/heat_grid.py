@@ -1,0 +1,68 @@
+"""Heat on a grid of bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+import scipy.sparse
+
+from ..errors import InputError
+from ..systems import ComposedSystem, Copies
+from .parameters import positive, whole
+from .thermo_particles import warmth
+
+
+def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductance: float = 1.0) -> ComposedSystem:
+    """Bodies at rest on a grid, each in contact with its neighbours along the axes: ``H = sum c exp(S_a / c)``.
+
+    The temperatures obey ``c T_a' = k sum_b (T_b - T_a)`` over the neighbours b, the heat equation with insulated ends,
+    and tend to their mean. The state has the entropies in C order, ``c log T``. It may have 1e5 nodes and more; its
+    fastest mode decays at up to 4 k / c for each axis, its slowest at ``(pi / n)^2 k / c``.
+
+    Parameters
+    ----------
+    shape : sequence of int
+        Nodes along each axis.
+    capacity : float, > 0
+        c of each node (energy / temperature).
+    conductance : float, > 0
+        k between neighbours (power / temperature).
+    """
+    sizes = _sizes(shape)
+    c, k = positive(capacity, "capacity"), positive(conductance, "conductance")
+    nodes = math.prod(sizes)
+    return ComposedSystem(
+        Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=float(k) * grid_graph(sizes)
+    )
+
+
+def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:
+    """The exact temperatures at a time, from those at t = 0, both in the shape of the grid: a sum of cosines."""
+    T = np.asarray(temperatures, dtype=float)
+    rates = np.zeros(T.shape)
+    for axis, n in enumerate(T.shape):
+        mode = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2
+        rates = rates + mode.reshape([-1 if i == axis else 1 for i in range(T.ndim)])
+    return scipy.fft.idctn(np.exp(-conductance / capacity * rates * t) * scipy.fft.dctn(T))
+
+
+def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
+    """The graph in which each node of a grid, in C order, is joined to its neighbours along the axes with weight 1."""
+    sizes = _sizes(shape)
+    total = scipy.sparse.csr_array((math.prod(sizes), math.prod(sizes)))
+    for axis, n in enumerate(sizes):
+        line = scipy.sparse.diags_array([np.ones(n - 1)] * 2, offsets=[-1, 1], shape=(n, n))
+        before, after = math.prod(sizes[:axis]), math.prod(sizes[axis + 1 :])
+        inner = scipy.sparse.kron(line, scipy.sparse.eye_array(after))
+        total = total + scipy.sparse.kron(scipy.sparse.eye_array(before), inner)
+    return scipy.sparse.csr_array(total)
+
+
+def _sizes(shape: Sequence[int]) -> tuple[int, ...]:
+    if isinstance(shape, int) or len(shape) == 0:
+        raise InputError(f"shape is the number of nodes along each axis, such as (32, 32), not {shape!r}")
+    return tuple(whole(n, "each entry of shape") for n in shape)

@@ -1,0 +1,123 @@
+"""A body with its attitude: the momentum of a Lie-Poisson system, and the element of the group that it moves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..energy import Energy, Sum
+from ..errors import InputError
+from .base import System
+from .lie_poisson import LiePoissonSystem
+
+
+class OfMomentum(Energy):
+    """A function of the momentum, the first ``dim`` components of a state."""
+
+    energy: Energy
+    dim: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.energy.is_quadratic
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(x[: self.dim])
+
+    def gradient(self, x) -> jax.Array:
+        rest = jnp.zeros(x.shape[0] - self.dim)
+        return jnp.concatenate([self.energy.gradient(x[: self.dim]), rest])
+
+
+class AttitudeSystem(System):
+    """A Lie-Poisson system for mu, and ``g' = g hat(grad H(mu))`` beside it [EQUATIONS §4, "Group reconstruction"].
+
+    A state is mu followed by the entries of g, row by row, their imaginary parts last where there are any. Energy,
+    entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.
+
+    Attributes
+    ----------
+    body : LiePoissonSystem
+    group : manifolds.MatrixGroup
+    """
+
+    body: LiePoissonSystem
+    group: mf.MatrixGroup = eqx.field(static=True)
+
+    def __init__(self, body: LiePoissonSystem):
+        assert body.group is not None
+        self.body, self.group, self.space = body, body.group, None
+        self.dim = body.dim + self._parts * self.group.matrix_size**2
+        self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
+        self.energy = self._of_momentum(body.energy)
+        self.entropy = None if body.entropy is None else self._of_momentum(body.entropy)
+
+    @property
+    def unrollable(self) -> bool:
+        return self.body.unrollable and self._parts == 1
+
+    def split(self, x) -> tuple[jax.Array, jax.Array]:
+        """Momentum, shape (..., dim of the algebra), and group element, shape (..., m, m), of a state."""
+        n, m = self.body.dim, self.group.matrix_size
+        parts = x[..., n:].reshape(*x.shape[:-1], self._parts, m, m)
+        return x[..., :n], parts[..., 0, :, :] if self._parts == 1 else parts[..., 0, :, :] + 1j * parts[..., 1, :, :]
+
+    def join(self, mu, g) -> jax.Array:
+        """The inverse of :meth:`split`."""
+        parts = g[..., None, :, :] if self._parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
+        return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1)], axis=-1)
+
+    def begin(self, mu, attitude=None) -> jax.Array:
+        """The state with a momentum and an attitude, the identity by default.
+
+        Raises
+        ------
+        InputError
+            If the attitude is not in the group.
+        """
+        g = self.group.identity if attitude is None else self.group._element(attitude, "attitude")
+        if not bool(self.group.belongs(g)):
+            residual = float(self.group.defect(g))
+            raise InputError(
+                f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
+            )
+        return self.join(self.body.state(mu), g)
+
+    def points(self, x):
+        """The momenta: what functions of the state are functions of."""
+        return x[..., : self.body.dim]
+
+    def presented(self, solution):
+        mu, g = self.split(solution.x)
+        dense = solution.dense
+        if dense is not None:
+            dense = dataclasses.replace(dense, x=self.points(dense.x), k=self.points(dense.k))
+        return dataclasses.replace(
+            self.body.presented(solution), x=mu, attitude=np.ascontiguousarray(g), dense=dense
+        ).with_provenance(
+            system=type(self.body).__name__,
+            algebra=self.body.algebra.name,
+            group=self.group.name,
+            x0=np.asarray(mu[0]).tolist(),
+        )
+
+    def invariants(self):
+        return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
+
+    def _vector_field(self, x):
+        mu, g = self.split(x)
+        return self.join(self.body._vector_field(mu), g @ self.body.algebra.hat(self.body.energy.gradient(mu)))
+
+    def _of_momentum(self, energy: Energy) -> Energy:
+        terms = tuple(OfMomentum(term, self.body.dim) for term in energy.terms)
+        return terms[0] if len(terms) == 1 else Sum(terms)
+
+    @property
+    def _parts(self) -> int:
+        return 2 if jnp.iscomplexobj(self.group.identity) else 1

@@ -1,0 +1,178 @@
+"""The bodies of a composed system: one by one, or many of a kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..dissipation import semidefinite
+from ..each import Each
+from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..errors import InputError
+
+
+class Subsystem(eqx.Module):
+    """One body of a composed system: its energy in its own state (q, p, S), and its friction.
+
+    Parameters
+    ----------
+    energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy; or None
+        With ``lt.Kinetic`` and ``lt.Potential`` as terms where that is its form; None where it is all in the coupling.
+    dim : int
+        2n + 1 components; 1 for a body at rest, whose state is S alone.
+    friction : optional
+        A coefficient R of linear friction, ``p' = -R v`` and ``S' = v . R v / T`` (mass / time): a number, an array of
+        shape (n,) for a diagonal matrix or (n, n), positive semidefinite, or a function from the state of the body to
+        one. Or "contact": the friction ``p' = -p T`` of an evolution field [SML 7]. None by default.
+    name : str, optional
+        For messages.
+    """
+
+    energy: Energy
+    friction: jax.Array | Callable | str | None
+    dim: int = eqx.field(static=True)
+    name: str | None = eqx.field(static=True)
+
+    def __init__(self, energy, dim: int, friction=None, name: str | None = None):
+        _check_dim(dim)
+        self.dim, self.name = dim, name
+        energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
+        check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}")
+        self.energy = recognised(energy, dim)
+        self.friction = _checked_friction(friction, dim, name or "a subsystem")
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        return self.dim // 2
+
+    @property
+    def count(self) -> int:
+        """How many bodies it is."""
+        return 1
+
+    def energy_from(self, start: int) -> Energy:
+        """The energy as a function of a whole state in which the body begins at a component."""
+        return self.energy.on(np.arange(start, start + self.dim))
+
+
+class Copies(eqx.Module):
+    """Many bodies of one kind in a composed system: ``H_a(q_a, p_a, S_a)`` is one function with parameters of its own.
+
+    What it costs to trace and to compile does not grow with their number, so there can be 1e5 of them.
+
+    Parameters
+    ----------
+    count : int
+    energy : function or Energy, or None
+        From (q, p, S) in one array, shape (dim,), and the parameters of a body, to a scalar: with a heat capacity c,
+        say, ``lambda x, c: c * jnp.exp(x[-1] / c)``. Or an Energy, the same for all. None where it is all in the
+        coupling.
+    dim : int
+        2n + 1 components of each; 1 for bodies at rest.
+    parameters : array, shape (count, ...), or tuple of such
+    friction : optional
+        Coefficients of linear friction (mass / time): a number, an array of shape (n,) for all, or (count, n). Or
+        "contact": see :class:`Subsystem`.
+    name : str, optional
+        What the bodies are called in messages, with a number behind it.
+    """
+
+    energy: Energy | Callable
+    parameters: tuple[jax.Array, ...]
+    friction: jax.Array | str | None
+    count: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    name: str | None = eqx.field(static=True)
+
+    def __init__(self, count: int, energy, dim: int, parameters=(), friction=None, name: str | None = None):
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise InputError(f"count is the number of bodies, an integer >= 1, not {count!r}")
+        _check_dim(dim)
+        self.count, self.dim, self.name = count, dim, name
+        self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
+        given = parameters if isinstance(parameters, tuple) else (parameters,)
+        self.parameters = tuple(jnp.asarray(a, dtype=jnp.float64) for a in given)
+        self.energy_from(0)  # checked there
+        self.friction = _friction_of_many(friction, count, dim, name or "the bodies")
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        return self.dim // 2
+
+    def energy_from(self, start: int) -> Energy:
+        """The energy as a function of a whole state in which the first of the bodies begins at a component."""
+        places = np.arange(start, start + self.count * self.dim).reshape(self.count, self.dim)
+        return Each(self.energy, places, *self.parameters)
+
+
+# -- arguments --------------------------------------------------------------------------------------------------------
+
+
+def named(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
+    """A name for each entry, and the entries."""
+    if isinstance(subsystems, Mapping):
+        names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
+    else:
+        bodies = (subsystems,) if isinstance(subsystems, Subsystem | Copies) else tuple(subsystems)
+        starts = np.cumsum([0, *(getattr(body, "count", 1) for body in bodies)])
+        names = tuple(
+            getattr(body, "name", None) or ("body" if isinstance(body, Copies) else f"body {i}")
+            for body, i in zip(bodies, starts[:-1], strict=True)
+        )
+    for name, body in zip(names, bodies, strict=True):
+        if not isinstance(body, Subsystem | Copies):
+            raise InputError(f"{name} must be an lt.Subsystem or lt.Copies, not {type(body).__name__}")
+    if not bodies:
+        raise InputError("a composed system has at least one subsystem")
+    return names, bodies
+
+
+def _check_dim(dim) -> None:
+    if isinstance(dim, bool) or not isinstance(dim, int) or dim < 1 or dim % 2 == 0:
+        raise InputError(f"dim counts the components of a state (q, p, S): 2n + 1, and 1 for S alone, not {dim!r}")
+
+
+def _checked_friction(friction, dim: int, name: str):
+    n = dim // 2
+    if friction is None:
+        return None
+    if n == 0:
+        raise InputError(f"{name} has no momenta, so it cannot have friction")
+    if isinstance(friction, str):
+        if friction != "contact":
+            raise InputError(f"friction of {name} is a coefficient or 'contact', not {friction!r}")
+        return friction
+    if callable(friction):
+        shape = jax.eval_shape(lambda x: jnp.asarray(friction(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        if shape not in ((), (n,), (n, n)):
+            raise InputError(f"friction of {name} must return shape (), ({n},) or ({n}, {n}), not {shape}")
+        return friction
+    R = jnp.asarray(friction, dtype=jnp.float64)
+    if R.ndim == 0:
+        R = jnp.full(n, R)
+    if R.shape not in ((n,), (n, n)):
+        raise InputError(f"friction of {name} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
+    if R.ndim == 2:
+        return semidefinite(R, f"the friction of {name}")
+    return _not_negative(R, name)
+
+
+def _friction_of_many(friction, count: int, dim: int, name: str):
+    if friction is None or isinstance(friction, str):
+        return _checked_friction(friction, dim, name)
+    n, R = dim // 2, jnp.asarray(friction, dtype=jnp.float64)
+    if n == 0 or R.shape not in ((), (n,), (count, n)):
+        raise InputError(
+            f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"
+        )
+    return _not_negative(jnp.broadcast_to(R, (count, n)), name)
+
+
+def _not_negative(R: jax.Array, name: str) -> jax.Array:
+    if not is_traced(R) and not (np.asarray(R) >= 0.0).all():
+        raise InputError(f"friction of {name} must be >= 0, not {np.min(np.asarray(R)):g}: it would cool the body")
+    return R

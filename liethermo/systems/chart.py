@@ -1,0 +1,145 @@
+"""A system on a manifold in the coordinates of a chart: a system on R^dim, for the methods of vector spaces.
+
+Functions pull back by ``c -> point(c)``, the Poisson tensor and the dissipation by the inverse of its derivative
+[EQUATIONS §4, "On a manifold"]: Pi stays a Poisson tensor, K symmetric and semidefinite, and each stays what it was to
+the gradients of the functions. So every law that a method keeps in R^dim it keeps on the manifold.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import manifolds as mf
+
+from ..dissipation import Dissipation, Several
+from ..energy import Energy, Sum
+from .base import System
+
+
+class InChart(Energy):
+    """A function of states, as one of coordinates."""
+
+    energy: Energy
+    coordinates: mf.Coordinates
+    space: mf.Space = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
+
+
+class ChartSystem(System):
+    """The system in coordinates c, shape (dim,).
+
+    Parameters
+    ----------
+    system : System
+        On a manifold.
+    coordinates : manifolds.Coordinates
+    place : manifolds.Place, optional
+        Where Pi and K are taken, in place of the point that they are asked for at.
+    """
+
+    manifold: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+
+    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None = None):
+        assert system.space is not None
+        self.manifold, self.coordinates, self.place = system, coordinates, place
+        self.dim, self.space, self.momentum_maps = system.space.dim, None, {}
+        self.energy = self.pulled(system.energy)
+        self.entropy = None if system.entropy is None else self.pulled(system.entropy)
+        trivial = isinstance(system.poisson, mf.NoPoisson)
+        self.poisson = mf.NoPoisson(self.dim) if trivial else _Poisson(system, coordinates, place)
+        self.momentum_maps = {name: self.pulled(J) for name, J in system.momentum_maps.items()}
+        if system.dissipation is None:
+            self.dissipation = None
+            return
+        known = {id(L): self.pulled(L) for part in _parts(system.dissipation) for L in part.preserve}
+        parts = tuple(
+            _Force(part, tuple(known[id(L)] for L in part.preserve), system, coordinates, place)
+            for part in _parts(system.dissipation)
+        )
+        self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+
+    def pulled(self, energy: Energy) -> Energy:
+        """A function of states as one of coordinates."""
+        assert self.manifold.space is not None
+        terms = tuple(InChart(term, self.coordinates, self.manifold.space) for term in energy.terms)
+        return terms[0] if len(terms) == 1 else Sum(terms)
+
+    @property
+    def smooth(self) -> bool:
+        return self.manifold.smooth
+
+    def here(self, x) -> System:
+        return self if self.place is not None else ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x))
+
+    def field(self, x, dH, dS, dL=()):
+        place = _Place(self.manifold, self.coordinates, self.place, x)
+        dS, dL = None if dS is None else place.lift(dS), tuple(map(place.lift, dL))
+        return place.lower(self.manifold.field(place.state, place.lift(dH), dS, dL))
+
+
+class _Place:
+    """A point given or by its coordinates, and the maps there between arrays of coordinates and of states."""
+
+    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
+        assert system.space is not None
+        self._space, self._place = system.space, coordinates.at(c) if place is None else place
+        self.state = self._space.to_vector(self._place.point)
+
+    def lift(self, alpha):
+        return self._space.to_vector(self._place.lift(alpha).conj())
+
+    def lower(self, v):
+        return self._place.lower(self._space.from_vector(v))
+
+
+class _Poisson(mf.PoissonStructure):
+    system: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+
+    @property
+    def dim(self) -> int:
+        assert self.system.space is not None
+        return self.system.space.dim
+
+    def tensor(self, x):
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
+
+    def sharp(self, x, alpha):
+        place = _Place(self.system, self.coordinates, self.place, x)
+        return place.lower(self.system.poisson.sharp(place.state, place.lift(alpha)))
+
+
+class _Force(Dissipation):
+    part: Dissipation
+    functions: tuple[Energy, ...]
+    system: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+
+    @property
+    def energy_law(self):
+        return self.part.energy_law
+
+    @property
+    def entropy_law(self):
+        return self.part.entropy_law
+
+    @property
+    def preserve(self):
+        return self.functions
+
+    def force(self, system, x, dH, dS, dL):
+        place = _Place(self.system, self.coordinates, self.place, x)
+        dL = tuple(map(place.lift, dL))
+        return place.lower(self.part.force(self.system, place.state, place.lift(dH), place.lift(dS), dL))
+
+
+def _parts(dissipation: Dissipation) -> tuple[Dissipation, ...]:
+    return dissipation.parts if isinstance(dissipation, Several) else (dissipation,)

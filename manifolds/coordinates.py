@@ -1,0 +1,178 @@
+"""Coordinates around a point of a state space: a chart, and the orthonormal frame that its vectors are counted in.
+
+In coordinates c, shape (dim,), a manifold is R^dim: functions of points become functions of c, and tangent vectors and
+covectors at the point of c are taken to R^dim by the derivative of the chart. In products that is done factor by
+factor, so that the work grows with the number of factors and no faster.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .matrix_functions import inverse
+from .retraction import Chart
+from .spaces import Power, Product
+
+
+class Place(NamedTuple):
+    """A point with coordinates c, and what takes vectors there to R^dim and covectors of R^dim there.
+
+    Attributes
+    ----------
+    point : array, shape (..., *shape)
+    lift : function
+        From a covector of R^dim, shape (..., dim), to the ambient covector that is paired with tangent vectors alike.
+    lower : function
+        From a tangent vector, shape (..., *shape), to the velocity of its coordinates, shape (..., dim).
+    """
+
+    point: jax.Array
+    lift: Callable
+    lower: Callable
+
+
+class Coordinates(eqx.Module):
+    """Coordinates c of the points ``chart.point(z, sum_a c_a E_a)`` around z, E the orthonormal frame of z.
+
+    Made by :func:`coordinates_around`.
+    """
+
+    @abstractmethod
+    def point(self, c) -> jax.Array:
+        """The point with the coordinates c, shape (..., *shape)."""
+
+    @abstractmethod
+    def components(self, v) -> jax.Array:
+        """A tangent vector at z in the frame, shape (..., dim): the velocity of c where c = 0."""
+
+    @abstractmethod
+    def vector(self, c) -> jax.Array:
+        """The inverse of :meth:`components`."""
+
+    @abstractmethod
+    def at(self, c) -> Place:
+        """The point with the coordinates c, and the maps of vectors and covectors there."""
+
+    @abstractmethod
+    def centre(self) -> Place:
+        """``at(0)``, where the derivative of the chart is the identity."""
+
+
+def coordinates_around(chart: Chart, z) -> Coordinates:
+    """Coordinates around a point, shape (*space.shape), or around each point of a batch."""
+    if isinstance(chart.space, Product):
+        parts = zip(chart.space.factors, chart.space.split(z), strict=True)
+        return _Joined(chart.space, tuple(coordinates_around(_on(chart, factor), part) for factor, part in parts))
+    if isinstance(chart.space, Power):
+        return _Repeated(chart.space, coordinates_around(_on(chart, chart.space.base), z))
+    return _Plain(chart, z)
+
+
+def _on(chart: Chart, space) -> Chart:
+    """The chart of the same kind on a factor."""
+    return dataclasses.replace(chart, space=space)  # type: ignore[type-var]
+
+
+class _Plain(Coordinates):
+    chart: Chart
+    z: jax.Array
+
+    def point(self, c):
+        return self.chart._point(self.z, self.vector(c))
+
+    def components(self, v):
+        return self.chart.space._coordinates(self.z, v)
+
+    def vector(self, c):
+        return self.chart.space._from_coordinates(self.z, c)
+
+    def at(self, c):
+        space = self.chart.space
+        axes = np.broadcast_to(np.eye(space.dim)[(slice(None), *(None,) * (c.ndim - 1))], (space.dim, *c.shape))
+        x, push = jax.linearize(self.point, c)
+        columns = jax.vmap(lambda axis: space._coordinates(x, push(axis)))(jnp.asarray(axes))
+        back = inverse(jnp.moveaxis(columns, 0, -1))  # of the derivative, in the frames of both ends
+
+        def lift(alpha):
+            return space._flat(x, space._from_coordinates(x, (back.swapaxes(-1, -2) @ alpha[..., None])[..., 0]))
+
+        return Place(x, lift, lambda v: (back @ space._coordinates(x, v)[..., None])[..., 0])
+
+    def centre(self):
+        space = self.chart.space
+        return Place(self.z, lambda alpha: space._flat(self.z, self.vector(alpha)), self.components)
+
+
+class _Joined(Coordinates):
+    space: Product
+    parts: tuple[Coordinates, ...]
+
+    def point(self, c):
+        return self.space.join(*(part.point(own) for part, own in zip(self.parts, self._split(c), strict=True)))
+
+    def components(self, v):
+        return self._rows([part.components(own) for part, own in zip(self.parts, self.space.split(v), strict=True)])
+
+    def vector(self, c):
+        return self.space.join(*(part.vector(own) for part, own in zip(self.parts, self._split(c), strict=True)))
+
+    def at(self, c):
+        return self._join([part.at(own) for part, own in zip(self.parts, self._split(c), strict=True)])
+
+    def centre(self):
+        return self._join([part.centre() for part in self.parts])
+
+    def _join(self, places: list[Place]) -> Place:
+        def lift(alpha):
+            return self.space.join(*(p.lift(own) for p, own in zip(places, self._split(alpha), strict=True)))
+
+        def lower(v):
+            return self._rows([p.lower(own) for p, own in zip(places, self.space.split(v), strict=True)])
+
+        return Place(self.space.join(*(p.point for p in places)), lift, lower)
+
+    def _split(self, c):
+        return jnp.split(c, np.cumsum([factor.dim for factor in self.space.factors])[:-1], axis=-1)
+
+    @staticmethod
+    def _rows(parts):
+        return jnp.concatenate(parts, axis=-1)
+
+
+class _Repeated(Coordinates):
+    """The copies are a batch of the base."""
+
+    space: Power
+    base: Coordinates
+
+    def point(self, c):
+        return self.base.point(self._split(c))
+
+    def components(self, v):
+        return self._row(self.base.components(v))
+
+    def vector(self, c):
+        return self.base.vector(self._split(c))
+
+    def at(self, c):
+        return self._join(self.base.at(self._split(c)))
+
+    def centre(self):
+        return self._join(self.base.centre())
+
+    def _join(self, place: Place) -> Place:
+        return Place(place.point, lambda alpha: place.lift(self._split(alpha)), lambda v: self._row(place.lower(v)))
+
+    def _split(self, c):
+        return c.reshape(*c.shape[:-1], self.space.count, self.space.base.dim)
+
+    def _row(self, c):
+        return c.reshape(*c.shape[:-2], self.space.dim)

@@ -1,0 +1,426 @@
+"""Any geomstats manifold with a metric as a state space, through a callback to the host.
+
+geomstats runs in NumPy: a compiled program stops at every call and hands it the arrays. That makes such a space a
+hundred or more times slower than a native one, and confines it to the CPU and the array engine. Batches go over in one
+call.
+
+Derivatives, forward and reverse, are central differences of order 8 on the host, over geodesics where a point varies:
+right to about 1e-12 for the closed forms of geomstats, to less for its numerical solvers. There are none of second
+order.
+
+geomstats is imported by :func:`from_geomstats`, not before.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .errors import ParameterError, SpaceError
+from .matrix_functions import solve
+from .spaces.base import CUT_MARGIN, MEMBERSHIP_TOLERANCE, Space, random_key
+from .symmetric import cholesky, solve_lower
+
+_STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+"""Weights of f(x + k h) - f(x - k h) in h f'(x), to order 8."""
+
+_STEP = 0.02
+"""Of the differences, as a length in the metric: the error h^8 f^(9)/630 is below the rounding eps/h for smooth f."""
+
+
+def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsSpace:
+    """A geomstats manifold, equipped with a metric, as a state space.
+
+    Parameters
+    ----------
+    space : geomstats Manifold
+        For example ``Hypersphere(2)`` or ``PoincareBall(2)``, with points of its own kind: see ``space.shape``.
+    injectivity_radius : float, optional
+        By default what the metric says, and infinite where it does not know; for SO(n) and SE(n) pi and sqrt(2) pi, as
+        geomstats 2.8 gives them larger than they are.
+
+    Raises
+    ------
+    SpaceError
+        If it is not a geomstats manifold, has no metric, or its metric no exponential or logarithm; if its points are
+        complex, or geomstats runs with a backend other than NumPy.
+    """
+    from geomstats import backend
+    from geomstats.geometry.complex_manifold import ComplexManifold
+    from geomstats.geometry.manifold import Manifold
+
+    if isinstance(space, ComplexManifold):
+        raise SpaceError(f"{_name(space)} has complex points, which are not supported")
+
+    if not isinstance(space, Manifold):
+        raise SpaceError(f"from_geomstats takes a geomstats manifold, not {type(space).__name__}")
+    if not backend.__name__.endswith("numpy"):
+        raise SpaceError(f"geomstats runs with the backend {backend.__name__}: set GEOMSTATS_BACKEND=numpy")
+    if getattr(space, "metric", None) is None:
+        raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
+    if injectivity_radius is not None and not injectivity_radius > 0.0:
+        raise ParameterError(f"an injectivity radius is positive, not {injectivity_radius!r}")
+    found = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
+    for kernel in ("exp", "log", "inner", "project_tangent"):
+        found._need(kernel)
+    return found
+
+
+@jax.tree_util.register_static
+class GeomstatsSpace(Space):
+    """A geomstats manifold as a state space, made by :func:`from_geomstats`.
+
+    Attributes
+    ----------
+    source : geomstats Manifold
+    """
+
+    smooth = False
+
+    def __init__(self, source, radius: float | None):
+        self.source, self._radius = source, radius
+        self.metric = type(source.metric).__name__
+        self._present: set[str] = set()
+
+    @property
+    def name(self):
+        return _name(self.source)
+
+    @property
+    def dim(self):
+        return int(self.source.dim)
+
+    @property
+    def shape(self):
+        return tuple(int(n) for n in self.source.shape)
+
+    def random(self, key_or_seed, size=()) -> jax.Array:
+        """Points from geomstats' own distribution, shape (*size, *shape); not under tracing."""
+        seed = int(jax.random.randint(random_key(key_or_seed), (), 0, 2**31 - 1))
+        state = np.random.get_state()  # noqa: NPY002
+        try:
+            np.random.seed(seed)  # noqa: NPY002  geomstats draws from NumPy's global generator
+            points = self.source.random_point(n_samples=math.prod(size))
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
+        return jnp.asarray(points, dtype=jnp.float64).reshape(*size, *self.shape)
+
+    def injectivity_radius(self, x=None):
+        if self._radius is not None:
+            return self._radius
+        x = self.source.random_point() if x is None else x
+        return float(self._on_host("radius", np.asarray(x, dtype=float)[None])[0])
+
+    def _random(self, key, size):
+        raise SpaceError(f"{self.name} draws its random points outside of compiled programs")
+
+    def _residual(self, x):
+        return self._call("residual", x)
+
+    def _project(self, x):
+        return self._call("project", x)
+
+    def _project_tangent(self, x, w):
+        return self._call("project_tangent", x, w)
+
+    def _inner(self, x, u, v):
+        return self._call("inner", x, u, v)
+
+    def _exp(self, x, v):
+        return self._call("exp", x, v)
+
+    def _log(self, x, y):
+        return _log(self, *jnp.broadcast_arrays(x, y))
+
+    def _distance(self, x, y):
+        return self._call("distance", x, y)
+
+    def _transport(self, x, v, u):
+        return self._call("transport", x, v, u)
+
+    def _flat(self, x, v):
+        """The inner products with the projected axes."""
+        x, v = self._over_frame(x), self._over_frame(v)
+        values = self._inner(x, v, self._project_tangent(x, self._axis_vectors))
+        return values.reshape(*values.shape[:-1], *self.shape)
+
+    def _frame(self, x):
+        """Gram-Schmidt on the projections of axes, as many as the space has dimensions, chosen for independence."""
+        chosen = jnp.asarray(self._axis_vectors)[_independent_axes(self, x)]
+        base = self._over_frame(x)
+        vectors = self._project_tangent(base, chosen)
+        left, right = jnp.expand_dims(vectors, -2 - len(self.shape)), self._over_frame(vectors)
+        gram = self._inner(self._over_frame(base), left, right)
+        rows = solve_lower(cholesky(gram), vectors.reshape(*gram.shape[:-1], -1))
+        return rows.reshape(vectors.shape)
+
+    def _coordinates(self, x, v):
+        return self._inner(self._over_frame(x), self._frame(x), self._over_frame(v))
+
+    def _reach(self, x, v):
+        radius = self._call("radius", x) if self._radius is None else self._radius
+        return self._norm(x, v) / radius
+
+    def _why_no_log(self, x, y):
+        return (
+            "geomstats found no logarithm, or one that its own exponential map does not lead back from, or one not "
+            f"within the injectivity radius {self.injectivity_radius(x):.6g}; go by a point between them"
+        )
+
+    # -- calls to the host ----------------------------------------------------------------------------------------
+
+    @property
+    def _axis_vectors(self) -> np.ndarray:
+        return np.eye(math.prod(self.shape)).reshape(-1, *self.shape)
+
+    def _call(self, kernel: str, *arrays):
+        self._need(kernel)
+        return _call(self, kernel, jnp.broadcast_arrays(*arrays))
+
+    def _need(self, kernel: str) -> None:
+        """Raise unless geomstats has what a kernel calls, found out at a random point."""
+        if kernel in self._present:
+            return
+        x = np.asarray(self.source.random_point(), dtype=float)[None]
+        try:
+            _KERNELS[kernel](self, *({"v": 0.0 * x}.get(kind, x) for kind in _SIGNATURES[kernel][0]))
+        except (NotImplementedError, AttributeError, TypeError, ValueError) as error:
+            raise SpaceError(f"{self.name} with {self.metric} has no {kernel.replace('_', ' ')}: {error}") from None
+        self._present.add(kernel)
+
+    def _core(self, kernel: str) -> tuple[int, ...]:
+        """Shape of the result for one point."""
+        return self.shape if _SIGNATURES[kernel][1] == "array" else ()
+
+    def _on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
+        """A kernel on arrays of shape (count, *shape): all at once, or one by one where some are refused."""
+        count = len(arrays[0])
+        try:
+            with np.errstate(all="ignore"), warnings.catch_warnings():  # what comes of it is looked at
+                warnings.simplefilter("ignore")
+                return np.asarray(_KERNELS[kernel](self, *arrays), dtype=float).reshape(count, *self._core(kernel))
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            if count == 1:
+                return np.full((1, *self._core(kernel)), np.nan)
+            return np.concatenate([self._on_host(kernel, *(a[i : i + 1] for a in arrays)) for i in range(count)])
+
+    def _jacobian_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
+        """Derivatives by all entries of all arguments, shape (count, size of the result, number of entries)."""
+        columns = [
+            self._derivative(kernel, arrays, k, np.broadcast_to(axis, arrays[k].shape))
+            for k in range(len(arrays))
+            for axis in self._axis_vectors
+        ]
+        return np.stack(columns, axis=-1)
+
+    def _derivative(self, kernel: str, arrays, k: int, direction: np.ndarray) -> np.ndarray:
+        """Derivative along a direction of the k-th argument, shape (count, size of the result)."""
+        kind, length = _SIGNATURES[kernel][0][k], np.ones(len(direction))
+        if kind != "a":
+            x = arrays[k if kind == "p" else 0]
+            direction = self._on_host("project_tangent", x, direction)
+            length = np.sqrt(np.maximum(self._on_host("inner", x, direction, direction), 0.0))
+        unit = direction / np.where(length > 0.0, length, 1.0).reshape(-1, *(1,) * len(self.shape))
+        total = np.zeros((len(direction), math.prod(self._core(kernel))))
+        for offset, weight in _STENCIL.items():
+            after, before = (
+                self._on_host(kernel, *self._moved(kernel, arrays, k, sign * offset * _STEP * unit)) for sign in (1, -1)
+            )
+            total += weight * (after - before).reshape(total.shape)
+        return total / _STEP * length[:, None]
+
+    def _moved(self, kernel: str, arrays, k: int, shift: np.ndarray) -> list[np.ndarray]:
+        """The arguments with the k-th moved: a point along a geodesic, taking the tangent vectors at it along."""
+        kinds, moved = _SIGNATURES[kernel][0], list(arrays)
+        if kinds[k] != "p":
+            moved[k] = moved[k] + shift
+            return moved
+        moved[k] = self._on_host("exp", moved[k], shift)
+        if k == 0:
+            tangent = [i for i, kind in enumerate(kinds) if kind == "v"]
+            for i in tangent:
+                moved[i] = self._on_host("project_tangent", moved[0], moved[i])
+        return moved
+
+
+# -- what geomstats computes, on arrays of shape (count, *shape) --------------------------------------------------
+
+
+def _checked_log(space: GeomstatsSpace, x, y):
+    """The logarithm, NaN where it does not lead to y or is too long: solvers that fail return numbers all the same."""
+    axes = tuple(range(1, x.ndim))
+    v = np.array(space.source.metric.log(y, x), dtype=float)
+    miss = np.abs(space.source.metric.exp(v, x) - y).max(axis=axes) / np.maximum(np.abs(y).max(axis=axes), 1.0)
+    length = np.sqrt(space.source.metric.inner_product(v, v, x))
+    radius = _radius(space, x) if space._radius is None else space._radius
+    v[~((miss <= 1e-6) & (length < radius * (1.0 - CUT_MARGIN)))] = np.nan
+    return v
+
+
+def _radius(space: GeomstatsSpace, x):
+    return np.array([float(np.squeeze(space.source.metric.injectivity_radius(point))) for point in x])
+
+
+def _residual(space: GeomstatsSpace, x):
+    """What the equations of the space leave, or the distance to the projection, relative; infinite without either."""
+    axes = tuple(range(1, x.ndim))
+    size = np.maximum(np.abs(x).max(axis=axes), 1.0)
+    inside = np.array([np.all(space.source.belongs(point, atol=MEMBERSHIP_TOLERANCE)) for point in x])
+    rest = np.where(inside, 0.0, np.inf)
+    if hasattr(space.source, "submersion"):
+        rest = np.abs(np.asarray(space.source.submersion(x))).reshape(len(x), -1).max(axis=1) / size**2
+    elif not inside.all():
+        try:
+            moved = np.abs(space.source.projection(x) - x).max(axis=axes) / size
+            rest = np.where(inside, 0.0, np.where(moved > MEMBERSHIP_TOLERANCE, moved, np.inf))
+        except (NotImplementedError, AttributeError):
+            pass
+    return np.where(np.isfinite(x).all(axis=axes), rest, np.nan)
+
+
+_SIGNATURES = {
+    # kernel: its arguments (p a point, v a vector tangent at the first one, a any array) and its result
+    "exp": ("pv", "array"),
+    "log": ("pp", "array"),
+    "transport": ("pvv", "array"),
+    "project_tangent": ("pa", "array"),
+    "project": ("a", "array"),
+    "inner": ("pvv", "scalar"),
+    "distance": ("pp", "scalar"),
+    "radius": ("p", "scalar"),
+    "residual": ("a", "scalar"),
+}
+
+_KERNELS: dict[str, Callable] = {
+    "exp": lambda space, x, v: space.source.metric.exp(v, x),
+    "log": _checked_log,
+    "transport": lambda space, x, v, u: space.source.metric.parallel_transport(u, x, direction=v),
+    "project_tangent": lambda space, x, w: space.source.to_tangent(w, x),
+    "project": lambda space, x: space.source.projection(x),
+    "inner": lambda space, x, u, v: space.source.metric.inner_product(u, v, x),
+    "distance": lambda space, x, y: space.source.metric.dist(x, y),
+    "radius": _radius,
+    "residual": _residual,
+}
+
+
+# -- callbacks ----------------------------------------------------------------------------------------------------
+
+
+def _callback(space: GeomstatsSpace, function: Callable, core: tuple[int, ...], dtype, arrays):
+    """``function`` on the host, of arrays with one batch axis, as part of a JAX program with any."""
+    batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
+
+    def on_host(*arrays):
+        leading = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
+        result = function(*(np.asarray(a).reshape(-1, *space.shape) for a in arrays))
+        return result.reshape((*leading, *core)).astype(dtype)
+
+    return jax.pure_callback(
+        on_host, jax.ShapeDtypeStruct((*batch, *core), dtype), *arrays, vmap_method="broadcast_all"
+    )
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _call(space: GeomstatsSpace, kernel: str, arrays):
+    return _callback(space, partial(space._on_host, kernel), space._core(kernel), np.float64, arrays)
+
+
+@_call.defjvp
+def _call_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
+    (arrays,), (moves,) = primals, tangents
+    value = _call(space, kernel, arrays)
+    jacobian = _jacobian(space, kernel, arrays)
+    entries = jnp.concatenate([move.reshape(*jacobian.shape[:-2], -1) for move in moves], axis=-1)
+    return value, jnp.einsum("...ij,...j->...i", jacobian, entries).reshape(value.shape)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _log(space: GeomstatsSpace, x, y):
+    return space._call("log", x, y)
+
+
+@_log.defjvp
+def _log_derivative(space: GeomstatsSpace, primals, tangents):
+    """From ``exp(x, v) = y``: a logarithm may be the result of an iteration, which differences would only blur.
+
+    As x moves by x', v moves with the tangent space, by D, and in it, by the combination of frame vectors that makes
+    ``d_v exp (D + frame c) + d_x exp x' = y'``.
+    """
+    (x, y), (dx, dy) = primals, tangents
+    v, size = _log(space, x, y), math.prod(space.shape)
+
+    def rows(a):
+        return a.reshape(*a.shape[: a.ndim - len(space.shape)], size)
+
+    of_exp, of_projection = (_jacobian(space, kernel, [x, v]) for kernel in ("exp", "project_tangent"))
+    dx, frame = rows(dx), space._frame(x)
+    along = jnp.einsum("...ij,...aj->...ai", of_exp[..., size:], rows(frame))
+    rest = rows(dy) - jnp.einsum(
+        "...ij,...j->...i", of_exp[..., :size], dx
+    )  # exp projects what it is handed, hence no D
+    dual = rows(space._flat(space._over_frame(y), space._frame(y)))
+    matrix = jnp.einsum("...bi,...ai->...ba", dual, along)
+    c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, rest)[..., None])[..., 0]
+    dv = jnp.einsum("...ij,...j->...i", of_projection[..., :size], dx).reshape(v.shape)
+    return v, dv + (c.reshape(*c.shape, *(1,) * len(space.shape)) * frame).sum(axis=-1 - len(space.shape))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
+    core = (math.prod(space._core(kernel)), len(arrays) * math.prod(space.shape))
+    return _callback(space, partial(space._jacobian_on_host, kernel), core, np.float64, arrays)
+
+
+@_jacobian.defjvp
+def _no_second_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
+    raise SpaceError(f"{space.name}: {kernel} has first derivatives only, as they are differences taken on the host")
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _independent_axes(space: GeomstatsSpace, x):
+    """The axes, shape (dim,), whose projections to the tangent space at x make the best basis: pivoted Gram-Schmidt."""
+    return _callback(space, partial(_pivots, space), (space.dim,), np.int64, [x])
+
+
+@_independent_axes.defjvp
+def _constant(space: GeomstatsSpace, primals, tangents):
+    chosen = _independent_axes(space, *primals)
+    return chosen, np.zeros(chosen.shape, jax.dtypes.float0)
+
+
+def _pivots(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
+    rows = []
+    for point in x:
+        axes = space._axis_vectors
+        points = np.broadcast_to(point, axes.shape)
+        vectors = space._on_host("project_tangent", points, axes).reshape(len(axes), -1)
+        chosen: list[int] = []
+        for _ in range(space.dim):
+            chosen.append(int((vectors**2).sum(axis=1).argmax()))
+            direction = vectors[chosen[-1]] / np.linalg.norm(vectors[chosen[-1]])
+            vectors = vectors - np.outer(vectors @ direction, direction)
+        rows.append(chosen)
+    return np.array(rows).reshape(len(x), space.dim)
+
+
+def _known_radius(space) -> float | None:
+    """The injectivity radius where it is the same everywhere, infinity where geomstats does not know it."""
+    corrected = {"BiInvariantMetric": math.pi, "SpecialEuclideanMatricesCanonicalLeftMetric": math.sqrt(2.0) * math.pi}
+    if (kind := type(space.metric).__name__) in corrected:
+        return corrected[kind]
+    try:
+        radii = [float(np.squeeze(space.metric.injectivity_radius(space.random_point()))) for _ in range(2)]
+    except (NotImplementedError, AttributeError):
+        return math.inf
+    return radii[0] if radii[0] == radii[1] else None
+
+
+def _name(space) -> str:
+    return f"geomstats {type(space).__name__.strip('_')}({space.dim})"

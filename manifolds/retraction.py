@@ -1,0 +1,406 @@
+"""Retraction maps R_h: TP -> P x P and their inverses: finite differences on a manifold [BFM §4.4].
+
+A tangent vector v at z becomes the pair of points that a step h with velocity v leads from and to. Two choices make a
+retraction: a *chart* ``v -> point(z, v)`` of the space around z, with ``point(z, 0) = z`` and derivative the identity
+there, and the place of z in the step. At its start, ``R_h(z, v) = (z, point(z, h v))``, as every chart here does by
+itself; in its middle, ``(point(z, -h v/2), point(z, h v/2))``, as in :class:`MidpointRetraction`.
+
+All maps can be jitted, vmapped and differentiated. A step that leaves the domain raises; under tracing, where values
+cannot be looked at, ask :meth:`Retraction.reach`, which must be below 1.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._arrays import at, first, is_traced
+from .errors import DomainError, ParameterError, SpaceError
+from .spaces.base import Space, run
+
+
+class Retraction(ABC):
+    """A map ``R_h(z, v) -> (x, y)`` on a state space, with its inverse.
+
+    Attributes
+    ----------
+    space : Space
+    chart : Chart
+        The chart it is made with: itself, unless it is a :class:`MidpointRetraction`.
+    order : float
+        The largest p with ``R_1(z, v)`` within O(\\|v\\|^(p+1)) of what the Riemannian exponential gives in its place;
+        infinite where they are equal.
+    symmetric : bool
+        Whether ``R_h(z, -v)`` is ``R_h(z, v)`` with its two points exchanged.
+    """
+
+    space: Space
+    chart: Chart
+    symmetric: bool
+
+    @property
+    @abstractmethod
+    def order(self) -> float: ...
+
+    def __call__(self, z, v, h=1.0) -> tuple[jax.Array, jax.Array]:
+        """``R_h(z, v)``: the points x and y that the step leads from and to.
+
+        Parameters
+        ----------
+        z : array, shape (..., *space.shape)
+            Base point.
+        v : array, shape (..., *space.shape)
+            Tangent vector at z: a velocity, where h is a time.
+        h : float
+
+        Returns
+        -------
+        x, y : array, shape (..., *space.shape)
+
+        Raises
+        ------
+        DomainError
+            If h v is so long that the inverse would not give it back. Not checked under tracing.
+        OffManifoldError
+        """
+        z, v = self._step(z, v, h)
+        reach = run(self, "_reach", (), z, v)
+        if not is_traced(reach) and (index := first(~np.asarray(reach < 1.0))) is not None:
+            radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
+            raise DomainError(
+                f"{self}: the step h v{at(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
+                f"(injectivity radius of the space {radius:.6g}): take a smaller step"
+            )
+        return run(self, "_ends", (), z, v)
+
+    def inverse(self, x, y, h=1.0) -> tuple[jax.Array, jax.Array]:
+        """``R_h^-1(x, y)``: the base point z and the tangent vector v there that the step from x to y comes from.
+
+        Parameters
+        ----------
+        x, y : array, shape (..., *space.shape)
+        h : float
+
+        Returns
+        -------
+        z, v : array, shape (..., *space.shape)
+
+        Raises
+        ------
+        DomainError
+            If no step leads from x to y inside the domain. Under tracing the result is NaN instead.
+        OffManifoldError
+        """
+        x, y = self.space._checked_point(x, "x"), self.space._checked_point(y, "y")
+        z, v = run(self, "_base", (), x, y)
+        self.space._refuse_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
+        return z, v / h
+
+    def reach(self, z, v, h=1.0) -> jax.Array:
+        """Length of h v relative to the domain of the inverse, shape (...): a step is valid where it is below 1."""
+        return run(self, "_reach", (), *self._step(z, v, h))
+
+    @abstractmethod
+    def _ends(self, z, v): ...
+
+    @abstractmethod
+    def _base(self, x, y): ...
+
+    @abstractmethod
+    def _reach(self, z, v): ...
+
+    def _step(self, z, v, h):
+        z, v = self.space._checked_vectors(z, "z", v=v)
+        return z, h * v
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.space.name})"
+
+
+class Chart(Retraction):
+    """A retraction with its base point at the start of the step: ``R_h(z, v) = (z, point(z, h v))``."""
+
+    symmetric = False
+
+    @property
+    def chart(self) -> Chart:  # type: ignore[override]
+        return self
+
+    def point(self, z, v) -> jax.Array:
+        """The point of the space that the chart around z gives the tangent vector v, shape (..., *space.shape).
+
+        Defined beyond the domain of :meth:`vector` too.
+        """
+        return run(self, "_point", (), *self._step(z, v, 1.0))
+
+    def vector(self, z, x) -> jax.Array:
+        """The tangent vector at z that the chart gives the point x: the inverse of :meth:`point`.
+
+        Raises
+        ------
+        DomainError
+            Outside its domain. Under tracing the result is NaN instead.
+        """
+        return self.inverse(z, x)[1]
+
+    def differential(self, z, v, w) -> jax.Array:
+        """Derivative of ``v -> point(z, v)`` along w: a tangent vector at ``point(z, v)``."""
+        return run(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
+
+    def carry(self, z, v, u) -> jax.Array:
+        """The tangent vector u at z, taken along to ``x = point(z, v)``: such that ``point(x, -carry(z, v, v))`` is z.
+
+        Parallel transport with the Riemannian chart, the same left-trivialised velocity with those of groups. With
+        ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
+        """
+        return run(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
+
+    @abstractmethod
+    def _point(self, z, v): ...
+
+    @abstractmethod
+    def _vector(self, z, x): ...
+
+    @abstractmethod
+    def _middle(self, x, y):
+        """The z with ``vector(z, x) = -vector(z, y)``."""
+
+    @abstractmethod
+    def _carry(self, z, v, u): ...
+
+    @abstractmethod
+    def _midpoint_reach(self, z, v):
+        """Reach of the step v with z in its middle."""
+
+    def _differential(self, z, v, w):
+        v, w = jnp.broadcast_arrays(v, w)
+        return jax.jvp(lambda v: self._point(z, v), (v,), (w,))[1]
+
+    def _ends(self, z, v):
+        y = self._point(z, v)
+        return jnp.broadcast_to(z, y.shape), y
+
+    def _base(self, x, y):
+        v = self._vector(x, y)
+        return jnp.broadcast_to(x, v.shape), v
+
+    def __post_init__(self):
+        if not isinstance(self.space, Space):
+            raise SpaceError(f"{type(self).__name__} is made for a state space, not for {type(self.space).__name__}")
+        like = jax.ShapeDtypeStruct(self.space.shape, self.space.dtype)
+        for kernel in ("_point", "_vector", "_reach"):  # a space that lacks one refuses here
+            jax.eval_shape(getattr(self, kernel), like, like)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class RiemannianRetraction(Chart):
+    """``R_h(z, v) = (z, exp_z(h v))`` with the exponential map of the metric [BFM §4.4].
+
+    On every space. The domain is the ball of the injectivity radius.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf
+
+    def _point(self, z, v):
+        return self.space._exp(z, v)
+
+    def _vector(self, z, x):
+        return self.space._log(z, x)
+
+    def _middle(self, x, y):
+        return self.space._midpoint(x, y)
+
+    def _carry(self, z, v, u):
+        return self.space._transport(z, v, u)
+
+    def _reach(self, z, v):
+        return self.space._reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return self.space._reach(z, v)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class EuclideanRetraction(Chart):
+    """``R_h(z, v) = (z, z + h v)``, on spaces that are open sets of arrays: Euclidean ones, SPD(n) and their products.
+
+    On SPD(n) the step is bounded to length 1 in the affine-invariant metric, where z + h v is positive definite for
+    sure.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf if self.space.bi_invariant else 1
+
+    def _point(self, z, v):
+        return z + v
+
+    def _vector(self, z, x):
+        return x - z
+
+    def _middle(self, x, y):
+        return 0.5 * (x + y)
+
+    def _carry(self, z, v, u):
+        return u + jnp.zeros_like(v)
+
+    def _reach(self, z, v):
+        return self.space._straight_reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return 0.5 * self.space._straight_reach(z, v)
+
+
+class _GroupChart(Chart):
+    def _middle(self, x, y):
+        return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
+
+    def _carry(self, z, v, u):
+        return self.space._left_carry(z, self._point(z, v), u)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class GroupRetraction(_GroupChart):
+    """``R_h(z, v) = (z, z exp(h z^-1 v))`` with the exponential of the group, on groups and their products.
+
+    On SO(n) and SU(n) it is the Riemannian one. On SE(n) it follows screw motions, to first order the same.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf if self.space.bi_invariant else 1
+
+    def _point(self, z, v):
+        return self.space._group_exp(z, v)
+
+    def _vector(self, z, x):
+        return self.space._group_log(z, x)
+
+    def _reach(self, z, v):
+        return self.space._reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return self.space._reach(z, v)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class CayleyRetraction(_GroupChart):
+    """``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups with a Cayley map and their products: not SU(n) with n > 2.
+
+    Rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers all of the group
+    but the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
+    turn.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return 2 if self.space.bi_invariant else 1
+
+    def _point(self, z, v):
+        return self.space._cayley(z, v)
+
+    def _vector(self, z, x):
+        return self.space._inverse_cayley(z, x)
+
+    def _reach(self, z, v):
+        return 0.0 * self.space._reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return math.pi / 4.0 * self.space._reach(z, v)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class MidpointRetraction(Retraction):
+    """``R_h(z, v) = (point(z, -h v/2), point(z, h v/2))``, with z in the middle of the step [BFM 4.8].
+
+    With the Riemannian chart this is the paper's ``exp~_h``, and z the midpoint of the geodesic from x to y.
+
+    Parameters
+    ----------
+    chart : Chart
+    """
+
+    chart: Chart
+    symmetric = True
+
+    def __post_init__(self):
+        if not isinstance(self.chart, Chart):
+            raise SpaceError(
+                f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
+            )
+
+    @property
+    def space(self) -> Space:  # type: ignore[override]
+        return self.chart.space
+
+    @property
+    def order(self):
+        return self.chart.order
+
+    def _ends(self, z, v):
+        return self.chart._point(z, -0.5 * v), self.chart._point(z, 0.5 * v)
+
+    def _base(self, x, y):
+        z = self.chart._middle(x, y)
+        return z, self.chart._vector(z, y) - self.chart._vector(z, x)
+
+    def _reach(self, z, v):
+        return self.chart._midpoint_reach(z, v)
+
+    def __repr__(self) -> str:
+        return f"MidpointRetraction({self.chart!r})"
+
+
+_BY_NAME: dict[str, Callable[[Space], Retraction]] = {
+    "midpoint": lambda space: MidpointRetraction(RiemannianRetraction(space)),
+    "exp": RiemannianRetraction,
+    "euclidean": EuclideanRetraction,
+    "group_exp": GroupRetraction,
+    "cayley": CayleyRetraction,
+    "midpoint_euclidean": lambda space: MidpointRetraction(EuclideanRetraction(space)),
+    "midpoint_group_exp": lambda space: MidpointRetraction(GroupRetraction(space)),
+    "midpoint_cayley": lambda space: MidpointRetraction(CayleyRetraction(space)),
+}
+
+
+def retraction(space: Space, kind: str = "midpoint") -> Retraction:
+    """A retraction of a space by name.
+
+    Parameters
+    ----------
+    space : Space
+    kind : str
+        ``"midpoint"`` is the paper's (4.8), with the Riemannian chart. ``"exp"``, ``"euclidean"``, ``"group_exp"`` and
+        ``"cayley"`` have their base point at the start of the step; ``"midpoint_euclidean"``, ``"midpoint_group_exp"``
+        and ``"midpoint_cayley"`` have it in the middle.
+
+    Raises
+    ------
+    SpaceError
+        If the space does not have what it takes, such as a group structure.
+    ParameterError
+    """
+    if kind not in _BY_NAME:
+        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(_BY_NAME)}")
+    return _BY_NAME[kind](space)

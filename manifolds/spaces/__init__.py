@@ -1,0 +1,26 @@
+"""State spaces: Riemannian manifolds with their geodesics in JAX, one abstraction and its native instances."""
+
+from .base import Space, registered_spaces
+from .euclidean import Euclidean
+from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
+from .hyperbolic import Hyperbolic
+from .product import Power, Product
+from .spd import SPD
+from .sphere import Sphere
+from .stiefel import Stiefel
+
+__all__ = [
+    "SPD",
+    "Euclidean",
+    "GroupSpace",
+    "Hyperbolic",
+    "Power",
+    "Product",
+    "Space",
+    "SpecialEuclidean",
+    "SpecialOrthogonal",
+    "SpecialUnitary",
+    "Sphere",
+    "Stiefel",
+    "registered_spaces",
+]

@@ -1,0 +1,487 @@
+"""What a state space is: points, tangent vectors, a metric and its geodesics."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._arrays import as_numeric, at, first, is_traced
+from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError, SpaceError
+from ..lie_group import MEMBERSHIP_TOLERANCE
+
+__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "registered_spaces", "safe_sqrt"]
+
+CUT_MARGIN = 1e-8
+"""A logarithm is taken up to this relative distance from the cut locus; beyond, its direction is decided by noise."""
+
+_registry: list[tuple[Callable[..., Space], tuple]] = []
+
+
+def register(*arguments: tuple):
+    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+
+    def remember(constructor):
+        _registry.extend((constructor, a) for a in arguments)
+        return constructor
+
+    return remember
+
+
+def registered_spaces() -> Iterator[Space]:
+    """One instance after another of every registered state space."""
+    for constructor, arguments in _registry:
+        yield constructor(*arguments)
+
+
+class Space(ABC):
+    """A Riemannian manifold in an ambient space of arrays; leading axes of all arguments are batches, and broadcast.
+
+    A point is an array of the given shape, a tangent vector at it an array of the same shape, with the components of
+    its velocity in the ambient space. A covector, such as the gradient that ``jax.grad`` takes of a function of the
+    ambient array, is paired with a tangent vector by ``Re sum(alpha * v)``.
+
+    All maps can be jitted, vmapped and differentiated. What they are handed is checked, and they raise where they are
+    not defined; under tracing, where values cannot be looked at, they return NaN instead.
+
+    A subclass is a frozen dataclass. It gives the abstract members and may replace the others; each is a plain JAX
+    function of arrays already checked.
+
+    Attributes
+    ----------
+    name, metric : str
+        The space, and its metric in words.
+    dim : int
+    shape : tuple of int
+        Of a point.
+    dtype : numpy.dtype
+        Of a point: float64 or complex128.
+    """
+
+    metric: str
+    bi_invariant: bool = False
+    """Whether the space is a group whose exponential is the Riemannian one."""
+    smooth: bool = True
+    """Whether its maps have derivatives of every order, not of the first alone."""
+    dtype: np.dtype = np.dtype(np.float64)
+
+    @property
+    @abstractmethod
+    def name(self) -> str: ...
+
+    @property
+    @abstractmethod
+    def dim(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]: ...
+
+    # -- points ---------------------------------------------------------------------------------------------------
+
+    def point(self, x, project: bool = False, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
+        """``x`` as a point of the space, or a batch of points, shape (..., *shape).
+
+        Parameters
+        ----------
+        x : array, shape (..., *shape)
+        project : bool
+            Move it to the space first (see :meth:`project`), however far away it is.
+        tolerance : float
+            Largest residual (see :meth:`residual`) that passes.
+
+        Raises
+        ------
+        OffManifoldError
+            If x is off the space; the message names the residual and the tolerance. Not checked under tracing.
+        ShapeError, ComponentError
+        """
+        return self._checked_point(self.project(x) if project else self._array(x, "x"), "x", tolerance)
+
+    def residual(self, x) -> jax.Array:
+        """Distance from the space relative to the size of x, to the order of magnitude, shape (...)."""
+        return self._compiled("_residual", self._array(x, "x"))
+
+    def belongs(self, x, tolerance: float = 1e-10) -> jax.Array:
+        """Whether each point lies on the space: ``residual(x) <= tolerance``, shape (...)."""
+        return self.residual(x) <= tolerance
+
+    def project(self, x) -> jax.Array:
+        """A point of the space near x, the nearest one where that has a simple form, shape (..., *shape).
+
+        Raises
+        ------
+        DomainError
+            If there is none, as for the centre of a sphere.
+        """
+        x = self._array(x, "x")
+        y = self._compiled("_project", x)
+        if (index := self._first_nan(y, len(self.shape))) is not None:
+            raise DomainError(f"{self.name}: no point of the space is nearest to x{at(index)}")
+        return y
+
+    def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
+        """Random points, shape (*size, *shape): uniform on a compact space, within a few units of a centre otherwise.
+
+        Parameters
+        ----------
+        key_or_seed : JAX random key, or int
+        size : tuple of int
+        """
+        return self._compiled("_random", random_key(key_or_seed), static=(tuple(size),))
+
+    @property
+    def size(self) -> int:
+        """Number of real components of a point."""
+        return math.prod(self.shape) * (2 if self.dtype.kind == "c" else 1)
+
+    def to_vector(self, x) -> jax.Array:
+        """Points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary ones."""
+        x = self._array(x, "x")
+        rows = x.reshape(*x.shape[: x.ndim - len(self.shape)], -1)
+        return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
+
+    def from_vector(self, x) -> jax.Array:
+        """The inverse of :meth:`to_vector`, shape (..., *shape)."""
+        x = jnp.asarray(as_numeric(x, "x"))
+        if x.shape[-1:] != (self.size,):
+            raise ShapeError(f"x must have last axis {self.size} for {self.name}, but its shape is {x.shape}")
+        if self.dtype.kind == "c":
+            real, imaginary = jnp.split(x, 2, axis=-1)
+            x = real + 1j * imaginary
+        return x.reshape(*x.shape[:-1], *self.shape)
+
+    # -- tangent vectors ------------------------------------------------------------------------------------------
+
+    def project_tangent(self, x, w) -> jax.Array:
+        """The tangent vector at x nearest to the ambient array w in the Euclidean sense, shape (..., *shape)."""
+        return self._compiled("_project_tangent", self._checked_point(x, "x"), self._array(w, "w"))
+
+    def random_tangent(self, key_or_seed, x, scale: float = 1.0) -> jax.Array:
+        """Random tangent vectors at x, their components in a frame normal with standard deviation ``scale``."""
+        x = self._checked_point(x, "x")
+        batch = x.shape[: x.ndim - len(self.shape)]
+        return self.from_coordinates(x, scale * jax.random.normal(random_key(key_or_seed), (*batch, self.dim)))
+
+    def frame(self, x) -> jax.Array:
+        """An orthonormal basis of the tangent space at x, shape (..., dim, *shape)."""
+        return self._compiled("_frame", self._checked_point(x, "x"))
+
+    def coordinates(self, x, v) -> jax.Array:
+        """Components of a tangent vector in :meth:`frame`, shape (..., dim)."""
+        return self._compiled("_coordinates", *self._checked_vectors(x, v=v))
+
+    def from_coordinates(self, x, c) -> jax.Array:
+        """The tangent vector at x with the components c, shape (..., dim), in :meth:`frame`."""
+        c = jnp.asarray(as_numeric(c, "c"))
+        if c.shape[-1:] != (self.dim,):
+            raise ShapeError(f"c must have last axis {self.dim} for {self.name}, but its shape is {c.shape}")
+        return self._compiled("_from_coordinates", self._checked_point(x, "x"), c.astype(jnp.float64))
+
+    # -- metric ---------------------------------------------------------------------------------------------------
+
+    def inner(self, x, u, v) -> jax.Array:
+        """Inner product of two tangent vectors at x, shape (...)."""
+        return self._compiled("_inner", *self._checked_vectors(x, u=u, v=v))
+
+    def norm(self, x, v) -> jax.Array:
+        """Length of a tangent vector, shape (...); its derivative at v = 0 is taken as 0."""
+        return self._compiled("_norm", *self._checked_vectors(x, v=v))
+
+    def flat(self, x, v) -> jax.Array:
+        """The covector ``w -> inner(x, v, w)``, as an ambient array, shape (..., *shape)."""
+        return self._compiled("_flat", *self._checked_vectors(x, v=v))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        """The tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w: of dH, the gradient of H.
+
+        Parameters
+        ----------
+        x : array, shape (..., *shape)
+        alpha : array, shape (..., *shape)
+            An ambient covector; only its action on tangent vectors matters.
+        """
+        return self._compiled("_sharp", self._checked_point(x, "x"), self._array(alpha, "alpha"))
+
+    # -- geodesics ------------------------------------------------------------------------------------------------
+
+    def exp(self, x, v) -> jax.Array:
+        """Riemannian exponential map: where the geodesic from x with velocity v is at time 1, shape (..., *shape)."""
+        return self._compiled("_exp", *self._checked_vectors(x, v=v))
+
+    def log(self, x, y) -> jax.Array:
+        """Riemannian logarithm: the v of least length with ``exp(x, v) = y``, a tangent vector at x.
+
+        Parameters
+        ----------
+        x, y : array, shape (..., *shape)
+
+        Raises
+        ------
+        DomainError
+            If y is at the cut locus of x, as its antipode is on a sphere, or (SU(n) with n > 2, Stiefel) beyond the
+            domain of the logarithm used. Under tracing the result is NaN instead.
+        """
+        x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
+        v = self._compiled("_log", x, y)
+        self._refuse_nan(v, len(self.shape), x, y, "log")
+        return v
+
+    def distance(self, x, y) -> jax.Array:
+        """Length of the shortest geodesic from x to y, shape (...).
+
+        Raises
+        ------
+        DomainError
+            Where it is computed from :meth:`log` and that is not defined.
+        """
+        x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
+        d = self._distance(x, y)
+        self._refuse_nan(d, 0, x, y, "distance")
+        return d
+
+    def midpoint(self, x, y) -> jax.Array:
+        """The point half way along the shortest geodesic from x to y, shape (..., *shape); raises as :meth:`log`."""
+        x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
+        z = self._midpoint(x, y)
+        self._refuse_nan(z, len(self.shape), x, y, "midpoint")
+        return z
+
+    def transport(self, x, v, u) -> jax.Array:
+        """Parallel transport of the tangent vector u along ``t -> exp(x, t v)``, from t = 0 to 1.
+
+        Returns
+        -------
+        array, shape (..., *shape)
+            A tangent vector at ``exp(x, v)``. Inner products are kept.
+        """
+        return self._compiled("_transport", *self._checked_vectors(x, v=v, u=u))
+
+    def injectivity_radius(self, x=None) -> float:
+        """Radius of the ball of tangent vectors at x that ``exp`` maps one to one, with ``log`` its inverse.
+
+        The same at every point of a native space, which is then not needed.
+        """
+        del x
+        return math.inf
+
+    def reach(self, x, v) -> jax.Array:
+        """Length of v over the injectivity radius, shape (...): below 1, ``log`` recovers v from ``exp(x, v)``.
+
+        Defined under tracing too: it is how to ask whether a step stays in the domain. In a product, the largest over
+        the factors.
+        """
+        return self._compiled("_reach", *self._checked_vectors(x, v=v))
+
+    # -- what a subclass gives ------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _residual(self, x): ...
+
+    @abstractmethod
+    def _project(self, x): ...
+
+    @abstractmethod
+    def _random(self, key, size): ...
+
+    @abstractmethod
+    def _project_tangent(self, x, w): ...
+
+    @abstractmethod
+    def _frame(self, x): ...
+
+    @abstractmethod
+    def _inner(self, x, u, v): ...
+
+    @abstractmethod
+    def _flat(self, x, v): ...
+
+    @abstractmethod
+    def _exp(self, x, v): ...
+
+    @abstractmethod
+    def _log(self, x, y):
+        """NaN where it is not defined."""
+
+    @abstractmethod
+    def _transport(self, x, v, u): ...
+
+    def _coordinates(self, x, v):
+        return self._pair(self._frame(x), self._over_frame(self._flat(x, v)))
+
+    def _from_coordinates(self, x, c):
+        weights = c.reshape(*c.shape, *(1,) * len(self.shape))
+        return (weights * self._frame(x)).sum(axis=-1 - len(self.shape))
+
+    def _sharp(self, x, alpha):
+        return self._from_coordinates(x, self._pair(self._frame(x), self._over_frame(alpha)))
+
+    def _norm(self, x, v):
+        return safe_sqrt(self._inner(x, v, v))
+
+    # These two are made of compiled maps, as a logarithm can be long to compile.
+
+    def _distance(self, x, y):
+        return self._compiled("_norm", x, self._compiled("_log", x, y))
+
+    def _midpoint(self, x, y):
+        return self._compiled("_exp", x, 0.5 * self._compiled("_log", x, y))
+
+    def _reach(self, x, v):
+        return self._norm(x, v) / self.injectivity_radius()
+
+    # What retractions other than the Riemannian one are made of, where a space has it.
+
+    def _straight_reach(self, x, v):
+        """Length of v over that up to which ``x + v`` is sure to stay in a space that is an open set of arrays."""
+        raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
+
+    def _group_exp(self, x, v):
+        """``x exp(x^-1 v)``."""
+        raise SpaceError(f"{self.name} is not a group: it has no group exponential and no Cayley map")
+
+    def _group_log(self, x, y):
+        """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
+        return self._group_exp(x, y)  # raises
+
+    def _left_carry(self, x, y, u):
+        """``y x^-1 u``."""
+        return self._group_exp(x, u)  # raises
+
+    def _cayley(self, x, v):
+        """``x cayley(x^-1 v)``."""
+        return self._group_exp(x, v)  # raises
+
+    def _inverse_cayley(self, x, y):
+        return self._group_exp(x, y)  # raises
+
+    def _why_no_log(self, x, y) -> str:
+        """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
+        return (
+            "y is at the cut locus of x or beyond it (injectivity radius "
+            f"{self.injectivity_radius():.6g}), where no one geodesic is the shortest; go by a point between them"
+        )
+
+    # -- checks ---------------------------------------------------------------------------------------------------
+
+    def _array(self, x, what: str) -> jax.Array:
+        """``x`` as an array of the shape and kind of points."""
+        array = jnp.asarray(as_numeric(x, what))
+        if jnp.iscomplexobj(array) and self.dtype.kind != "c":
+            raise ComponentError(
+                f"{what} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
+            )
+        if array.shape[array.ndim - len(self.shape) :] != self.shape or array.ndim < len(self.shape):
+            expected = f"(..., {', '.join(map(str, self.shape))})"
+            raise ShapeError(f"{what} must have the shape {expected} for {self.name}, but its shape is {array.shape}")
+        return array.astype(self.dtype)
+
+    def _checked_point(self, x, what: str, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
+        x = self._array(x, what)
+        if is_traced(x):
+            return x
+        with jax.ensure_compile_time_eval():  # x may be a constant in a program being traced
+            residual, values = np.asarray(self._compiled("_residual", x)), np.asarray(x)
+        if (index := first(~(residual <= tolerance))) is not None:
+            worst = float(residual[index])
+            raise OffManifoldError(
+                f"{self.name}: {what}{at(index)} is off the space: {self._why_off(values[index], worst)}, "
+                f"tolerance {tolerance:.0e}; point({what}, project=True) moves it there",
+                residual=worst,
+                tolerance=tolerance,
+            )
+        return x
+
+    def _why_off(self, x: np.ndarray, residual: float) -> str:
+        return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
+
+    def _checked_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
+        """The point, and each of the vectors as a tangent vector there."""
+        x, checked = self._checked_point(x, name), []
+        for what, v in vectors.items():
+            v = self._array(v, what)
+            if not is_traced(x, v):
+                self._check_tangent(x, name, v, what)
+            checked.append(v)
+        return [x, *checked]
+
+    def _check_tangent(self, x, name: str, v, what: str) -> None:
+        with jax.ensure_compile_time_eval():
+            residual = np.asarray(self._compiled("_tangent_residual", x, v))
+        if (index := first(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
+            worst = float(residual[index])
+            raise OffManifoldError(
+                f"{self.name}: {what}{at(index)} is not tangent at {name}: residual {worst:.3g}, tolerance "
+                f"{MEMBERSHIP_TOLERANCE:.0e}; project_tangent({name}, {what}) makes it so",
+                residual=worst,
+                tolerance=MEMBERSHIP_TOLERANCE,
+            )
+
+    def _tangent_residual(self, x, v):
+        axes = self._axes
+        size = jnp.maximum(jnp.abs(v).max(axis=axes, initial=0.0), 1.0)
+        return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / size
+
+    def _refuse_nan(self, value, core: int, x, y, what: str) -> None:
+        if (index := self._first_nan(value, core)) is not None:
+            batch = value.shape[: value.ndim - core]
+            x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
+            raise DomainError(f"{self.name}: {what}(x, y){at(index)} is not defined: {self._why_no_log(x, y)}")
+
+    @staticmethod
+    def _first_nan(value, core: int) -> tuple[int, ...] | None:
+        if is_traced(value):
+            return None
+        return first(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-core, 0))))
+
+    # -- helpers --------------------------------------------------------------------------------------------------
+
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        """The axes of one point."""
+        return tuple(range(-len(self.shape), 0))
+
+    def _pair(self, alpha, v):
+        """``Re sum(alpha * v)`` over the axes of one point."""
+        return (alpha * v).sum(axis=self._axes).real
+
+    def _over_frame(self, v):
+        """``v`` with an axis of length 1 for the vectors of a frame."""
+        return jnp.expand_dims(v, -1 - len(self.shape))
+
+    def _compiled(self, kernel: str, *arrays, static: tuple = ()):
+        return run(self, kernel, static, *arrays)
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: dim {self.dim}, points of shape {self.shape}, {self.metric} metric>"
+
+    def __mul__(self, other: Space) -> Space:
+        from .product import Product
+
+        return Product(self, other) if isinstance(other, Space) else NotImplemented
+
+    def __pow__(self, count: int) -> Space:
+        from .product import Power
+
+        return Power(self, count)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def run(space: Space, kernel: str, static: tuple, *arrays) -> Any:
+    return getattr(space, kernel)(*arrays, *static)
+
+
+def safe_sqrt(z):
+    """``sqrt(max(z, 0))``, with the derivative 0 where z <= 0."""
+    positive = z > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
+
+
+def random_key(key_or_seed):
+    return jax.random.key(key_or_seed) if isinstance(key_or_seed, int | np.integer) else key_or_seed

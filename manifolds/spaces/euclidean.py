@@ -1,0 +1,100 @@
+"""Euclidean space: arrays of any shape with the sum of products as metric."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from ..catalogue import _size
+from .base import Space, register
+
+
+@register((3,), (2, 2))
+@jax.tree_util.register_static
+@dataclass(frozen=True, init=False, repr=False)
+class Euclidean(Space):
+    """Arrays of the given shape: ``Euclidean(3)`` is R^3, ``Euclidean(2, 4)`` the 2 x 4 matrices."""
+
+    sizes: tuple[int, ...]
+    metric = "flat"
+    bi_invariant = True
+
+    def __init__(self, *sizes: int):
+        object.__setattr__(self, "sizes", tuple(_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))
+
+    @property
+    def name(self):
+        return "R^" + " x ".join(map(str, self.sizes))
+
+    @property
+    def dim(self):
+        return math.prod(self.sizes)
+
+    @property
+    def shape(self):
+        return self.sizes
+
+    def _residual(self, x):
+        return 0.0 * x.sum(axis=self._axes)  # NaN for an array that is not finite
+
+    def _project(self, x):
+        return x
+
+    def _random(self, key, size):
+        return jax.random.normal(key, (*size, *self.shape))
+
+    def _project_tangent(self, x, w):
+        return w + jnp.zeros_like(x)
+
+    def _frame(self, x):
+        batch = x.shape[: x.ndim - len(self.shape)]
+        return jnp.broadcast_to(jnp.eye(self.dim).reshape(self.dim, *self.shape), (*batch, self.dim, *self.shape))
+
+    def _inner(self, x, u, v):
+        return self._pair(u, v)
+
+    def _flat(self, x, v):
+        return v
+
+    def _sharp(self, x, alpha):
+        return alpha
+
+    def _coordinates(self, x, v):
+        return v.reshape(*v.shape[: v.ndim - len(self.shape)], self.dim)
+
+    def _from_coordinates(self, x, c):
+        return c.reshape(*c.shape[:-1], *self.shape)
+
+    def _exp(self, x, v):
+        return x + v
+
+    def _log(self, x, y):
+        return y - x
+
+    def _midpoint(self, x, y):
+        return 0.5 * (x + y)
+
+    def _transport(self, x, v, u):
+        return u + jnp.zeros_like(v)
+
+    def _group_exp(self, x, v):
+        return x + v
+
+    def _group_log(self, x, y):
+        return y - x
+
+    def _left_carry(self, x, y, u):
+        return u + jnp.zeros_like(y)
+
+    def _cayley(self, x, v):
+        """That of the translations, as matrices ``[[I, x], [0, 1]]``."""
+        return x + v
+
+    def _inverse_cayley(self, x, y):
+        return y - x
+
+    def _straight_reach(self, x, v):
+        return jnp.zeros(jnp.broadcast_shapes(x.shape, v.shape)[: -len(self.shape)])

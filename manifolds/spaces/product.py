@@ -1,0 +1,305 @@
+"""Products of state spaces, and powers of one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..catalogue import _size
+from ..errors import SpaceError
+from .base import Space, random_key, register
+from .euclidean import Euclidean
+from .groups import SpecialOrthogonal
+from .sphere import Sphere
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, init=False, repr=False)
+class Product(Space):
+    """The product of several spaces, also written ``A * B``: a point is one flat array, the factors' points in a row.
+
+    :meth:`split` and :meth:`join` go between that array and the points of the factors. The metric is the sum.
+    """
+
+    factors: tuple[Space, ...]
+    metric = "product"
+
+    def __init__(self, *factors: Space):
+        flat: list[Space] = []
+        for factor in factors:
+            if not isinstance(factor, Space):
+                raise SpaceError(f"a product is made of state spaces, not of {type(factor).__name__}")
+            flat.extend(factor.factors if isinstance(factor, Product) else [factor])
+        if not flat:
+            raise SpaceError("a product needs at least one factor")
+        object.__setattr__(self, "factors", tuple(flat))
+
+    @property
+    def name(self):
+        return " x ".join(factor.name for factor in self.factors)
+
+    @property
+    def dim(self):
+        return sum(factor.dim for factor in self.factors)
+
+    @property
+    def shape(self):
+        return (sum(math.prod(factor.shape) for factor in self.factors),)
+
+    @property
+    def dtype(self):  # type: ignore[override]
+        return np.result_type(*(factor.dtype for factor in self.factors))
+
+    def split(self, x) -> list[jax.Array]:
+        """The parts of a point or tangent vector, each an array of its factor's shape."""
+        x, parts, start = self._array(x, "x"), [], 0
+        for factor in self.factors:
+            size = math.prod(factor.shape)
+            part = x[..., start : start + size].reshape(*x.shape[:-1], *factor.shape)
+            parts.append(part if factor.dtype.kind == "c" else part.real)
+            start += size
+        return parts
+
+    def join(self, *parts) -> jax.Array:
+        """The flat array of the parts: the inverse of :meth:`split`."""
+        arrays = [factor._array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
+        rows = [a.reshape(*a.shape[: a.ndim - len(f.shape)], -1) for f, a in zip(self.factors, arrays, strict=True)]
+        batch = jnp.broadcast_shapes(*(row.shape[:-1] for row in rows))
+        return jnp.concatenate([jnp.broadcast_to(row, (*batch, row.shape[-1])) for row in rows], axis=-1)
+
+    def injectivity_radius(self, x=None):
+        parts = [None] * len(self.factors) if x is None else self.split(x)
+        return min(factor.injectivity_radius(part) for factor, part in zip(self.factors, parts, strict=True))
+
+    def _each(self, kernel: str, *arrays) -> list:
+        """A kernel of every factor on its parts of the arrays."""
+        parts = zip(*(self.split(a) for a in arrays), strict=True)
+        return [getattr(factor, kernel)(*part) for factor, part in zip(self.factors, parts, strict=True)]
+
+    def _joined(self, kernel: str, *arrays):
+        return self.join(*self._each(kernel, *arrays))
+
+    def _residual(self, x):
+        imaginary = jnp.abs(x - self.join(*self.split(x))).max(axis=-1)  # where a factor is real
+        return jnp.maximum(jnp.stack(self._each("_residual", x)).max(axis=0), imaginary)
+
+    def _project(self, x):
+        return self._joined("_project", x)
+
+    def random(self, key_or_seed, size=()):
+        keys = jax.random.split(random_key(key_or_seed), len(self.factors))
+        return self.join(*(factor.random(k, size) for factor, k in zip(self.factors, keys, strict=True)))
+
+    def _random(self, key, size):
+        return self.random(key, size)
+
+    def _project_tangent(self, x, w):
+        return self._joined("_project_tangent", x, w)
+
+    def _frame(self, x):
+        batch, columns = x.shape[:-1], []
+        for i, (factor, part) in enumerate(zip(self.factors, self.split(x), strict=True)):
+            zeros = [jnp.zeros((*batch, factor.dim, *other.shape)) for other in self.factors]
+            columns.append(self.join(*zeros[:i], factor._frame(part), *zeros[i + 1 :]))
+        return jnp.concatenate(columns, axis=-2)
+
+    def _coordinates(self, x, v):
+        parts = self._each("_coordinates", x, v)
+        batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in parts))
+        return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
+
+    def _from_coordinates(self, x, c):
+        ends = np.cumsum([factor.dim for factor in self.factors])[:-1]
+        triples = zip(self.factors, self.split(x), jnp.split(c, ends, axis=-1), strict=True)
+        return self.join(*(factor._from_coordinates(part, components) for factor, part, components in triples))
+
+    def _inner(self, x, u, v):
+        return sum(self._each("_inner", x, u, v))
+
+    def _flat(self, x, v):
+        return self._joined("_flat", x, v)
+
+    def _sharp(self, x, alpha):
+        return self._joined("_sharp", x, alpha)
+
+    def _exp(self, x, v):
+        return self._joined("_exp", x, v)
+
+    def _log(self, x, y):
+        return self._joined("_log", x, y)
+
+    def _midpoint(self, x, y):
+        return self._joined("_midpoint", x, y)
+
+    def _distance(self, x, y):
+        return jnp.linalg.norm(jnp.stack(self._each("_distance", x, y)), axis=0)
+
+    def _transport(self, x, v, u):
+        return self._joined("_transport", x, v, u)
+
+    def _reach(self, x, v):
+        return jnp.stack(self._each("_reach", x, v)).max(axis=0)
+
+    @property
+    def bi_invariant(self):  # type: ignore[override]
+        return all(factor.bi_invariant for factor in self.factors)
+
+    @property
+    def smooth(self):  # type: ignore[override]
+        return all(factor.smooth for factor in self.factors)
+
+    def _straight_reach(self, x, v):
+        return jnp.stack(self._each("_straight_reach", x, v)).max(axis=0)
+
+    def _group_exp(self, x, v):
+        return self._joined("_group_exp", x, v)
+
+    def _group_log(self, x, y):
+        return self._joined("_group_log", x, y)
+
+    def _left_carry(self, x, y, u):
+        return self._joined("_left_carry", x, y, u)
+
+    def _cayley(self, x, v):
+        return self._joined("_cayley", x, v)
+
+    def _inverse_cayley(self, x, y):
+        return self._joined("_inverse_cayley", x, y)
+
+    def _why_no_log(self, x, y):
+        for i, (factor, *pair) in enumerate(zip(self.factors, self.split(x), self.split(y), strict=True)):
+            if not np.isfinite(factor._log(*pair)).all():
+                return f"in factor {i}, {factor.name}, {factor._why_no_log(*map(np.asarray, pair))}"
+        raise AssertionError("the logarithm is defined in every factor")
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class Power(Space):
+    """The product of ``count`` copies of one space, also written ``A**count``: points of shape (count, *base.shape).
+
+    ``Sphere(2) ** 100`` holds the states of a chain of a hundred spins. The copies are run as one batch.
+    """
+
+    base: Space
+    count: int
+    metric = "product"
+
+    def __post_init__(self):
+        if not isinstance(self.base, Space):
+            raise SpaceError(f"a power is that of a state space, not of {type(self.base).__name__}")
+        _size(self.count, 1, "Power(base, count)", "count")
+
+    @property
+    def name(self):
+        return f"({self.base.name})^{self.count}"
+
+    @property
+    def dim(self):
+        return self.count * self.base.dim
+
+    @property
+    def shape(self):
+        return (self.count, *self.base.shape)
+
+    @property
+    def dtype(self):  # type: ignore[override]
+        return self.base.dtype
+
+    def injectivity_radius(self, x=None):
+        if x is None:
+            return self.base.injectivity_radius()
+        return min(self.base.injectivity_radius(part) for part in self._array(x, "x"))
+
+    def _residual(self, x):
+        return self.base._residual(x).max(axis=-1)
+
+    def _project(self, x):
+        return self.base._project(x)
+
+    def random(self, key_or_seed, size=()):
+        return self.base.random(key_or_seed, (*size, self.count))
+
+    def _random(self, key, size):
+        return self.random(key, size)
+
+    def _project_tangent(self, x, w):
+        return self.base._project_tangent(x, w)
+
+    def _frame(self, x):
+        frames = self.base._frame(x).reshape(*x.shape[: -len(self.shape)], self.count, self.base.dim, -1)
+        blocks = jnp.einsum("...idm,ij->...idjm", frames, np.eye(self.count))
+        return blocks.reshape(*x.shape[: -len(self.shape)], self.dim, *self.shape)
+
+    def _coordinates(self, x, v):
+        c = self.base._coordinates(x, v)
+        return c.reshape(*c.shape[:-2], self.dim)
+
+    def _from_coordinates(self, x, c):
+        return self.base._from_coordinates(x, c.reshape(*c.shape[:-1], self.count, self.base.dim))
+
+    def _inner(self, x, u, v):
+        return self.base._inner(x, u, v).sum(axis=-1)
+
+    def _flat(self, x, v):
+        return self.base._flat(x, v)
+
+    def _sharp(self, x, alpha):
+        return self.base._sharp(x, alpha)
+
+    def _exp(self, x, v):
+        return self.base._exp(x, v)
+
+    def _log(self, x, y):
+        return self.base._log(x, y)
+
+    def _midpoint(self, x, y):
+        return self.base._midpoint(x, y)
+
+    def _distance(self, x, y):
+        return jnp.linalg.norm(self.base._distance(x, y), axis=-1)
+
+    def _transport(self, x, v, u):
+        return self.base._transport(x, v, u)
+
+    def _reach(self, x, v):
+        return self.base._reach(x, v).max(axis=-1)
+
+    @property
+    def bi_invariant(self):  # type: ignore[override]
+        return self.base.bi_invariant
+
+    @property
+    def smooth(self):  # type: ignore[override]
+        return self.base.smooth
+
+    def _straight_reach(self, x, v):
+        return self.base._straight_reach(x, v).max(axis=-1)
+
+    def _group_exp(self, x, v):
+        return self.base._group_exp(x, v)
+
+    def _group_log(self, x, y):
+        return self.base._group_log(x, y)
+
+    def _left_carry(self, x, y, u):
+        return self.base._left_carry(x, y, u)
+
+    def _cayley(self, x, v):
+        return self.base._cayley(x, v)
+
+    def _inverse_cayley(self, x, y):
+        return self.base._inverse_cayley(x, y)
+
+    def _why_no_log(self, x, y):
+        lost = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)
+        i = int(lost.argmax())
+        return f"in copy {i}, {self.base._why_no_log(x[i], y[i])}"
+
+
+register((Sphere(2), Euclidean(3)), (SpecialOrthogonal(3), Euclidean(3)))(Product)
+register((Sphere(2), 4))(Power)

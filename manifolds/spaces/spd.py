@@ -1,0 +1,116 @@
+"""Symmetric positive definite matrices with the affine-invariant metric."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..catalogue import _size
+from ..matrix_functions import expm, largest
+from ..symmetric import cholesky, solve_lower, spd_log, symmetrized
+from .base import Space, register
+
+
+@register((3,))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class SPD(Space):
+    """Symmetric positive definite n x n matrices with ``inner(x, u, v) = tr(x^-1 u x^-1 v)``.
+
+    The metric is invariant under every ``x -> g x g^T``; it makes the space complete and of nonpositive curvature, so
+    that exp and log are one to one everywhere [Pennec, Fillard & Ayache 2006]. Written with the Cholesky factor L of x,
+    where they use the square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
+    largest entry, so eigenvalues smaller than that by 1e16 are lost.
+    """
+
+    n: int
+    metric = "affine-invariant"
+
+    def __post_init__(self):
+        _size(self.n, 1, "SPD(n)")
+
+    @property
+    def name(self):
+        return f"SPD({self.n})"
+
+    @property
+    def dim(self):
+        return self.n * (self.n + 1) // 2
+
+    @property
+    def shape(self):
+        return (self.n, self.n)
+
+    def _residual(self, x):
+        positive = jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
+        asymmetry = largest(x - x.swapaxes(-1, -2)) / largest(x)
+        return jnp.where(positive, asymmetry, jnp.inf)
+
+    def _project(self, x):
+        x = symmetrized(x)
+        return jnp.where(jnp.isfinite(cholesky(x)).all(axis=(-2, -1), keepdims=True), x, jnp.nan)
+
+    def _random(self, key, size):
+        components = 0.5 * jax.random.normal(key, (*size, self.dim))
+        return symmetrized(expm(jnp.einsum("...a,aij->...ij", components, self._basis)))
+
+    def _project_tangent(self, x, w):
+        return symmetrized(w)
+
+    def _frame(self, x):
+        L = cholesky(x)[..., None, :, :]
+        return L @ self._basis @ L.swapaxes(-1, -2)
+
+    def _inner(self, x, u, v):
+        inverse = self._inverse_factor(x)
+        return self._pair(_congruent(inverse, u), _congruent(inverse, v))
+
+    def _flat(self, x, v):
+        inverse = self._inverse_factor(x)
+        return _congruent(inverse.swapaxes(-1, -2), _congruent(inverse, v))
+
+    def _sharp(self, x, alpha):
+        return x @ symmetrized(alpha) @ x
+
+    def _exp(self, x, v):
+        half = cholesky(x) @ expm(0.5 * _congruent(self._inverse_factor(x), v))
+        return symmetrized(half @ half.swapaxes(-1, -2))  # positive definite by its form
+
+    def _log(self, x, y):
+        inverse = self._inverse_factor(x)
+        return _congruent(cholesky(x), spd_log(_congruent(inverse, y), _congruent(inverse, y - x)))
+
+    def _transport(self, x, v, u):
+        inverse = self._inverse_factor(x)
+        return _congruent(cholesky(x) @ expm(0.5 * _congruent(inverse, v)) @ inverse, u)
+
+    def _straight_reach(self, x, v):
+        return self._norm(x, v)  # x + v = L (I + a) L^T, with a of this norm
+
+    def _why_off(self, x, residual):
+        if np.isfinite(x).all() and not np.isfinite(residual):
+            return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
+        return super()._why_off(x, residual)
+
+    def _inverse_factor(self, x):
+        return solve_lower(cholesky(x), jnp.broadcast_to(jnp.eye(self.n), x.shape))
+
+    @property
+    def _basis(self) -> np.ndarray:
+        """An orthonormal basis of the symmetric matrices, shape (dim, n, n)."""
+        units = np.eye(self.n)
+        return np.array(
+            [
+                (np.outer(units[i], units[j]) + np.outer(units[j], units[i])) / (2.0 if i == j else np.sqrt(2.0))
+                for i in range(self.n)
+                for j in range(i, self.n)
+            ]
+        )
+
+
+def _congruent(g, a):
+    """``g a g^T``, symmetric to the last bit."""
+    return symmetrized(g @ a @ g.swapaxes(-1, -2))

@@ -1,0 +1,106 @@
+"""The sphere S^n with its round metric."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from ..catalogue import _size
+from ..closed_forms import arc, stumpff
+from ..matrix_functions import complement
+from .base import CUT_MARGIN, Space, register, safe_sqrt
+
+
+@register((1,), (2,), (3,))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class Sphere(Space):
+    """Unit vectors of R^(n+1), shape (n + 1,), with the metric that R^(n+1) gives them.
+
+    Distances are angles. Closed forms throughout, accurate to rounding up to the antipode; there the direction of the
+    logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
+    """
+
+    n: int
+    metric = "round"
+
+    def __post_init__(self):
+        _size(self.n, 1, "Sphere(n)")
+
+    @property
+    def name(self):
+        return f"S^{self.n}"
+
+    @property
+    def dim(self):
+        return self.n
+
+    @property
+    def shape(self):
+        return (self.n + 1,)
+
+    def injectivity_radius(self, x=None):
+        return math.pi
+
+    def _residual(self, x):
+        return jnp.abs(jnp.sqrt((x**2).sum(axis=-1)) - 1.0)
+
+    def _project(self, x):
+        return x / jnp.sqrt(_dot(x, x))
+
+    def _random(self, key, size):
+        return self._project(jax.random.normal(key, (*size, *self.shape)))
+
+    def _project_tangent(self, x, w):
+        return w - _dot(x, w) * x
+
+    def _frame(self, x):
+        return complement(x[..., None]).swapaxes(-1, -2)
+
+    def _inner(self, x, u, v):
+        return (u * v).sum(axis=-1)
+
+    def _flat(self, x, v):
+        return v
+
+    def _sharp(self, x, alpha):
+        return self._project_tangent(x, alpha)
+
+    def _exp(self, x, v):
+        z = _dot(v, v)
+        y = stumpff(0, z) * x + stumpff(1, z) * v
+        return y * (1.5 - 0.5 * _dot(y, y))  # a Newton step to |y| = 1, so that rounding does not add up
+
+    def _log(self, x, y):
+        step = y - x
+        w = step - _dot(x, step) * x  # of length sin(angle); free of cancellation for neighbours
+        z, cosine = _dot(w, w), _dot(x, y)
+        defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
+        return jnp.where(defined, arc(z, cosine) * w, jnp.nan)
+
+    def _distance(self, x, y):
+        chord, cochord = (safe_sqrt(((y + s * x) ** 2).sum(axis=-1)) for s in (-1.0, 1.0))
+        return 2.0 * jnp.arctan2(chord, cochord)
+
+    def _midpoint(self, x, y):
+        total = x + y
+        z = _dot(total, total)
+        return jnp.where(z > (math.pi * CUT_MARGIN) ** 2, total / jnp.sqrt(z), jnp.nan)
+
+    def _transport(self, x, v, u):
+        z = _dot(v, v)
+        return u - _dot(v, u) * (stumpff(2, z) * v + stumpff(1, z) * x)
+
+    def _why_no_log(self, x, y):
+        gap = float(jnp.sqrt(((x + y) ** 2).sum()))
+        return (
+            f"y is within {gap:.2g} of the antipode of x (margin {math.pi * CUT_MARGIN:.1e}), to which every direction "
+            "leads; go by a point between them"
+        )
+
+
+def _dot(u, v):
+    return (u * v).sum(axis=-1, keepdims=True)

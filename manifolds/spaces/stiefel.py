@@ -1,0 +1,153 @@
+"""The Stiefel manifold of orthonormal p-frames in R^n, with its canonical metric."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..catalogue import _size
+from ..errors import ParameterError
+from ..matrix_functions import complement, expm, largest, orthonormalized, polar, solve
+from ..symmetric import orthonormal_columns
+from .base import CUT_MARGIN, Space, register
+
+_MOST_STEPS = 30
+"""Of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
+
+
+@register((4, 2))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class Stiefel(Space):
+    """Matrices n x p with orthonormal columns, p < n, and ``inner(x, u, v) = tr(u^T (I - x x^T / 2) v)``.
+
+    This is the metric of SO(n)/SO(n - p), in which a rotation counts once, whether it turns the columns of x among
+    themselves or out of their span. A tangent vector v at x is ``W x`` for one skew W of least norm; the geodesic is
+    ``expm(t W) x`` [Edelman, Arias & Smith 1998]. Parallel transport solves the linear equation
+    ``eta' = -[W, eta]/2``, projected, of a naturally reductive space. There is no closed form of the logarithm: it is
+    found by Gauss and Newton's method from the projected chord, and accepted inside the injectivity radius only, where
+    it is unique. That radius is pi for p = 1 and p = n - 1; otherwise the bound ``2 pi / sqrt 5`` [Rentmeesters 2013].
+    """
+
+    n: int
+    p: int
+    metric = "canonical"
+
+    def __post_init__(self):
+        _size(self.n, 2, "Stiefel(n, p)")
+        _size(self.p, 1, "Stiefel(n, p)", "p")
+        if self.p >= self.n:
+            raise ParameterError(
+                f"Stiefel(n, p): p must be less than n, not {self.p} >= {self.n}; for n = p take SpecialOrthogonal(n)"
+            )
+
+    @property
+    def name(self):
+        return f"St({self.n}, {self.p})"
+
+    @property
+    def dim(self):
+        return self.n * self.p - self.p * (self.p + 1) // 2
+
+    @property
+    def shape(self):
+        return (self.n, self.p)
+
+    def injectivity_radius(self, x=None):
+        return math.pi if self.p in (1, self.n - 1) else 2.0 * math.pi / math.sqrt(5.0)
+
+    def _residual(self, x):
+        return largest(_transposed(x) @ x - jnp.eye(self.p))
+
+    def _project(self, x):
+        return polar(x)
+
+    def _random(self, key, size):
+        return orthonormal_columns(jax.random.normal(key, (*size, *self.shape)))
+
+    def _project_tangent(self, x, w):
+        product = _transposed(x) @ w
+        return w - x @ (product + _transposed(product)) / 2
+
+    def _frame(self, x):
+        """Rotations of the columns of x among themselves, then of each column into the rest of the space."""
+        units = np.eye(self.p)
+        pairs = [(i, j) for i in range(self.p) for j in range(i + 1, self.p)]
+        skew = [np.outer(units[j], units[i]) - np.outer(units[i], units[j]) for i, j in pairs]
+        within = x[..., None, :, :] @ np.array(skew).reshape(-1, self.p, self.p)
+        outwards = jnp.einsum("...ni,jp->...ijnp", complement(x), units)
+        return jnp.concatenate([within, outwards.reshape(*x.shape[:-2], -1, *self.shape)], axis=-3)
+
+    def _inner(self, x, u, v):
+        return self._pair(self._flat(x, u), v)
+
+    def _flat(self, x, v):
+        return v - 0.5 * x @ (_transposed(x) @ v)
+
+    def _sharp(self, x, alpha):
+        return alpha - x @ _transposed(alpha) @ x
+
+    def _exp(self, x, v):
+        return orthonormalized(expm(self._lift(x, v)) @ x)  # one Newton step back, so that rounding does not add up
+
+    def _log(self, x, y):
+        return jnp.vectorize(self._log_of_one, signature="(n,p),(n,p)->(n,p)")(x, y)
+
+    def _transport(self, x, v, u):
+        W, base = self._lift(x, v), x[..., None, :, :]
+        frame = self._lift(base, self._frame(x))
+        rates = -0.5 * (W[..., None, :, :] @ frame - frame @ W[..., None, :, :]) @ base
+        flow = expm(self._coordinates(base, rates))  # rows are images: it acts from the right
+        c = (self._coordinates(x, u)[..., None, :] @ flow)[..., 0, :]
+        return expm(W) @ self._from_coordinates(x, c)
+
+    def _lift(self, x, v):
+        """The skew matrix W, n x n, of least norm with ``W x = v``."""
+        outer = v @ _transposed(x)
+        return outer - _transposed(outer) - x @ (_transposed(x) @ outer)
+
+    def _log_of_one(self, x, y):
+        def gap(c):
+            return self._exp(x, self._from_coordinates(x, c)) - y
+
+        def step(state):
+            c, _, steps = state
+            J, f = jax.jacfwd(lambda c: (gap(c),) * 2, has_aux=True)(c)
+            J, f = J.reshape(-1, self.dim), f.ravel()
+            direction = solve(J.T @ J, -(J.T @ f)[:, None])[:, 0]
+            lengths = 0.5 ** jnp.arange(8)
+            sizes = jax.vmap(lambda t: (gap(c + t * direction) ** 2).sum())(lengths)
+            move = lengths[jnp.nanargmin(sizes)] * direction
+            return c + move, jnp.abs(move).max(), steps + 1
+
+        def newton(_, start):
+            unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MOST_STEPS)  # noqa: E731
+            c, change, _ = jax.lax.while_loop(unfinished, step, (start, jnp.inf, 0))
+            inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
+            found = (change <= 1e-8) & (jnp.abs(gap(c)).max() <= 1e-10)  # not just a point where Newton gets stuck
+            return jnp.where(inside & found, c, jnp.nan)
+
+        chord = self._project_tangent(x, y - x)
+        length = jnp.sqrt(self._inner(x, y - x, y - x) / jnp.maximum(self._inner(x, chord, chord), 1e-300))
+        start = jax.lax.stop_gradient(self._coordinates(x, length * chord))
+        c = jax.lax.custom_root(  # for the derivatives, of every order, by the implicit function theorem
+            lambda c: self._coordinates(y, self._project_tangent(y, gap(c))),
+            start,
+            newton,
+            lambda linear, b: solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b[:, None])[:, 0],
+        )
+        return self._from_coordinates(x, c)
+
+    def _why_no_log(self, x, y):
+        return (
+            f"no geodesic shorter than {self.injectivity_radius():.6g} from x to y was found, and a longer one might "
+            "not be the shortest; go by a point between them"
+        )
+
+
+def _transposed(a):
+    return a.swapaxes(-1, -2)

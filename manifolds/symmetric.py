@@ -1,0 +1,115 @@
+"""Symmetric matrices: Cholesky factors, eigenvectors by Jacobi's rotations, and a logarithm with all its derivatives.
+
+Plain array operations of fixed length, for the reason given at :func:`manifolds.matrix_functions.solve` and so that
+small cases can be unrolled into scalar programs. Leading axes are batches.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .closed_forms import hyperbolic_stumpff
+from .matrix_functions import expm, largest, orthonormalized
+
+_NEARLY_ONE = 0.5
+"""Largest entry of w - I up to which the logarithm of w takes the eigenvalues of w - I, not those of w."""
+
+
+def symmetrized(a) -> jax.Array:
+    """``(a + a^T) / 2``."""
+    return 0.5 * (a + a.swapaxes(-1, -2))
+
+
+def cholesky(a) -> jax.Array:
+    """Lower triangular L with ``L L^H = a``, NaN where a is not positive definite."""
+    n, columns = a.shape[-1], []
+    for k in range(n):
+        column = jnp.where(jnp.arange(n) < k, 0.0, a[..., :, k] / jnp.sqrt(a[..., k, k])[..., None])
+        a = a - column[..., :, None] * column.conj()[..., None, :]
+        columns.append(column)
+    return jnp.stack(columns, axis=-1)
+
+
+def solve_lower(L, b) -> jax.Array:
+    """Solution x of ``L x = b``, shapes (..., n, n) and (..., n, k), by forward substitution."""
+    rows: list[jax.Array] = []
+    for i in range(L.shape[-1]):
+        rest = b[..., i, :]
+        for j, row in enumerate(rows):
+            rest = rest - L[..., i, j, None] * row
+        rows.append(rest / L[..., i, i, None])
+    return jnp.stack(rows, axis=-2)
+
+
+def orthonormal_columns(a) -> jax.Array:
+    """The Q of ``a = Q R`` with R upper triangular and its diagonal positive, for a of full rank, shape (..., n, p)."""
+    adjoint = a.conj().swapaxes(-1, -2)
+    q = solve_lower(cholesky(adjoint @ a), adjoint).conj().swapaxes(-1, -2)
+    for _ in range(3):  # the product squares the condition number of a
+        q = orthonormalized(q)
+    return q
+
+
+def eigh(a) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues, shape (..., n), in no order, and orthonormal eigenvectors, as columns: cyclic Jacobi rotations.
+
+    Small eigenvalues come out more accurately than by reduction to tridiagonal form [Demmel & Veselic 1992]. NaN where
+    it has not converged. The eigenvectors have no derivative where eigenvalues meet.
+    """
+    n = a.shape[-1]
+    pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)
+    sweeps = 4 + n.bit_length()  # one or two more than random matrices of size 3, 10, 30, 50 need: 4, 7, 8, 9
+    axes = np.tile(np.eye(n)[pairs], (sweeps, 1, 1))  # as unit vectors, so that the program needs no indices that vary
+
+    def rotate(state, axes):
+        a, vectors = state
+        e, f = axes
+        alpha, beta, gamma = ((u @ a @ v)[..., None, None] for u, v in ((e, e), (f, f), (e, f)))
+        done = gamma == 0.0
+        slope = (beta - alpha) / jnp.where(done, 1.0, 2 * gamma)
+        tangent = jnp.where(slope < 0, -1.0, 1.0) / (jnp.abs(slope) + jnp.sqrt(1.0 + slope**2))
+        cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
+        sine = jnp.where(done, 0.0, tangent * cosine)
+        cosine = jnp.where(done, 1.0, cosine)
+        plane, turn = jnp.outer(e, e) + jnp.outer(f, f), jnp.outer(e, f) - jnp.outer(f, e)
+        J = jnp.eye(n) + (cosine - 1.0) * plane + sine * turn
+        return (J.swapaxes(-1, -2) @ a @ J, vectors @ J), None
+
+    start = symmetrized(a), jnp.broadcast_to(jnp.eye(n), a.shape)
+    (d, vectors), _ = jax.lax.scan(rotate, start, axes)
+    values = jnp.diagonal(d, axis1=-2, axis2=-1)
+    converged = largest(d * (1.0 - np.eye(n))) <= 1e-14 * largest(a)
+    return jnp.where(converged[..., None], values, jnp.nan), vectors
+
+
+@jax.custom_jvp
+def spd_log(w, excess) -> jax.Array:
+    """Logarithm of a symmetric positive definite matrix, given along with its excess ``w - I``; NaN where not defined.
+
+    With both at hand neither a w next to I nor one next to 0 loses digits. Derivatives of every order, in w, through
+    ``exp(x) = w``.
+    """
+    near = largest(excess) < _NEARLY_ONE
+    values, vectors = eigh(jnp.where(near[..., None, None], excess, w))
+    near = near[..., None]
+    logs = jnp.where(near, jnp.log1p(jnp.where(near, values, 0.0)), jnp.log(jnp.where(near, 1.0, values)))
+    return symmetrized((vectors * logs[..., None, :]) @ vectors.swapaxes(-1, -2))
+
+
+@spd_log.defjvp
+def _log_derivative(primals, tangents):
+    x, dw = spd_log(*primals), tangents[0]
+    values, vectors = eigh(jax.lax.stop_gradient(x))
+    mean, half = (values[..., :, None] + values[..., None, :]) / 2, (values[..., :, None] - values[..., None, :]) / 2
+    quotients = jnp.exp(mean) * hyperbolic_stumpff(1, half**2)  # (e^s - e^t) / (s - t)
+
+    def derivative_of_exp(dx):
+        return jax.jvp(expm, (x,), (dx,))[1]
+
+    def in_eigenvectors(_, b):
+        return vectors @ ((vectors.swapaxes(-1, -2) @ b @ vectors) / quotients) @ vectors.swapaxes(-1, -2)
+
+    # The derivative of exp is self-adjoint, and a linear solve has derivatives of its own: hence those of higher order.
+    return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(dw), in_eigenvectors, symmetric=True)

@@ -1,0 +1,615 @@
+"""State spaces: every registered one through the same properties, and against geomstats; the cut locus; refusals.
+
+geomstats, an implementation by other people, is the oracle for exponential, logarithm, distance and transport.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import geomstats.geometry.euclidean as gs_euclidean
+import geomstats.geometry.hyperboloid as gs_hyperboloid
+import geomstats.geometry.hypersphere as gs_hypersphere
+import geomstats.geometry.nfold_manifold as gs_nfold
+import geomstats.geometry.product_manifold as gs_product
+import geomstats.geometry.spd_matrices as gs_spd
+import geomstats.geometry.special_euclidean as gs_se
+import geomstats.geometry.special_orthogonal as gs_so
+import geomstats.geometry.stiefel as gs_stiefel
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import manifolds as mf
+from liethermo.engine.scalarize import scalarize
+
+TOLERANCES = {
+    # name: (bound, what was measured and why)
+    "member": (3e-15, "relative residual of a computed point; at most 9e-16 seen"),
+    "exact": (1e-14, "results of order one; at most 4e-15 seen, roundings of a distance near pi"),
+    "hyperbolic": (4e-14, "times cosh(distance from the apex)^2, as for all coordinates there; at most 8e-15 seen"),
+    "spd": (4e-14, "entries up to 20, and products of five such matrices; at most 1e-14 seen"),
+    "oracle": (5e-14, "against geomstats, a few times its own roundings; at most 1e-14 seen"),
+    "oracle_log": (1e-11, "against geomstats where its logarithm iterates, to 1e-13"),
+    "ladder": (1e-6, "against two pole ladders of geomstats, extrapolated; at most 3e-7 seen"),
+    "cut": (5e-15, "times 1 / distance from the cut locus; at most 1e-15 seen"),
+    "derivative": (2e-14, "first and second derivatives of log(exp(c)) = c; at most 4e-15 seen"),
+    "drift": (2e-15, "relative residual after 10^5 steps, as after one; at most 9e-16 seen"),
+}
+
+seeds = st.integers(0, 10**6)
+BATCH = 3
+SLOW = ("S^1", "S^3", "SO(4)", "SU(2)", "SU(3)", "SE(2)", "SE(3)", "St(4, 2)", "SO(3) x R^3")
+"""Spaces whose whole suite is left to the slow tests: together they compile for more than a minute."""
+
+BY_FACTORS = (mf.Product, mf.Power, mf.SpecialEuclidean)
+"""Spaces that bound each factor by itself, so that a step may be longer than the injectivity radius."""
+
+
+def named(space, slow=False):
+    return pytest.param(space, id=space.name, marks=[pytest.mark.slow] if slow else [])
+
+
+SPACES = [named(space, slow=space.name in SLOW) for space in mf.registered_spaces()]
+
+
+def largest(a) -> float:
+    return float(np.abs(np.asarray(a)).max(initial=0.0))
+
+
+def close(a, b, name="exact", scale=1.0) -> bool:
+    return largest(np.asarray(a) - np.asarray(b)) <= TOLERANCES[name][0] * scale
+
+
+def rounding(space, *points) -> tuple[str, float]:
+    """Which tolerance holds in a space, and its scale for these points."""
+    if "H^" in space.name:
+        return "hyperbolic", max(largest(np.asarray(x)[..., 0]) for x in points) ** 2
+    return ("spd", 1.0) if "SPD" in space.name else ("exact", 1.0)
+
+
+def spread(a, space):
+    """Numbers, one for each point, in the shape that multiplies points."""
+    return np.asarray(a).reshape(*np.shape(a), *(1,) * len(space.shape))
+
+
+def points(space, seed):
+    """As NumPy arrays, in which the tests calculate: each operation of JAX would be compiled anew for each shape."""
+    return np.asarray(space.random(seed, (BATCH,)))
+
+
+def unit(space, seed, x):
+    """Unit tangent vectors at x."""
+    c = np.random.default_rng(seed).standard_normal((BATCH, space.dim))
+    return np.asarray(space.from_coordinates(x, c / np.linalg.norm(c, axis=1, keepdims=True)))
+
+
+def paired(space, alpha, v):
+    return np.sum(np.asarray(alpha) * np.asarray(v), axis=tuple(range(-len(space.shape), 0))).real
+
+
+def ambient(space, seed):
+    real, imaginary = np.random.default_rng(seed).standard_normal((2, BATCH, *space.shape))
+    return real + 1j * imaginary if space.dtype.kind == "c" else real
+
+
+@pytest.fixture(scope="module", params=SPACES)
+def S(request):
+    """Module scope: pytest then runs all tests of one space together, which share its compiled maps."""
+    return request.param
+
+
+# -- every registered space: points, vectors, metric ------------------------------------------------------------------
+
+
+@given(seed=seeds)
+def test_points(S, seed):
+    x = points(S, seed)
+    assert x.shape == (BATCH, *S.shape)
+    assert x.dtype == S.dtype
+    assert bool(S.belongs(x, TOLERANCES["member"][0]).all())
+    assert close(S.project(x), x)
+    moved = x + 0.01 * ambient(S, seed)
+    projected = np.asarray(S.project(moved))
+    assert bool(S.belongs(projected, TOLERANCES["member"][0]).all())
+    assert largest(projected - x) < 0.1 * np.sqrt(np.prod(S.shape)) * max(1.0, largest(x))
+    assert np.array_equal(S.point(moved, project=True), projected)
+    if not isinstance(S, mf.Euclidean):  # control: the residual sees the way off
+        assert not bool(S.belongs(moved, 1e-4).all())
+
+
+@given(seed=seeds)
+def test_tangent_vectors(S, seed):
+    x, w = points(S, seed), ambient(S, seed)
+    c = np.random.default_rng(seed).standard_normal((BATCH, S.dim))
+    v = np.asarray(S.from_coordinates(x, c))
+    tolerance = rounding(S, x)
+    assert close(S.project_tangent(x, v), v, *tolerance)
+    assert close(S.coordinates(x, v), c, *tolerance)
+    assert close(S.from_coordinates(x, S.coordinates(x, v)), v, *tolerance)
+    assert close(np.einsum("ba,ba...->b...", c, S.frame(x)), v, *tolerance)
+    projected = np.asarray(S.project_tangent(x, w))  # orthogonally, in the ambient space
+    assert close(paired(S, np.conj(w - projected), v), 0.0, tolerance[0], tolerance[1] * largest(v))
+    assert close(S.project_tangent(x, projected), projected, *tolerance)
+
+
+@given(seed=seeds)
+def test_metric(S, seed):
+    x, alpha = points(S, seed), ambient(S, seed)
+    c, d = np.random.default_rng(seed).standard_normal((2, BATCH, S.dim))
+    u, v = np.asarray(S.from_coordinates(x, c)), S.from_coordinates(x, d)
+    name, scale = rounding(S, x)
+    scale *= S.dim
+    assert close(S.inner(x, u, v), (c * d).sum(axis=1), name, scale)  # the frame is orthonormal
+    assert close(S.norm(x, u), np.linalg.norm(c, axis=1), name, scale)
+    assert close(paired(S, S.flat(x, u), v), S.inner(x, u, v), name, scale)
+    assert close(S.sharp(x, S.flat(x, u)), u, name, scale)
+    size = max(1.0, largest(x)) ** 2
+    assert close(S.inner(x, S.sharp(x, alpha), v), paired(S, alpha, v), name, scale * size)
+
+
+# -- every registered space: geodesics --------------------------------------------------------------------------------
+
+
+def lengths(space):
+    return (1e-3, 0.5, 0.9 * min(space.injectivity_radius(), 3.0))
+
+
+@given(seed=seeds)
+def test_exp_and_log(S, seed):
+    x = points(S, seed)
+    direction = unit(S, seed + 1, x)
+    for length in lengths(S):
+        v = length * direction
+        y = np.asarray(S.exp(x, v))
+        tolerance = rounding(S, x, y)
+        assert bool(S.belongs(y, TOLERANCES["member"][0]).all())
+        assert close(S.coordinates(x, np.asarray(S.log(x, y)) - v), 0.0, *tolerance)
+        assert close(S.distance(x, y), length, *tolerance)
+        assert close(S.distance(y, x), length, *tolerance)
+        assert close(S.reach(x, v), length / S.injectivity_radius(), *tolerance) or isinstance(S, BY_FACTORS)
+    assert close(S.exp(x, np.zeros_like(x)), x, *rounding(S, x))
+    assert largest(S.distance(x, x)) < 1e-14
+
+
+@given(seed=seeds)
+def test_parallel_transport(S, seed):
+    x = points(S, seed)
+    u, w = unit(S, seed + 1, x), unit(S, seed + 2, x)
+    for length in lengths(S):
+        v = length * unit(S, seed + 3, x)
+        y = np.asarray(S.exp(x, v))
+        tu, tw, tv = (np.asarray(S.transport(x, v, a)) for a in (u, w, v))
+        back = -tv
+        tolerance = rounding(S, x, y)
+        assert close(S.project_tangent(y, tu), tu, *tolerance)
+        assert close(S.inner(y, tu, tw), S.inner(x, u, w), *tolerance)
+        assert close(S.coordinates(y, np.asarray(S.log(y, x)) - back), 0.0, *tolerance)  # it transports its velocity
+        returned = np.asarray(S.transport(y, back, tu))
+        assert close(S.coordinates(x, returned - u), 0.0, tolerance[0], 4 * tolerance[1] ** 2)
+        half = S.exp(x, 0.5 * v)
+        further = S.transport(half, 0.5 * np.asarray(S.transport(x, 0.5 * v, v)), S.transport(x, 0.5 * v, u))
+        assert close(further, tu, tolerance[0], 4 * tolerance[1] ** 2)
+
+
+@given(seed=seeds)
+def test_midpoints(S, seed):
+    x = points(S, seed)
+    for length in lengths(S)[1:]:
+        v = length * unit(S, seed + 1, x)
+        y = S.exp(x, v)
+        z, tolerance = S.midpoint(x, y), rounding(S, x, y)
+        assert close(z, S.exp(x, 0.5 * v), *tolerance)
+        assert close(z, S.midpoint(y, x), *tolerance)
+
+
+# -- geomstats as the oracle ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A geomstats manifold with the points, and up to a factor the metric, of a native space."""
+
+    build: Callable
+    scale: float = 1.0  # its metric over the native one
+    transport: str = "closed form"  # or how else it is to be had
+
+
+def _tight_stiefel():
+    space = gs_stiefel.Stiefel(4, 2)
+    space.metric.log_solver.tol = 1e-13  # 1e-8 by default
+    return space
+
+
+TWINS = {
+    "R^3": Twin(lambda: gs_euclidean.Euclidean(3)),
+    "S^1": Twin(lambda: gs_hypersphere.Hypersphere(1)),
+    "S^2": Twin(lambda: gs_hypersphere.Hypersphere(2)),
+    "S^3": Twin(lambda: gs_hypersphere.Hypersphere(3)),
+    "H^2": Twin(lambda: gs_hyperboloid.Hyperboloid(2)),
+    "SO(3)": Twin(lambda: gs_so.SpecialOrthogonal(3)),
+    "SO(4)": Twin(lambda: gs_so.SpecialOrthogonal(4)),
+    "SE(2)": Twin(lambda: gs_se.SpecialEuclidean(2), scale=np.nan),  # its metric is that of the length sqrt(2): below
+    "SE(3)": Twin(lambda: gs_se.SpecialEuclidean(3), scale=np.nan),
+    "SPD(3)": Twin(lambda: gs_spd.SPDMatrices(3)),
+    "St(4, 2)": Twin(_tight_stiefel, transport="ladder"),
+    "(S^2)^4": Twin(lambda: gs_nfold.NFoldManifold(gs_hypersphere.Hypersphere(2), 4), transport="none"),
+    "S^2 x R^3": Twin(
+        lambda: gs_product.ProductManifold((gs_hypersphere.Hypersphere(2), gs_euclidean.Euclidean(3))),
+        transport="none",
+    ),
+    "SO(3) x R^3": Twin(
+        lambda: gs_product.ProductManifold((gs_so.SpecialOrthogonal(3), gs_euclidean.Euclidean(3))), transport="none"
+    ),
+}
+
+WITHOUT_TWIN = {
+    "R^2 x 2": "as R^3",
+    "SU(2)": "geomstats has no SU(n): compared with the sphere S^3 below",
+    "SU(3)": "geomstats has no SU(n): compared with its totally geodesic subgroup SO(3) below",
+}
+
+
+def test_every_space_has_a_twin_or_a_reason():
+    names = {space.name for space in mf.registered_spaces()}
+    assert names == set(TWINS) | set(WITHOUT_TWIN)
+
+
+def test_geomstats_agrees(S):
+    if S.name in WITHOUT_TWIN:
+        pytest.skip(WITHOUT_TWIN[S.name])
+    twin = TWINS[S.name]
+    other = twin.build()
+    x, name = points(S, 7), "oracle_log" if S.name.startswith("St") else "oracle"
+    u = unit(S, 8, x)
+
+    def theirs(a):  # their products of spaces with points of equal shape stack them
+        return np.asarray(a).reshape(BATCH, *other.shape)
+
+    def ours(a):
+        return np.asarray(a).reshape(BATCH, *S.shape)
+
+    for length in (0.1, 0.7 * min(S.injectivity_radius(), 3.0)):
+        v = length * unit(S, 9, x)
+        y = np.asarray(S.exp(x, v))
+        a, b, c, d = map(theirs, (x, y, u, v))
+        scale = rounding(S, x, y)[1] * max(1.0, largest(y)) ** 2
+        assert close(y, ours(other.metric.exp(d, a)), "oracle", scale)
+        assert close(S.log(x, y), ours(other.metric.log(b, a)), name, scale)
+        if np.isfinite(twin.scale):
+            assert close(S.distance(x, y) * np.sqrt(twin.scale), other.metric.dist(a, b), name, scale)
+            inner = S.inner(x, u, v)
+            assert close(inner * twin.scale, other.metric.inner_product(c, d, a), "oracle", scale)
+        if twin.transport == "closed form":
+            assert close(S.transport(x, v, u), other.metric.parallel_transport(c, a, direction=d), "oracle", scale)
+    if twin.transport == "ladder":
+        v = 0.25 * v
+
+        def ladder(rungs):
+            found = other.metric.ladder_parallel_transport(u[0], x[0], v[0], n_rungs=rungs, alpha=2)
+            return found["transported_tangent_vec"]
+
+        coarse, fine, exact = ladder(8), ladder(16), S.transport(x, v, u)[0]
+        assert close((4 * fine - coarse) / 3, exact, "ladder")
+        assert not close(fine, exact, "ladder")  # control: the extrapolation is needed
+
+
+@pytest.mark.slow
+def test_rigid_motions_with_the_metric_of_geomstats():
+    """The Frobenius product there: twice the native metric, if a length sqrt(2) counts as one radian."""
+    S, other = mf.SpecialEuclidean(2, 2**0.5), gs_se.SpecialEuclidean(2)
+    x, y = points(S, 1), points(S, 2)
+    assert close(S.distance(x, y) * 2**0.5, other.metric.dist(x, y), "oracle")
+
+
+@pytest.mark.slow
+def test_su2_is_a_sphere_of_radius_two():
+    S, sphere = mf.SpecialUnitary(2), mf.Sphere(3)
+
+    def matrix(q):
+        a, b = q[..., 0] + 1j * q[..., 1], q[..., 2] + 1j * q[..., 3]
+        return np.stack([np.stack([a, b], -1), np.stack([-b.conj(), a.conj()], -1)], -2)
+
+    q = points(sphere, 3)
+    u = unit(sphere, 4, q)
+    for length in (0.1, 2.5):
+        v = length * unit(sphere, 5, q)
+        y = np.asarray(sphere.exp(q, v))
+        assert close(S.exp(matrix(q), matrix(v)), matrix(y))
+        assert close(S.log(matrix(q), matrix(y)), matrix(v))
+        assert close(S.distance(matrix(q), matrix(y)), 2 * length)
+        assert close(S.inner(matrix(q), matrix(u), matrix(v)), 4 * sphere.inner(q, u, v))
+        assert close(S.transport(matrix(q), matrix(v), matrix(u)), matrix(np.asarray(sphere.transport(q, v, u))))
+
+
+@pytest.mark.slow
+def test_so3_is_totally_geodesic_in_su3():
+    S, real = mf.SpecialUnitary(3), mf.SpecialOrthogonal(3)
+    x = points(real, 3)
+    u, v = unit(real, 4, x), 2.5 * unit(real, 5, x)
+    y = np.asarray(real.exp(x, v))
+    assert close(S.exp(x, v), y)
+    assert close(S.log(x, y), v)
+    assert close(S.inner(x, u, v), 4 * real.inner(x, u, v))
+    assert close(S.transport(x, v, u), real.transport(x, v, u))
+
+
+@pytest.mark.slow
+def test_stiefel_in_brief():
+    """The whole suite on St(4, 2) is slow."""
+    S, other = mf.Stiefel(3, 2), gs_stiefel.Stiefel(3, 2)
+    x = points(S, 1)
+    v = 2.0 * unit(S, 2, x)
+    y = np.asarray(S.exp(x, v))
+    assert close(y, other.metric.exp(v, x))
+    assert close(S.log(x, y), v)
+    assert close(S.norm(x, v), 2.0)
+
+
+@pytest.mark.slow
+def test_a_stiefel_manifold_of_single_columns_is_a_sphere():
+    S, sphere = mf.Stiefel(3, 1), mf.Sphere(2)
+    x = points(sphere, 3)
+    u, v = unit(sphere, 4, x), 2.9 * unit(sphere, 5, x)
+    y = np.asarray(sphere.exp(x, v))
+    assert close(S.exp(x[..., None], v[..., None]), y[..., None])
+    assert close(S.log(x[..., None], y[..., None]), v[..., None], "cut", 5.0)
+    assert close(
+        S.transport(x[..., None], v[..., None], u[..., None]), np.asarray(sphere.transport(x, v, u))[..., None]
+    )
+
+
+# -- accuracy where formulas break down -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "space",
+    [named(mf.Sphere(2)), named(mf.SpecialOrthogonal(3)), named(mf.SpecialUnitary(2), slow=True)],
+)
+def test_just_inside_the_cut_locus(space):
+    """The direction is known to a rounding of the points over their distance from the cut locus; the way back fully."""
+    x = points(space, 11)
+    for gap in (1e-1, 1e-3, 1e-5, 1e-7):
+        v = (space.injectivity_radius() - gap) * unit(space, 12, x)
+        y = np.asarray(space.exp(x, v))
+        found = np.asarray(space.log(x, y))
+        assert close(found, v, "cut", 1 / gap)
+        assert close(space.norm(x, found), space.injectivity_radius() - gap, "exact")
+        assert close(space.exp(x, found), y)
+        assert close(space.distance(x, y), space.injectivity_radius() - gap)
+
+
+def test_distant_positive_definite_matrices():
+    space = mf.SPD(3)
+    x = points(space, 15)
+    for factor in (1e-10, 1e10):  # logarithms with entries up to 60
+        assert close(space.log(x, factor * x), np.log(factor) * x, "spd", scale=3.0)
+        assert close(space.distance(x, factor * x), 3**0.5 * abs(np.log(factor)), "spd", scale=3.0)
+
+
+def test_neighbours_keep_their_relative_accuracy():
+    """The chord is exact, and no cancellation follows."""
+    for space in (mf.Sphere(2), mf.Hyperbolic(2), mf.Euclidean(3)):
+        x = points(space, 13) if space.name != "H^2" else np.tile([1.0, 0.0, 0.0], (BATCH, 1))
+        y = np.asarray(space.exp(x, 1e-8 * unit(space, 14, x)))
+        chord = np.linalg.norm(y - x, axis=1)  # of what rounding has made of y
+        assert np.abs(np.asarray(space.distance(x, y)) / chord - 1).max() < 1e-15
+        assert np.abs(np.asarray(space.norm(x, space.log(x, y))) / chord - 1).max() < 1e-15
+
+
+@pytest.mark.parametrize("space", [named(space, slow=True) for space in mf.registered_spaces()])
+def test_derivatives_at_zero_and_elsewhere(space):
+    """``c -> log(exp(c))`` is the identity: its first derivative is I and its second 0, forward and reverse."""
+    x = space.random(21)
+
+    def round_trip(c):
+        y = space.exp(x, space.from_coordinates(x, c))
+        return space.coordinates(x, space.log(x, y))
+
+    first, reverse = jax.jit(jax.jacfwd(round_trip)), jax.jit(jax.jacrev(round_trip))
+    second = jax.jit(jax.jacfwd(jax.jacfwd(round_trip)))
+    for c in (np.zeros(space.dim), 0.4 * np.random.default_rng(1).standard_normal(space.dim)):
+        assert close(first(c), np.eye(space.dim), "derivative")
+        assert close(reverse(c), np.eye(space.dim), "derivative")
+        assert close(second(c), 0.0, "derivative")
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        named(mf.Sphere(2)),
+        *(
+            named(space, slow=True)
+            for space in (
+                mf.SpecialOrthogonal(3),
+                mf.SpecialEuclidean(3),
+                mf.SpecialUnitary(2),
+                mf.Stiefel(4, 2),
+            )
+        ),
+    ],
+)
+def test_points_do_not_drift_off(space):
+    """Each step returns to the space to rounding; a formula without that Newton step adds up its errors."""
+    steps = 100_000
+
+    def run(exp):
+        def step(x, key):
+            c = 0.1 * jax.random.normal(key, (space.dim,))
+            return exp(x, space._from_coordinates(x, c)), None
+
+        return jax.lax.scan(step, start, jax.random.split(jax.random.key(0), steps))[0]
+
+    start = space.random(0)
+    assert float(space.residual(jax.jit(lambda: run(space._exp))())) <= TOLERANCES["drift"][0]
+    if isinstance(space, mf.SpecialOrthogonal):  # control
+        naive = jax.jit(lambda: run(lambda x, v: x @ space.group.exp(space._velocity(x, v))))()
+        assert float(space.residual(naive)) > 5 * TOLERANCES["drift"][0]
+
+
+# -- programs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        named(mf.Sphere(2)),
+        named(mf.Sphere(2) ** 2, slow=True),
+        named(mf.Hyperbolic(2), slow=True),
+        named(mf.SpecialOrthogonal(3), slow=True),
+        named(mf.SpecialEuclidean(3), slow=True),
+        named(mf.SPD(2), slow=True),
+    ],
+)
+def test_closed_forms_unroll_into_scalar_programs(space):
+    x = np.asarray(space.random(0))
+    v, u = (
+        np.asarray(space.from_coordinates(x, c)) for c in 0.3 * np.random.default_rng(0).standard_normal((2, space.dim))
+    )
+    y = np.asarray(space.exp(x, v))
+
+    def everything(x, v, u, y):
+        derivative = jax.jvp(lambda v: space.exp(x, v), (v,), (u,))[1]
+        log, transported, middle = space.log(x, y), space.transport(x, v, u), space.midpoint(x, y)
+        return derivative, log, transported, middle, space.sharp(x, u), space.frame(x), space.inner(x, u, v)
+
+    found = scalarize(jax.make_jaxpr(everything)(x, v, u, y)).evaluate(x, v, u, y)
+    for a, b in zip(found, jax.jit(everything)(x, v, u, y), strict=True):
+        assert close(a, b, *rounding(space, x, y))
+
+
+@pytest.mark.slow
+def test_batches_broadcast_and_compile():
+    space = mf.Sphere(2) * mf.Hyperbolic(2)
+    x, y = space.random(0, (2, 1)), space.random(1, (3,))
+    v = space.log(x, y)
+    assert v.shape == (2, 3, *space.shape)
+    assert close(v[1, 2], space.log(x[1, 0], y[2]))
+    assert close(space.exp(x, v), np.broadcast_to(y, v.shape))
+    assert space.distance(x, y).shape == space.reach(x, v).shape == space.belongs(space.exp(x, v)).shape == (2, 3)
+    assert space.frame(x).shape == (2, 1, space.dim, *space.shape)
+    assert close(jax.jit(jax.vmap(space.log))(x[:, 0], y[:2]), space.log(x[:, 0], y[:2]))
+    single = x[0, 0]  # a constant of the program, checked while it is traced
+    assert close(jax.jit(lambda y: space.log(single, y))(y[0]), space.log(single, y[0]))
+
+
+def test_under_tracing_what_is_not_defined_is_nan():
+    space = mf.Sphere(2)
+    x = np.array([0.0, 0.0, 1.0])
+    y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    assert np.isnan(jax.jit(space.log)(x, y)).any(axis=1).tolist() == [False, True]
+    assert np.isnan(jax.jit(space.midpoint)(x, y)).any(axis=1).tolist() == [False, True]
+    assert close(space.distance(x, y), [np.pi / 2, np.pi])
+
+
+@pytest.mark.slow
+def test_product_parts():
+    space = mf.Sphere(2) * mf.Euclidean(2) * mf.SpecialUnitary(2)
+    assert space.name == "S^2 x R^2 x SU(2)"
+    assert (space.dim, space.shape, space.dtype) == (7, (9,), np.complex128)
+    x = space.random(0, (4,))
+    parts = space.split(x)
+    assert [part.shape for part in parts] == [(4, 3), (4, 2), (4, 2, 2)]
+    assert [part.dtype.kind for part in parts] == ["f", "f", "c"]
+    assert np.array_equal(space.join(*parts), x)
+    assert not bool(space.belongs(x + 1j * np.eye(9)[0]).any())  # where the factor is real
+    assert (mf.Sphere(2) ** 3).dim == 6
+    assert (mf.Sphere(2) * (mf.Euclidean(1) * mf.Sphere(1))).factors[1:] == (mf.Euclidean(1), mf.Sphere(1))
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------------
+
+
+NORTH = np.array([0.0, 0.0, 1.0])
+
+
+def test_a_point_off_the_space():
+    space = mf.Sphere(2)
+    with pytest.raises(
+        mf.OffManifoldError, match=r"S\^2: x\[1\] is off the space: residual 1, tolerance 1e-08; .*project=True"
+    ) as info:
+        space.point([NORTH, 2 * NORTH])
+    assert (info.value.residual, info.value.tolerance) == (1.0, 1e-8)
+    assert isinstance(info.value, ValueError)
+    assert np.array_equal(space.point(2 * NORTH, project=True), NORTH)
+    assert np.array_equal(space.point(1.001 * NORTH, tolerance=0.01), 1.001 * NORTH)
+    with pytest.raises(mf.OffManifoldError, match="y is off the space"):
+        space.log(NORTH, 2 * NORTH)
+    with pytest.raises(mf.OffManifoldError, match="residual nan, as it is not finite"):
+        space.point([np.nan, 0.0, 1.0])
+    with pytest.raises(mf.DomainError, match="no point of the space is nearest"):
+        space.point(0 * NORTH, project=True)
+    for other, x, message in [
+        (mf.Hyperbolic(2), [-1.0, 0.0, 0.0], "residual inf"),
+        (mf.SPD(2), np.diag([1.0, -0.5]), "not positive definite, with the least eigenvalue -0.5"),
+        (mf.SPD(2), [[1.0, 0.1], [0.0, 1.0]], "residual 0.1"),
+        (mf.SpecialOrthogonal(3), np.diag([1.0, 1.0, -1.0]), "residual 2"),
+        (mf.Sphere(2) ** 2, [NORTH, 1.5 * NORTH], "residual 0.5"),
+    ]:
+        with pytest.raises(mf.OffManifoldError, match=message):
+            other.point(x)
+    for other, x in [(mf.SPD(2), np.diag([1.0, -0.5])), (mf.SpecialOrthogonal(3), np.diag([1.0, 1.0, -1.0]))]:
+        with pytest.raises(mf.DomainError, match="no point of the space"):
+            other.project(x)
+
+
+def test_a_vector_that_is_not_tangent():
+    space = mf.Sphere(2)
+    with pytest.raises(
+        mf.OffManifoldError, match=r"v\[0\] is not tangent at x: residual 1, .* project_tangent\(x, v\)"
+    ):
+        space.exp(NORTH, [NORTH, 0 * NORTH])
+    with pytest.raises(mf.OffManifoldError, match="u is not tangent"):
+        space.transport(NORTH, 0 * NORTH, NORTH)
+
+
+@pytest.mark.parametrize(
+    ("space", "x", "y", "message"),
+    [
+        (mf.Sphere(2), NORTH, -NORTH, r"S\^2: log\(x, y\) is not defined: y is within 0 of the antipode"),
+        (mf.SpecialOrthogonal(3), np.eye(3), np.diag([1.0, -1.0, -1.0]), r"x\^-1 y has the eigenvalue -1.* below pi"),
+        (mf.SpecialUnitary(2), np.eye(2), -np.eye(2), r"SU\(2\): log\(x, y\) is not defined"),
+        (mf.SpecialEuclidean(3, 0.5), np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), "has the eigenvalue -1"),
+        (mf.Sphere(2) ** 2, [NORTH, NORTH], [NORTH, -NORTH], r"in copy 1, y is within 0 of the antipode"),
+        (mf.Euclidean(1) * mf.Sphere(2), [0, *NORTH], [0, *-NORTH], r"in factor 1, S\^2, y is within 0"),
+        pytest.param(
+            mf.Stiefel(3, 2),
+            np.eye(3)[:, :2],
+            -np.eye(3)[:, :2],
+            r"no geodesic shorter than 3\.14159",
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=lambda case: getattr(case, "name", ""),
+)
+def test_points_at_the_cut_locus(space, x, y, message):
+    with pytest.raises(mf.DomainError, match=message):
+        space.log(x, y)
+
+
+def test_arrays_of_the_wrong_kind():
+    space = mf.Sphere(2)
+    with pytest.raises(mf.ShapeError, match=r"x must have the shape \(\.\.\., 3\) for S\^2, but its shape is \(2,\)"):
+        space.exp([1.0, 0.0], [0.0, 1.0])
+    with pytest.raises(mf.ComponentError, match="x must be real"):
+        space.point(1j * NORTH)
+    with pytest.raises(mf.ShapeError, match="c must have last axis 2"):
+        space.from_coordinates(NORTH, [1.0, 2.0, 3.0])
+    with pytest.raises(mf.ParameterError, match="n must be at least 1"):
+        mf.Sphere(0)
+    with pytest.raises(mf.ParameterError, match="take SpecialOrthogonal"):
+        mf.Stiefel(3, 3)
+    with pytest.raises(mf.ParameterError, match="length is a positive number"):
+        mf.SpecialEuclidean(3, -1.0)
+    with pytest.raises(mf.SpaceError, match="made of state spaces"):
+        mf.Product(mf.Sphere(2), 3)
+    with pytest.raises(TypeError):
+        mf.Sphere(2) * 3
+
+
+def test_importing_manifolds_does_not_import_geomstats():
+    program = "import manifolds, sys; sys.exit('geomstats' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
