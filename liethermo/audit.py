@@ -103,6 +103,8 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     drift = max(highest - first, first - lowest) / scale
     if laws.energy == "conserved":
         rows.append(_verdict("energy drift", drift, tolerances.energy))
+    elif laws.energy is None:
+        rows.append(AuditRow("energy drift", drift, None, None, "no law promised"))
     else:
         increments = [*np.diff(solution.energy), _or(stats.largest_energy_increment, -np.inf)]
         risen = float(max(increments)) / scale
@@ -119,7 +121,7 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
         else:
             rows.append(AuditRow("least entropy increment", least, None, None, "no law promised"))
 
-    drifts = {name: _drift(series) for name, series in solution.casimirs.items()}
+    drifts = {name: _drift(series) for name, series in solution.casimirs.items() if name not in laws.ledger}
     kept = [drifts[name] for name in laws.conserved if name in drifts]
     casimir_drift = max(kept, default=np.nan)
     for name, value in drifts.items():
@@ -128,6 +130,11 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
             _verdict(f"drift of {name}", value, tolerances.casimirs)
             if promised
             else AuditRow(f"change of {name}", value, None, None, "not a constant of this system")
+        )
+    for name in laws.ledger:
+        series = solution.casimirs[name]
+        rows.append(
+            AuditRow(name, float(series[-1] - series[0]), None, None, "from outside: the energy above is without")
         )
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
     status = solution.status  # a run stopped by its user is short, but breaks no law

@@ -39,13 +39,19 @@ class Dissipation(eqx.Module):
     """
 
     @property
-    def energy_law(self) -> Law:
+    def energy_law(self) -> Law | None:
+        """What the construction guarantees of the energy; None where it guarantees nothing."""
         return "conserved"
 
     @property
     def entropy_law(self) -> Law | None:
         """What the construction guarantees of the entropy; None where it guarantees nothing."""
         return "nondecreasing"
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
+        return True
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -93,14 +99,18 @@ class Several(Dissipation):
     parts: tuple[Dissipation, ...]
 
     @property
-    def energy_law(self) -> Law:
+    def energy_law(self) -> Law | None:
         laws = {part.energy_law for part in self.parts}
-        return "nonincreasing" if "nonincreasing" in laws else "conserved"
+        return None if None in laws else "nonincreasing" if "nonincreasing" in laws else "conserved"
 
     @property
     def entropy_law(self) -> Law | None:
         laws = {part.entropy_law for part in self.parts} - {"conserved"}
         return "conserved" if not laws else ("nondecreasing" if laws == {"nondecreasing"} else None)
+
+    @property
+    def symmetric(self) -> bool:
+        return all(part.symmetric for part in self.parts)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
@@ -143,7 +153,7 @@ class InnerProductDissipation(Dissipation):
     K: jax.Array
 
     def __init__(self, K):
-        self.K = _semidefinite(K, "the inner product 𝒦")
+        self.K = semidefinite(K, "the inner product 𝒦")
 
     def prepared(self, system):
         _need_algebra(system, "InnerProductDissipation", self.K.shape[0])
@@ -242,7 +252,7 @@ class ProjectedMetric(Dissipation):
     rate: jax.Array
 
     def __init__(self, cometric=None, preserve=(), normalized=False, rate=1.0):
-        self.cometric = cometric if cometric is None or callable(cometric) else _semidefinite(cometric, "the cometric")
+        self.cometric = cometric if cometric is None or callable(cometric) else semidefinite(cometric, "the cometric")
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(L, "a preserved function") for L in functions)
         self.normalized = bool(normalized)
@@ -304,7 +314,7 @@ class FrictionOperator(Dissipation):
     rate: jax.Array
 
     def __init__(self, K, rate=1.0):
-        self.K = K if callable(K) else _semidefinite(K, "the friction operator K")
+        self.K = K if callable(K) else semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
 
     def prepared(self, system):
@@ -382,8 +392,8 @@ class KulkarniNomizu(Dissipation):
     mu: Callable | jax.Array
 
     def __init__(self, sigma, mu):
-        self.sigma = sigma if callable(sigma) else _semidefinite(sigma, "the form sigma")
-        self.mu = mu if callable(mu) else _semidefinite(mu, "the form mu")
+        self.sigma = sigma if callable(sigma) else semidefinite(sigma, "the form sigma")
+        self.mu = mu if callable(mu) else semidefinite(mu, "the form mu")
 
     def prepared(self, system):
         _check_matrix(self.sigma, system.dim, "the form sigma")
@@ -417,7 +427,7 @@ class DoubleBracket(Dissipation):
 
     def __init__(self, rate=1.0, metric=None):
         self.rate = checked_rate(rate)
-        self.metric = None if metric is None else _semidefinite(metric, "the metric")
+        self.metric = None if metric is None else semidefinite(metric, "the metric")
 
     @property
     def energy_law(self):
@@ -502,7 +512,8 @@ def checked_rate(rate) -> jax.Array:
     return array
 
 
-def _semidefinite(form, what: str) -> jax.Array:
+def semidefinite(form, what: str) -> jax.Array:
+    """A form as a symmetric positive semidefinite matrix (or a traced one)."""
     matrix = real_array(form)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")

@@ -1,13 +1,15 @@
 """Energies and entropies: functions of the state as sums of terms, quadratic or general.
 
 The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
-midpoint is one already; a general term gets a correction of its own [EQUATIONS: "Sums of energies"].
+midpoint is one already; a general term gets a correction of its own, along its own coordinates where it is told them
+(:meth:`Energy.on`) [EQUATIONS: "Sums of energies"].
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,12 +19,18 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from .engine.interpret import polynomial_degree
+from .engine.interpret import at_points, polynomial_degree
 from .errors import FunctionError, InputError
+
+if TYPE_CHECKING:
+    from .gradients import DiscreteGradient, Path
+
+COORDINATE_TOLERANCE = 1e-10
+"""How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
 
 class Energy(eqx.Module):
-    """A real function of the state with a gradient; energies add with ``+``.
+    """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
 
     Calling one evaluates it: shape (..., n) to shape (...).
     """
@@ -45,6 +53,28 @@ class Energy(eqx.Module):
         """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
         return False
 
+    def discrete_gradient(self, scheme: DiscreteGradient, x, d, low) -> jax.Array:
+        """The discrete gradient of one term by a scheme, shape (n,), from x + low to x + low + d."""
+        return scheme.quadratic(self, x, d, low) if self.is_quadratic else scheme.general(self, x, d, low)
+
+    def stage_gradients(self, scheme: Callable, path: Path) -> jax.Array:
+        """Those of one term at the stages of a collocation method, shape (s, n)."""
+        return scheme(self, path)
+
+    def on(self, coordinates: Sequence[int] | np.ndarray | Callable) -> Energy:
+        """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
+
+        Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions
+        puts no correction into momenta, one of distances keeps the momentum maps that distances are invariant under.
+
+        Parameters
+        ----------
+        coordinates : sequence of int, or function from x, shape (n,), to y, shape (m,)
+            Indices into the state, or a map at most quadratic in x (checked where a system is built).
+        """
+        pulled = tuple(Pullback(term, coordinates) for term in self.terms)
+        return pulled[0] if len(pulled) == 1 else Sum(pulled)
+
     def __call__(self, x) -> jax.Array:
         return jnp.vectorize(self.value, signature="(n)->()")(jnp.asarray(x, dtype=jnp.float64))
 
@@ -52,6 +82,15 @@ class Energy(eqx.Module):
         return Sum((*self.terms, *as_energy(other, "a term of a sum").terms))
 
     __radd__ = __add__
+
+    def __neg__(self) -> Energy:
+        return Negative(self)
+
+    def __sub__(self, other) -> Energy:
+        return self + -as_energy(other, "a term of a sum")
+
+    def __rsub__(self, other) -> Energy:
+        return -self + other
 
 
 class Quadratic(Energy):
@@ -97,6 +136,9 @@ class Quadratic(Energy):
     def gradient(self, x) -> jax.Array:
         return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
 
+    def __neg__(self) -> Energy:
+        return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
+
 
 class Function(Energy):
     """An energy given by a plain function from a JAX array, shape (n,), to a scalar; differentiated by JAX.
@@ -115,6 +157,73 @@ class Function(Energy):
         return jnp.asarray(self.function(x))
 
 
+class Pullback(Energy):
+    """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
+
+    For such a map ``y' - y = Dpi(z) d`` with z the midpoint, exactly, so ``Dpi(z)^T`` takes discrete gradients in y to
+    discrete gradients in x [Gonzalez 1996].
+    """
+
+    term: Energy
+    indices: tuple[int, ...] = eqx.field(static=True)
+    function: Callable | None
+
+    def __init__(self, term: Energy, coordinates: Sequence[int] | np.ndarray | Callable):
+        self.term = term
+        self.function = coordinates if callable(coordinates) else None
+        self.indices = () if callable(coordinates) else tuple(map(int, coordinates))
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.function is None and self.term.is_quadratic
+
+    def of(self, x) -> jax.Array:
+        """The coordinates y of a state, shape (m,)."""
+        return x[np.array(self.indices, dtype=int)] if self.function is None else self.function(x)
+
+    def value(self, x) -> jax.Array:
+        return self.term.value(self.of(x))
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        low = jnp.zeros_like(x) + low
+        middle, kept = x + (low + 0.5 * d), jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
+        step = jax.jvp(self.of, (middle,), (d,))[1]
+        (back,) = jax.vjp(self.of, middle)[1](self.term.discrete_gradient(scheme, self.of(x), step, kept))
+        return back
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        path, back = path.through(self.of)
+        return back(self.term.stage_gradients(scheme, path))
+
+    def __neg__(self) -> Energy:
+        return Pullback(-self.term, self.indices if self.function is None else self.function)
+
+
+class Negative(Energy):
+    """Minus a term."""
+
+    term: Energy
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.term.is_quadratic
+
+    def value(self, x) -> jax.Array:
+        return -self.term.value(x)
+
+    def gradient(self, x) -> jax.Array:
+        return -self.term.gradient(x)
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        return -self.term.discrete_gradient(scheme, x, d, low)
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        return -self.term.stage_gradients(scheme, path)
+
+    def __neg__(self) -> Energy:
+        return self.term
+
+
 class Sum(Energy):
     """A sum of energies."""
 
@@ -127,6 +236,9 @@ class Sum(Energy):
     @property
     def is_quadratic(self) -> bool:
         return all(term.is_quadratic for term in self.summands)
+
+    def __neg__(self) -> Energy:
+        return Sum(tuple(-term for term in self.summands))
 
     def value(self, x) -> jax.Array:
         return sum((term.value(x) for term in self.summands[1:]), self.summands[0].value(x))
@@ -182,6 +294,11 @@ def recognised(energy: Energy, dim: int) -> Energy:
     """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
     if isinstance(energy, Sum):
         return Sum(tuple(recognised(term, dim) for term in energy.summands))
+    if isinstance(energy, Negative):
+        return Negative(recognised(energy.term, dim))
+    if isinstance(energy, Pullback):
+        (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
     if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
         return Function(energy.function, quadratic=True)
     return energy
@@ -192,7 +309,10 @@ def _value(energy: Energy, x):
 
 
 def check_scalar(energy: Energy, dim: int, role: str) -> None:
-    """Raise unless the energy maps a state of this dimension to one real number."""
+    """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has."""
+    for term in energy.terms:
+        if isinstance(term, Pullback):
+            _check_coordinates(term, dim, role)
     state = jax.ShapeDtypeStruct((dim,), jnp.float64)
     try:
         result = jax.eval_shape(energy.value, state)
@@ -207,3 +327,40 @@ def check_scalar(energy: Energy, dim: int, role: str) -> None:
         )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
+
+
+def is_traced(tree) -> bool:
+    """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
+
+
+def _check_coordinates(term: Pullback, dim: int, role: str) -> None:
+    if term.function is None:
+        outside = [i for i in term.indices if not -dim <= i < dim]
+        if outside:  # JAX would read the last component instead
+            raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
+        return
+    if is_traced(term):
+        return
+    try:
+        start, end, step = at_points(_chord, term, np.random.default_rng(0).standard_normal((1, 2 * dim)))
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
+    if start.ndim != 2:
+        raise FunctionError(
+            f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"
+        )
+    size = max(1.0, float(np.abs(start).max() + np.abs(end).max()))
+    defect = float(np.abs(end - start - step).max())
+    if not defect <= COORDINATE_TOLERANCE * size:
+        raise InputError(
+            f"the coordinates of a term of {role} are not a quadratic function of the state: they miss "
+            f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * size:.1g}), which would "
+            "cost the exactness of the energy. Let the term take, say, the square of a distance and root it itself"
+        )
+
+
+def _chord(term: Pullback, ends):
+    """The coordinates of two random states, and their difference as a quadratic map would have it."""
+    x, d = jnp.split(ends, 2)
+    return term.of(x), term.of(x + d), jax.jvp(term.of, (x + 0.5 * d,), (d,))[1]

@@ -85,8 +85,12 @@ def _stages(system: System, method: OneStepMethod, x, low, h: float, guess) -> j
         return method.slopes(system, x, low, h, k) - k
 
     def solve(misfit, guess):
-        scale = lambda k: size / h + jnp.max(jnp.abs(k))  # noqa: E731
-        solved = array.solve_stages(lambda k: misfit(k) + k, guess, scale, system.space is None)
+        solved = array.solve_stages(
+            lambda k: misfit(k) + k,
+            guess,
+            lambda k: size / h + jnp.max(jnp.abs(k)),
+            lambda k: method.jacobian(system, x, low, h, k),
+        )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 
     def solve_linear(linear, y):

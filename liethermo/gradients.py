@@ -15,7 +15,8 @@ shut out where it is rounding noise, by a gate that is continuous, scale free, a
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,7 +43,8 @@ three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even 
 class DiscreteGradient(eqx.Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
-    A sum of energies is treated term by term: discrete gradients add. ``low`` is what rounding has kept from x
+    A sum of energies is treated term by term: discrete gradients add, and each term knows which of the methods below is
+    its own (:meth:`liethermo.Energy.discrete_gradient`). ``low`` is what rounding has kept from x
     (compensated summation): points along the step are ``x + (low + c d)``, so that a step far below the rounding of
     x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
     """
@@ -53,10 +55,7 @@ class DiscreteGradient(eqx.Module):
         return 2
 
     def __call__(self, energy: Energy, x, d, low=0.0) -> jax.Array:
-        parts = [
-            self.quadratic(term, x, d, low) if term.is_quadratic else self.general(term, x, d, low)
-            for term in energy.terms
-        ]
+        parts = [term.discrete_gradient(self, x, d, low) for term in energy.terms]
         return sum(parts[1:], parts[0])
 
     def quadratic(self, term: Energy, x, d, low) -> jax.Array:
@@ -188,37 +187,86 @@ def stage_gradients(energy: Energy, x, low, h, k, A, b, finer: Finer | None = No
         varies on lengths far below those seen in its gradient drifts without it, at steps where the defect is shut out:
         two nodes missed 5e-15 of H in each of a hundred steps.
     """
-    parts = [_stage_gradients(term, x, low, h, k, A, b, finer) for term in energy.terms]
+    u = x + (low + h * (A @ k))
+    further = None if finer is None else (x + (low + h * (finer.A @ k)), finer.slopes @ k)
+    path = Path(x, low, h * (b @ k), u, k, further, h, b, finer)
+    parts = [term.stage_gradients(_stage_gradients, path) for term in energy.terms]
     return sum(parts[1:], parts[0])
 
 
-def _stage_gradients(term: Energy, x, low, h, k, A, b, finer: Finer | None) -> jax.Array:
+class Path(NamedTuple):
+    """The collocation polynomial of a step, in the coordinates that a term depends on.
+
+    Attributes
+    ----------
+    start, low, step : array, shape (m,)
+        It leads from start + low to start + low + step.
+    points, slopes : array, shape (s, m)
+        At the stages.
+    further : two arrays, shape (r, m), or None
+        Points and slopes at the nodes of ``finer``.
+    """
+
+    start: jax.Array
+    low: jax.Array
+    step: jax.Array
+    points: jax.Array
+    slopes: jax.Array
+    further: tuple[jax.Array, jax.Array] | None
+    h: jax.Array
+    b: np.ndarray
+    finer: Finer | None
+
+    def through(self, coordinates: Callable) -> tuple[Path, Callable]:
+        """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
+
+        def seen(x, d):
+            return jax.jvp(coordinates, (x,), (d,))
+
+        def back(covectors):
+            return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
+
+        low = jnp.zeros_like(self.start) + self.low
+        (points, slopes), step = jax.vmap(seen)(self.points, self.slopes), self.step
+        path = self._replace(
+            start=coordinates(self.start),
+            low=seen(self.start + 0.5 * low, low)[1],
+            step=seen(self.start + (low + 0.5 * step), step)[1],
+            points=points,
+            slopes=slopes,
+            further=None if self.further is None else jax.vmap(seen)(*self.further),
+        )
+        return path, back
+
+
+def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
+    """Of one term; ``along`` says which components of the slopes to correct along, by default all."""
     if term.is_quadratic:
-        return jax.vmap(term.gradient)(x + (low + h * (A @ k)))
-    d = h * (b @ k)
+        return jax.vmap(term.gradient)(path.points)
+    x, low, d, k, h, b = path.start, path.low, path.step, path.slopes, path.h, path.b
     new, new_low = _rounded(x, low + d)
-    nodes = A if finer is None else np.concatenate([A, finer.A])
+    points, slopes = (jnp.zeros((0, *k.shape[1:])),) * 2 if path.further is None else path.further
     # one map for all points, as one is what a compiler has to work on
-    found = jax.vmap(term.gradient)(jnp.concatenate([x + (low + h * (nodes @ k)), jnp.stack([x, new])]))
-    gradients, between, ends = found[: len(A)], found[len(A) : -2], found[-2:]
-    mean = b @ gradients
+    found = jax.vmap(term.gradient)(jnp.concatenate([path.points, points, jnp.stack([x, new])]))
+    gradients, between, ends = found[: len(k)], found[len(k) : -2], found[-2:]
+    mean, smooth = b @ gradients, jnp.zeros(())
     spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
-    smooth = jnp.zeros(())
-    if finer is not None:
-        rates = jnp.sum(between * (finer.slopes @ k), axis=1)
-        smooth = h * (jnp.dot(finer.b, rates) + jnp.dot(finer.change, jnp.sum(gradients * k, axis=1)))
+    if path.finer is not None and path.further is not None:
+        rates = jnp.sum(between * slopes, axis=1)
+        smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
     before, after = _values(term, jnp.stack([x, new]))
     # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
     difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
     defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
-    square = jnp.dot(b, jnp.sum(k * k, axis=1))
+    direction = k if along is None else along * k
+    square = jnp.dot(b, jnp.sum(direction * direction, axis=1))
     slope = jnp.linalg.norm(mean)
     noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
     harmless = 1.0 - _gate(_divide(defect, h * jnp.sqrt(square)), HARMLESS * slope)
     opened = jnp.maximum(_gate(defect, noise), harmless * _gate(spread, SPREAD * slope))
     alpha = _divide(smooth + _let_through(defect, opened), h * square)
-    return gradients + alpha * k
+    return gradients + alpha * direction
 
 
 def _rounded(x, d):

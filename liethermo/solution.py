@@ -90,11 +90,15 @@ class Stats:
 
 @dataclass(frozen=True)
 class Laws:
-    """What the system promises: the law of the energy, of the entropy, and the functions it conserves."""
+    """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
 
-    energy: str = "conserved"
+    ``ledger`` names those of the recorded functions that say what comes from outside.
+    """
+
+    energy: str | None = "conserved"
     entropy: str | None = None
     conserved: tuple[str, ...] = ()
+    ledger: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -232,7 +236,7 @@ def load(path: str | os.PathLike) -> Solution:
         names = [str(name) for name in dataset["invariant_name"].values]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        stored["laws"]["conserved"] = tuple(stored["laws"]["conserved"])
+        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in ("conserved", "ledger")}
         return Solution(
             t=t,
             x=x,

@@ -10,6 +10,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -263,10 +264,8 @@ def run(
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0
             if event and event.happens(value, after):
-                theta = _located(event, system, method, state, new, h, value, after)
-                if theta * h > UNDERFLOW * (end - span[0]):
-                    h = theta * h
-                    new = advance(state, h)  # a step that ends at the event: the laws hold there too
+                h, new = _located(event, system, method, advance, state, new, h, value, after)
+                if h > UNDERFLOW * (end - span[0]):
                     keep(t, t + h, h, state, new)
                     outcome.state = new
                 outcome.event_time = t + h
@@ -307,18 +306,27 @@ def _first_step(state, length: float) -> float:
     return min(length, 0.01 * size / speed) if speed > 0.0 and size > 0.0 else 1e-3 * length
 
 
-def _located(event: Event, system, method, state, new, h: float, before: float, after: float) -> float:
-    """Where in a step the event happens, as a fraction of it, to rounding on the collocation polynomial."""
+def _located(event: Event, system, method, advance: Callable, state, new, h: float, before: float, after: float):
+    """The step that ends where the event happens, to rounding: its size and the state it leads to.
+
+    Looked for among steps from the same state, so that the event is as accurate as the method and the laws hold there;
+    one that fails is replaced by the collocation polynomial of the whole step.
+    """
+    if after == 0.0:
+        return h, new
     x, k = np.asarray(state.x), np.asarray(new.k)
 
     def value(theta: float) -> float:
-        if theta == 0.0:
-            return before
-        return after if theta == 1.0 else event(np.asarray(method.along(system, x, h * integrated(len(k), theta) @ k)))
+        if theta in (0.0, 1.0):
+            return after if theta else before
+        end = advance(state, theta * h)
+        found = event(np.asarray(end.x)) if int(end.status) == array.RUNNING else math.nan
+        if math.isfinite(found):
+            return found
+        return event(np.asarray(method.along(system, x, h * integrated(len(k), theta) @ k)))
 
-    if after == 0.0:
-        return 1.0
-    return float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
+    theta = float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
+    return theta * h, advance(state, theta * h)
 
 
 def stops_of(save_at, start: float, end: float) -> np.ndarray:
@@ -336,7 +344,8 @@ def stops_of(save_at, start: float, end: float) -> np.ndarray:
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None) -> float:
     """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
 
-    The smallest that adaptive steps take in their first thirty, after they have settled, rounded down to two digits.
+    The smallest of the first thirty that adaptive steps take, once they no longer grow as fast as they are let,
+    rounded down to two digits.
 
     Parameters
     ----------
@@ -369,7 +378,8 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
         run(system, method, array, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
         raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
-    h = min(taken[len(taken) // 2 :])
+    settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < 0.9 * GROWTH * a), len(taken) - 1)
+    h = min(taken[settled:])
     digits = 1 - math.floor(math.log10(h))
     return math.floor(h * 10.0**digits) / 10.0**digits
 

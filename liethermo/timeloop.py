@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import os
 import time
 import warnings
@@ -17,6 +18,7 @@ import numpy as np
 
 from .engine import array, compiled
 from .engine.interpret import at_points
+from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import MetriplecticMidpoint, OneStepMethod, Reference, WithAttitude
@@ -27,8 +29,9 @@ from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
-SMALL_DIM = 8
-"""Components up to which numba compiles a step about as fast as XLA does, so that "auto" always takes it."""
+SMALL_DIM, SMALL_PROGRAM = 8, 1500
+"""Components of a state and operations of a step up to which numba compiles it about as fast as XLA does (5 s), so that
+"auto" always takes it. Beyond, its time grows as their square: half a minute for 2,700 operations."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
@@ -79,15 +82,15 @@ def integrate(
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
         Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
-        located to rounding on the collocation polynomial, reached by a step that ends there. ``solution.event_time``
+        located to rounding by a step that ends there. ``solution.event_time``
         and the status tell whether it happened.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
         more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
-        components, and for up to 40 in runs of 20,000 steps and more; it falls back, with a warning, where the system
-        uses what cannot be compiled.
+        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
+        with a warning, where the system uses what cannot be compiled.
     on_failure : {"raise", "return"}
         What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
         ``.solution``, or returned, with a ``status`` that says what happened.
@@ -119,17 +122,10 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    state = system.state(x0)
-    if isinstance(system, LiePoissonSystem) and system.group is not None and isinstance(method, OneStepMethod):
-        assert system.reconstruction is not None
-        method = WithAttitude(method.on(system), system.reconstruction)
-        system = AttitudeSystem(system)
-        state = system.begin(state, attitude)
-    elif attitude is not None:
+    system, method = _as_run(system, method)
+    _prepared(system, method)  # refuses what the method cannot run
+    if attitude is not None and not isinstance(system, AttitudeSystem):
         raise InputError("an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)")
-    if isinstance(method, OneStepMethod):
-        method = method.on(system)
-        method.check(system)
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -137,7 +133,10 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    run = _Run(system, method, state, table, save_to, engine)
+    x = system.begin(x0, attitude) if isinstance(system, AttitudeSystem) else system.state(x0)
+    if reason := system.outside(x):
+        raise InputError(f"the run cannot start at this x0: {reason}")
+    run = _Run(system, method, x, table, save_to, engine)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
@@ -265,13 +264,21 @@ class _Run:
         x = self.states[0][0]
         if self.engine == "compiled":
             try:
-                return compiled.begin(self.system, self.method, x)
+                if self._affordable():
+                    return compiled.begin(self.system, self.method, x)
+                self.engine = "array"
             except UnsupportedPrimitive as error:
                 if not self.fallback:
                     raise
                 warn_of_fallback(error, stacklevel=6)
                 self.engine = "array"
         return array.begin(self.system, self.method, x)
+
+    def _affordable(self) -> bool:
+        """Whether to compile: where it was asked for, where it is quick, or where a long run repays it."""
+        if not self.fallback or self.table.steps >= COMPILED_STEPS:
+            return True
+        return compiled.stepper_for(self.system, self.method)[0].operations <= SMALL_PROGRAM
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
@@ -312,18 +319,21 @@ class _Run:
 
     def _culprit(self, state) -> str:
         """Which function is not finite just ahead of the last good state."""
-        complaint = self.method.complaint(self.system, jnp.asarray(state.x), self.table.h, jnp.asarray(state.k))
-        if complaint is not None:
-            return complaint
         ahead = jnp.asarray(state.x) + self.table.h * jnp.nan_to_num(jnp.asarray(state.k[0]))
         system = self.system
+        if isinstance(self.method, OneStepMethod) and (
+            reason := self.method.explain(system, state.x, state.k, self.table.h)
+        ):
+            return reason
         suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}
         if system.entropy is not None:
             suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
         for name, function in suspects.items():
             if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
                 return f"the {name} first, near x = {np.array2string(np.asarray(ahead), precision=4, threshold=8)}"
-        return "the iteration overflowed"
+        return (
+            system.outside(ahead) or f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
+        )
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
 
@@ -356,7 +366,7 @@ class _Run:
         """What there is so far."""
         system = self.system
         x = np.concatenate(self.states)
-        invariants = system.invariants()
+        invariants, laws = _prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
         wall = time.perf_counter() - self.started
         found = Solution(
@@ -364,10 +374,13 @@ class _Run:
             x=x,
             energy=energy,
             entropy=None if system.entropy is None else entropy,
-            casimirs={name: at_points(_value, function, x) for name, (function, _) in invariants.items()},
+            casimirs={
+                name: at_points(_value, function, x)
+                for name, function in {**{name: f for name, (f, _) in invariants.items()}, **system.ledger}.items()
+            },
             status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=laws_of(system, self.method, invariants),
+            laws=laws,
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
@@ -411,10 +424,30 @@ def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
     warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
 
 
+@remembered
+def _as_run(system: System, method) -> tuple[System, Any]:
+    """The system and the method as they are run: with attitudes where there is a group, in charts on a manifold."""
+    if not isinstance(method, OneStepMethod):
+        return system, method
+    method = method.on(system)
+    if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
+        return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
+    return system, method
+
+
+@remembered
+def _prepared(system: System, method) -> tuple[dict, Laws]:
+    """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    invariants = system.invariants()
+    return invariants, laws_of(system, method, invariants)
+
+
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
-    return Laws(system.energy_law, system.entropy_law, conserved)
+    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger))
 
 
 def _value(function, x):
@@ -445,6 +478,7 @@ def _power_of_two(n: int) -> int:
     return 1 << max(0, n - 1).bit_length()
 
 
+@functools.cache
 def _version() -> str:
     try:
         return metadata.version("liethermo")

@@ -191,7 +191,9 @@ def inverse(a) -> jax.Array:
 
 def determinant(a) -> jax.Array:
     """Determinant, the signed product of the pivots."""
-    return _eliminate(a, a[..., :0])[1]
+    det = _eliminate(a, a[..., :0])[1]
+    # a matrix of numbers leads to NaN only by way of a pivot of zero
+    return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
 
 
 def largest(matrix) -> jax.Array:

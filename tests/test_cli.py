@@ -294,7 +294,10 @@ REFUSALS = {
     ),
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
-        ['method.name = "Referense": must be one of "MetriplecticMidpoint", "Reference" (did you mean Reference?)'],
+        [
+            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", "Reference" '
+            "(did you mean Reference?)"
+        ],
     ),
     "option of a method": (
         [MODEL, RUN, '[method]\ngradiant = "gonzalez"'],

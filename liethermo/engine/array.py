@@ -85,13 +85,11 @@ class _Iteration(NamedTuple):
         return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, exact: bool = True) -> Solved:
-    """Solve ``k = slopes(k)`` from ``guess``; ``scale(k)`` is the size that the plateau is measured against.
+def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable) -> Solved:
+    """Solve ``k = slopes(k)`` from ``guess``.
 
-    On manifolds the Jacobian is not ``exact`` but made of differences: the second derivatives of a chart may not exist,
-    and where they do the compiler would spend most of its time on what is hardly ever needed.
+    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``.
     """
-    derivative = jax.jacfwd if exact else _differences
 
     def fixed_point_goes_on(s: _Iteration):
         slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
@@ -112,7 +110,7 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, exact: boo
 
     def newton(s: _Iteration):
         flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        inverse = _inverse(derivative(flat)(s.k.ravel()))
+        inverse = _inverse(jacobian(s.k))
 
         def reuse(carry):
             inner, _ = carry
@@ -132,19 +130,6 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, exact: boo
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.update, second.update)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.made, second.made)
-
-
-def _differences(function: Callable) -> Callable:
-    """The Jacobian by one-sided differences: half of the digits, which is enough for Newton's method."""
-
-    def jacobian(k):
-        size = jnp.max(jnp.abs(k))
-        step = EPS**0.5 * jnp.where(size > 0.0, size, 1.0)
-        shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
-        values = jax.lax.map(lambda shift: function(k + shift), shifts)
-        return ((values[1:] - values[0]) / step).T
-
-    return jacobian
 
 
 @jax.custom_batching.custom_vmap
@@ -219,8 +204,12 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def scale(k):
         return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k))
 
-    guess = method.predict(state.k, state.before)
-    solved = solve_stages(lambda k: method.slopes(system, x, low, h, k), guess, scale, system.space is None)
+    solved = solve_stages(
+        lambda k: method.slopes(system, x, low, h, k),
+        method.predict(state.k, state.before),
+        scale,
+        lambda k: method.jacobian(system, x, low, h, k),
+    )
     new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
@@ -306,7 +295,7 @@ def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
     """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are."""
     new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
-    if system.energy_law == "conserved":
+    if system.energy_law == "conserved" and "energy" in method.preserves:
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
     return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy
 

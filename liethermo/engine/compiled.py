@@ -33,6 +33,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from . import array, step_loop
 from .array import State
+from .remembered import fingerprint, remembered
 from .scalarize import Program, scalarize
 
 VECTORS = {"x": "X", "low": "LOW", "k": "K", "before": "BEFORE"}
@@ -58,6 +59,9 @@ NUMBERS = {
 
 WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS"
 """The other rows of one number."""
+
+VECTORS_OF_NEWTON = {"LINEAR": "linear", "DIRECTION": "direction", "CHANGES": "change"}
+"""Arrays that lie outside the rows, for one lane at a time, and their names in the step loop."""
 
 CONSTANTS = """FIXED_POINT_LIMIT FLOOR HARD IDLE ITERATING NEWTON_LIMIT NEWTON_REUSE NON_FINITE NOT_CONVERGED PLATEAU
 SHRINKING SLOW SOLVED"""
@@ -118,8 +122,9 @@ class Stepper:
     def __init__(self, form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int, varies: np.ndarray):
         self.lanes = lanes
         system, rebuilt = form.build(parameters), form.build
-        self._stiff = False  # whether some step has asked for Newton's method: the loop then has it from the start
+        self._hard_steps = 0  # that have asked for Newton's method
         self._loops: dict[bool, Callable] = {}
+        self._slow: ModuleType | None = None
         self._lock = threading.Lock()
         self._relaxing = int(system.energy_law != "nonincreasing")
         self._varies = varies
@@ -132,9 +137,8 @@ class Stepper:
             new = method.slopes(rebuilt(p), x, low, h[0], k)
             return new, jnp.max(jnp.abs(new - k)), jnp.max(jnp.abs(new))
 
-        def jacobian(p, x, low, h, k):
-            misfit = lambda v: method.slopes(rebuilt(p), x, low, h[0], v.reshape(k.shape)).ravel() - v  # noqa: E731
-            return jax.jacfwd(misfit)(k.ravel())
+        def along(p, x, low, h, k, direction):
+            return method.change(rebuilt(p), x, low, h[0], k, direction)
 
         def finish(p, x, low, h, k, first_energy):
             return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])
@@ -142,11 +146,11 @@ class Stepper:
         def start(p, x):
             return method.start(rebuilt(p), x), *array.values(rebuilt(p), x)
 
-        n, m = system.dim, system.dim * method.stages
+        n = system.dim
         self._shapes: dict[str, tuple[int, ...]] = dict.fromkeys([*NUMBERS.values(), *WORK.split()], (1,))
         self._shapes |= dict.fromkeys(("X", "LOW", "AFTER", "AFTER_LOW"), (n,))
-        self._shapes |= dict.fromkeys(("K", "BEFORE", "GUESS", "NEW"), (method.stages, n))
-        self._shapes |= {"P": parameters.shape, "MATRIX": (m, m)}
+        self._shapes |= dict.fromkeys(("K", "BEFORE", "GUESS", "NEW", "DIRECTION", "CHANGES"), (method.stages, n))
+        self._shapes |= {"P": parameters.shape}
 
         step, end = "P X LOW H GUESS", "P X LOW H GUESS FIRST_ENERGY"
         # What an iteration needs and does not change is computed once a step.
@@ -161,12 +165,20 @@ class Stepper:
             "finish": [_Piece(self._traced(finish, end), end, "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK")],
         }
         self._start = self._traced(start, "P X")
-        self._jacobian = lambda: _Piece(self._traced(jacobian, step), step, "MATRIX")
+        # Of a derivative, what is the same in every direction is computed once a Jacobian.
+        self._derivative = lambda: self._traced(along, f"{step} DIRECTION").split([len(step.split())])
+        self._step_arguments = step
 
         sizes = {name: math.prod(shape) for name, shape in self._shapes.items()}
-        sizes |= {"P": int(self._varies.sum()), "MATRIX": 0}
+        sizes |= {"P": int(self._varies.sum()), "DIRECTION": 0, "CHANGES": 0}
         self._rows = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
         self._height = sum(sizes.values())
+
+    @property
+    def operations(self) -> int:
+        """Scalar operations of a step with one iteration."""
+        pieces = itertools.chain.from_iterable(self._programs.values())
+        return sum(len(piece.program.instructions) for piece in pieces)
 
     def _traced(self, function: Callable, arguments: str) -> Program:
         shapes = [jax.ShapeDtypeStruct(self._shapes[a], jnp.float64) for a in arguments.split()]
@@ -196,7 +208,8 @@ class Stepper:
 
         def fill(first, values):
             rows = np.asarray(values, dtype=np.float64).reshape(number, -1)
-            rows = np.concatenate([rows, np.repeat(rows[-1:], count * lanes - number, axis=0)])  # some lanes stay empty
+            if number < count * lanes:  # some lanes stay empty
+                rows = np.concatenate([rows, np.repeat(rows[-1:], count * lanes - number, axis=0)])
             blocks[:, first : first + rows.shape[1]] = rows.reshape(count, lanes, -1).swapaxes(1, 2)
 
         for name, row in {**VECTORS, **NUMBERS}.items():
@@ -227,32 +240,47 @@ class Stepper:
         start = self._rows["H"] * lanes
         blocks[:, start : start + lanes] = h
         out, done = np.empty((count, saves, (n + 2) * lanes)), np.zeros(count, dtype=np.int64)
-        if not self._loop(self._stiff)(parameters, blocks, done, saves, every, out):
-            self._stiff = True
-            self._loop(True)(parameters, blocks, done, saves, every, out)
+        while (hard := self._loop()(parameters, blocks, done, saves, every, out, saves * every)) < count:
+            self._hard_steps += lanes
+            if self._hard_steps <= SPELLED_OUT:
+                one = slice(hard, hard + 1)
+                with np.errstate(all="ignore"):
+                    self._spelled_out().advance(parameters, blocks[one], done[one], saves, every, out[one], 1)
         return out.reshape(count, saves, n + 2, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, n + 2)
 
     # -- modules ------------------------------------------------------------------------------------------------------
 
-    def _loop(self, newton: bool) -> Callable:
-        """The function ``advance`` of the module, compiled or found compiled."""
+    def _loop(self) -> Callable:
+        """The function ``advance`` of the module, compiled or found compiled; with Newton's method where it pays."""
+        newton = self._hard_steps > SPELLED_OUT
         with self._lock:
             if newton not in self._loops:
                 self._loops[newton] = load(self._text(newton), self._try_out).advance
             return self._loops[newton]
 
+    def _spelled_out(self) -> ModuleType:
+        """The module with Newton's method, run by Python as it stands: a thousand times as slow, and there at once."""
+        with self._lock:
+            if self._slow is None:
+                self._slow = ModuleType("spelled_out")
+                text = self._text(True, "lambda **options: lambda f: f").replace("CACHE", "False")
+                exec(compile(text, "<step>", "exec"), self._slow.__dict__)
+            return self._slow
+
     def _try_out(self, module: ModuleType) -> None:
         """Take no step, which compiles the loop or finds it compiled."""
         blocks, done = np.zeros((0, self._height * self.lanes)), np.zeros(0, dtype=np.int64)
-        module.advance(np.zeros(self._shapes["P"]), blocks, done, 0, 1, np.zeros((0, 0, 0)))
+        module.advance(np.zeros(self._shapes["P"]), blocks, done, 0, 1, np.zeros((0, 0, 0)), 0)
 
-    def _text(self, newton: bool) -> str:
-        lanes, n, m = self.lanes, self._shapes["X"][0], self._shapes["MATRIX"][0]
-        lines = ["import math", "", "import numpy as np", "from numba import njit as compiled", ""]
+    def _text(self, newton: bool, compiled: str = "numba.njit") -> str:
+        lanes, n, m = self.lanes, self._shapes["X"][0], math.prod(self._shapes["K"])
+        lines = ["import math", "", "import numba", "import numpy as np", "", f"compiled = {compiled}"]
         lines += ["entry = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
         # inlined, the programs keep their values in registers; with Newton's method there are too many calls for that
         lines += [f"njit = compiled(error_model='numpy', nogil=True, forceinline={not newton})"]
         lines += [f"N, M, LANES, NEWTON = {n}, {m}, {lanes}, {newton}"]
+        derivative, size = self._derivative_programs(newton)
+        lines += [f"LINEAR = {size}"]
         lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS.split()]
         lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]
         lines += [f"RELAXING = {self._relaxing * lanes}"]
@@ -260,9 +288,22 @@ class Stepper:
             body = [line for i, piece in enumerate(pieces) for line in self._body(piece, f"_{i}")]
             loop = ["    for l in range(first, last):", *(f"        {line}" for line in body)]
             lines += ["", "", "@njit", f"def {name}(p, w, first, last):", *loop]
-        body = self._body(self._jacobian()) if newton else ["pass"]
-        lines += ["", "", "@njit", "def jacobian(p, w, l, matrix):", *(f"    {line}" for line in body)]
+        for heading, body in derivative.items():
+            lines += ["", "", "@njit", f"def {heading}:", *(f"    {line}" for line in body)]
         return "\n".join(lines) + "\n\n\n" + _template()
+
+    def _derivative_programs(self, newton: bool) -> tuple[dict[str, list[str]], int]:
+        """The functions of Newton's method, empty where it is not wanted; the length of what the first hands on."""
+        first, second = "linearise(p, w, l, linear)", "along(p, w, l, linear, direction, change)"
+        if not newton:
+            return {first: ["pass"], second: ["pass"]}, 1
+        linear, along = self._derivative()
+        (size,) = self._shapes["LINEAR"] = linear.shapes[0]
+        arguments = f"{self._step_arguments} DIRECTION"
+        return {
+            first: self._body(_Piece(linear, arguments, "LINEAR")),
+            second: self._body(_Piece(along, f"{arguments} LINEAR", "CHANGES")),
+        }, max(1, size)
 
     def _body(self, piece: _Piece, prefix: str = "") -> list[str]:
         return piece.program.body(self._cells(piece.arguments), self._cells(piece.results), prefix)
@@ -274,11 +315,16 @@ class Stepper:
             size = math.prod(self._shapes[name])
             if name == "P":
                 cells += [f"w[{next(own) * lanes} + l]" if v else f"p[{i}]" for i, v in enumerate(self._varies)]
-            elif name == "MATRIX":
-                cells += [f"matrix[{i}, {j}]" for i, j in np.ndindex(self._shapes[name])]
+            elif name in VECTORS_OF_NEWTON:
+                cells += [f"{VECTORS_OF_NEWTON[name]}[{i}]" for i in range(size)]
             else:
                 cells += [f"w[{(self._rows[name] + i) * lanes} + l]" for i in range(size)]
         return cells
+
+
+SPELLED_OUT = 1000
+"""Steps with Newton's method, times lanes, up to which it is not compiled: the program of a derivative is long, and a
+single large step would cost half a minute. Python takes some milliseconds for one."""
 
 
 class _Piece(NamedTuple):
@@ -344,7 +390,10 @@ def stepper_of(
     """
     varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
     known = (parameters == 0.0) & ~varies
-    key = (form.key, form.shapes, known.tobytes(), method, lanes, varies.tobytes())
+    method_key = fingerprint(method)
+    if method_key is None:
+        return Stepper(form, parameters, method, lanes, varies)
+    key = (form.key, form.shapes, known.tobytes(), method_key, lanes, varies.tobytes())
     if key not in _steppers:
         while len(_steppers) >= STEPPERS:
             del _steppers[next(iter(_steppers))]
@@ -352,6 +401,7 @@ def stepper_of(
     return _steppers[key]
 
 
+@remembered
 def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndarray]:
     """The stepper for one trajectory of a system, and the system's parameters."""
     leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))

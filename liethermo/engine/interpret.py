@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .remembered import fingerprint, remembered
 from .scalarize import Program, UnsupportedPrimitive, scalarize
 
 LIMIT = 8_000
@@ -34,6 +35,7 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
     return evaluator(function, model, np.shape(points)[1])(points)
 
 
+@remembered
 def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
     """The map from points, shape (m, dim), to :func:`at_points` there, unrolled once."""
     try:
@@ -57,7 +59,8 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
     if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
         return math.inf  # a function that closes over what is being traced
     try:
-        return scalarize(closed, limit=LIMIT).degree(len(leaves))
+        with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+            return scalarize(closed, limit=LIMIT).degree(len(leaves))
     except UnsupportedPrimitive:
         return math.inf
 
@@ -70,7 +73,8 @@ KNOWN = 256
 
 def _unrolled(function: Callable, model: Any, shape: tuple[int, ...]) -> tuple[Program, Any]:
     """The program, and the structure of its results; the same model, array by array, is unrolled once."""
-    key = _identity(function, model, shape)
+    model_key = fingerprint((function, model))
+    key = None if model_key is None else (model_key, shape)
     if key is not None and key in _known:
         return _known[key]
     closed, found = jax.make_jaxpr(lambda x: function(model, x), return_shape=True)(
@@ -82,21 +86,6 @@ def _unrolled(function: Callable, model: Any, shape: tuple[int, ...]) -> tuple[P
             del _known[next(iter(_known))]
         _known[key] = unrolled
     return unrolled
-
-
-def _identity(function: Callable, model: Any, shape: tuple[int, ...]) -> Any:
-    """A key that tells models apart by the values of arrays and the identity of functions; None where there is none."""
-    leaves, structure = jax.tree_util.tree_flatten(model)
-    try:
-        parts = tuple(
-            (leaf.shape, np.asarray(leaf).tobytes()) if isinstance(leaf, jax.Array | np.ndarray | np.generic) else leaf
-            for leaf in leaves
-        )
-        key = (function, structure, parts, shape)
-        hash(key)
-    except (TypeError, jax.errors.JAXTypeError):  # something unhashable, or traced
-        return None
-    return key
 
 
 @eqx.filter_jit

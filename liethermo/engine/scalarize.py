@@ -170,8 +170,18 @@ class Program:
         def text(a: Scalar) -> str:
             return prefix + a if isinstance(a, str) else _number(a)
 
+        def line(i: Instruction) -> str:
+            args = [text(a) for a in i.args]
+            if i.op in (
+                "select",
+                "max",
+                "min",
+            ):  # a plain float could not divide by zero in Python
+                args = [f"np.float64({t})" if isinstance(a, float) else t for a, t in zip(i.args, args, strict=True)]
+            return f"{prefix}{i.target} = {OPERATIONS[i.op].format(*args)}"
+
         loads = [f"{prefix}{name} = {source}" for name, source in zip(names, sources, strict=True) if name in used]
-        lines = [f"{prefix}{i.target} = {OPERATIONS[i.op].format(*map(text, i.args))}" for i in self.instructions]
+        lines = [line(i) for i in self.instructions]
         stores = [f"{target} = {text(a)}" for target, a in zip(targets, results, strict=True)]
         return loads + lines + stores
 

@@ -26,9 +26,10 @@ from .array import (
 IDLE, ITERATING, SOLVED, HARD = 0, 1, 2, 3
 """Phases of a lane within a step."""
 
-N = M = LANES = 1
+N = M = LANES = LINEAR = 1
 NEWTON = False
-"""Components of the state and of all stage slopes together; trajectories in a block; whether there is a Jacobian."""
+"""Components of the state, of all stage slopes together; trajectories in a block; numbers of ``linearise``; whether the
+last two programs are there."""
 
 X = LOW = K = BEFORE = GUESS = NEW = AFTER = AFTER_LOW = AFTER_ENERGY = AFTER_ENTROPY = CHECK = 0
 H = SIZE = UPDATE = SLOPE = PREVIOUS = BEST = STALLED = PHASE = CHANGE = TRIES = CORRECTIONS = 0
@@ -45,8 +46,12 @@ def iterate(p, w, first, last):
     """NEW, the slopes at GUESS; UPDATE, their largest difference; SLOPE, the largest of them."""
 
 
-def jacobian(p, w, lane, matrix):
-    """The derivative of NEW - GUESS by GUESS."""
+def linearise(p, w, lane, linear):
+    """What the derivative of NEW by GUESS, at GUESS, needs in every direction."""
+
+
+def along(p, w, lane, linear, direction, change):
+    """The derivative of NEW - GUESS by GUESS in one direction."""
 
 
 def finish(p, w, first, last):
@@ -125,6 +130,19 @@ def substitute(A, order, b):
 
 
 @njit
+def jacobian(p, w, l, matrix, linear, direction, change):
+    """The derivative of NEW - GUESS by GUESS, column by column."""
+    linearise(p, w, l, linear)
+    direction[:] = 0.0
+    for j in range(M):
+        direction[j] = 1.0
+        along(p, w, l, linear, direction, change)
+        direction[j] = 0.0
+        for i in range(M):
+            matrix[i, j] = change[i]
+
+
+@njit
 def misfit(p, w, l):
     """``|slopes(k) - k|`` at the GUESS of a lane."""
     iterate(p, w, l, l + 1)
@@ -135,7 +153,7 @@ def misfit(p, w, l):
 
 
 @njit
-def solve_by_newton(p, w, l, matrix, order, b):
+def solve_by_newton(p, w, l, matrix, order, b, linear, direction):
     """Simplified Newton for one lane."""
     # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may wander.
     prepare(p, w, l, l + 1)
@@ -147,7 +165,7 @@ def solve_by_newton(p, w, l, matrix, order, b):
     status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
     while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:
-            jacobian(p, w, l, matrix)
+            jacobian(p, w, l, matrix, linear, direction, b)
             if not factorise(matrix, order):
                 status, update = NON_FINITE, np.nan
                 break
@@ -180,7 +198,7 @@ def solve_by_newton(p, w, l, matrix, order, b):
 
 
 @njit
-def take_step(p, w, matrix, order, b):
+def take_step(p, w, matrix, order, b, linear, direction):
     """One step of every lane that is running; where one fails its state stays and a status says why.
 
     False, and nothing has happened, where some lane needs Newton's method and the module has none.
@@ -208,7 +226,7 @@ def take_step(p, w, matrix, order, b):
             return False
         for l in range(LANES):
             if w[PHASE + l] == HARD:
-                solve_by_newton(p, w, l, matrix, order, b)
+                solve_by_newton(p, w, l, matrix, order, b, linear, direction)
     finish(p, w, 0, LANES)
     for l in range(LANES):
         solved = w[PHASE + l] == SOLVED
@@ -246,22 +264,24 @@ def take_step(p, w, matrix, order, b):
 
 
 @entry
-def advance(p, blocks, done, saves, every, out):
+def advance(p, blocks, done, saves, every, out, most):
     """Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept, with its energies.
 
-    False where a block needs Newton's method and the module has none: another call, with one that has, goes on there.
+    No further than ``most`` steps, or to where a block needs Newton's method and the module has none: the number of
+    that block is returned, and another call, with a module that has, goes on there; otherwise the number of blocks.
     """
     matrix, order, b = np.empty((M, M)), np.empty(M, np.int64), np.empty(M)
+    linear, direction = np.empty(LINEAR), np.empty(M)
     for block in range(len(blocks)):
-        w = blocks[block]
-        while done[block] < saves * every:
+        w, end = blocks[block], min(saves * every, done[block] + most)
+        while done[block] < end:
             running = 0
             for l in range(LANES):
                 running += 1 if w[STATUS + l] == 0.0 else 0
             if running == 0:
                 break
-            if not take_step(p, w, matrix, order, b):
-                return False
+            if not take_step(p, w, matrix, order, b, linear, direction):
+                return block
             done[block] += 1
             if done[block] % every == 0:
                 kept = out[block, done[block] // every - 1]
@@ -269,4 +289,4 @@ def advance(p, blocks, done, saves, every, out):
                     kept[i] = w[X + i]
                 for i in range(2 * LANES):
                     kept[N * LANES + i] = w[ENERGY + i]
-    return True
+    return len(blocks)

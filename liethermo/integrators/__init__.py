@@ -2,10 +2,13 @@
 
 from .base import OneStepMethod, registered_methods
 from .charts import InCharts
+from .discrete import DiscreteSystem, FiniteDifference
 from .gauss import MetriplecticGauss
+from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
+from .variational import VariationalIntegrator
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
     "Reference": Reference
@@ -14,11 +17,15 @@ METHODS: dict[str, type] = {type(method).__name__: type(method) for method in re
 
 __all__ = [
     "METHODS",
+    "DiscreteHerglotz",
+    "DiscreteSystem",
+    "FiniteDifference",
     "InCharts",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "OneStepMethod",
     "Reference",
+    "VariationalIntegrator",
     "WithAttitude",
     "registered_methods",
 ]

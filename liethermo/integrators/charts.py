@@ -8,6 +8,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 
@@ -76,10 +77,23 @@ class InCharts(OneStepMethod):
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)
 
-    def complaint(self, system: System, x, h, k) -> str | None:
+    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+        """By one-sided differences, with half of the digits, which is enough for Newton's method.
+
+        The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
+        what is hardly ever needed.
+        """
+        size = jnp.max(jnp.abs(k))
+        step = _ROOT_EPS * jnp.where(size > 0.0, size, 1.0)
+        shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
+        values = jax.lax.map(lambda shift: self.slopes(system, x, low, h, k + shift.reshape(k.shape)).ravel(), shifts)
+        return ((values[1:] - values[0]) / step).T - jnp.eye(k.size)
+
+    def explain(self, system: System, x, k, h) -> str:
+        x, k = jnp.asarray(x), jnp.asarray(k)
         reach = float(self._reach(system, x, self.increment(h, k)))
         if not reach >= 0.5:
-            return None
+            return ""
         radius = self.retraction.space.injectivity_radius(system.points(x))
         return (
             f"the last step was {reach:.3g} times as long as the domain of {self.retraction} allows (injectivity "
@@ -127,6 +141,9 @@ class InCharts(OneStepMethod):
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"
+
+
+_ROOT_EPS = float(np.finfo(np.float64).eps) ** 0.5
 
 
 class _Step(NamedTuple):

@@ -1,7 +1,27 @@
-"""Named systems, ready to run, each with its source and reference data."""
+"""Named systems, ready to run, each with its source and reference data.
+
+A function ``model_solution`` beside a model, in its module, is the exact solution.
+"""
 
 from __future__ import annotations
 
+from .cylinder import cylinder
+from .gas_piston import gas_piston
+from .mass_spring_gas import mass_spring_gas
+from .oscillator import damped_oscillator
 from .rigid_body import free_rigid_body, rigid_body
+from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
+from .thermoelastic_chain import thermoelastic_chain
 
-__all__ = ["free_rigid_body", "rigid_body"]
+__all__ = [
+    "cylinder",
+    "damped_oscillator",
+    "free_rigid_body",
+    "gas_piston",
+    "mass_spring_gas",
+    "moving_thermo_particles",
+    "rigid_body",
+    "thermo_particles",
+    "thermo_springs",
+    "thermoelastic_chain",
+]

@@ -3,16 +3,27 @@
 from .attitude import AttitudeSystem
 from .base import System
 from .chart import ChartSystem
+from .composed import ComposedSystem, Subsystem
 from .euler_poincare import EulerPoincareSystem, Legendre
+from .evolution import ContactSystem, EvolutionSystem
+from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
+from .simple_closed import SimpleClosedSystem
 
 __all__ = [
     "AttitudeSystem",
     "ChartSystem",
+    "ComposedSystem",
+    "ContactSystem",
     "EulerPoincareSystem",
+    "EvolutionSystem",
+    "Herglotz",
     "Legendre",
     "LiePoissonSystem",
     "MetriplecticSystem",
+    "SimpleClosedSystem",
+    "Subsystem",
     "System",
+    "ThermodynamicHerglotz",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -50,6 +50,10 @@ class System(eqx.Module):
     momentum_maps: dict[str, Energy]
     dim: int = eqx.field(static=True)
     space: mf.Space | None = eqx.field(static=True)
+
+    production_name: ClassVar[str] = "dS/dt"
+    domain: ClassVar[str] = ""
+    """What a state of the system has to have beyond finite components, in words."""
 
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
@@ -174,8 +178,8 @@ class System(eqx.Module):
         return () if self.dissipation is None else self.dissipation.preserve
 
     @property
-    def energy_law(self) -> Law:
-        """ "conserved", or "nonincreasing" under double-bracket dissipation."""
+    def energy_law(self) -> Law | None:
+        """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
         return "conserved" if self.dissipation is None else self.dissipation.energy_law
 
     @property
@@ -207,6 +211,11 @@ class System(eqx.Module):
             bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
             for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
         ]
+
+    @property
+    def ledger(self) -> dict[str, Energy]:
+        """What the system receives from outside, recorded along a run, by name."""
+        return {}
 
     def _casimirs(self) -> dict[str, Energy]:
         """Casimirs of the Poisson structure worth recording."""
@@ -263,6 +272,16 @@ class System(eqx.Module):
             ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
         """
         return check_system(self, points, samples, seed, scale)
+
+    def outside(self, x) -> str:
+        """Why a state lies outside the domain of the system, in words; empty where it does not."""
+        del x
+        return ""
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
+        del x
+        return {}
 
     def _validate(self) -> None:
         """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""

@@ -37,7 +37,7 @@ class Legendre(Energy):
 
     def velocity(self, mu) -> jax.Array:
         """xi with ``dl/dxi = mu``, shape (n,); NaN where Newton's method finds none."""
-        return _inverse_gradient(self.lagrangian, jnp.asarray(mu))
+        return inverse_gradient(self.lagrangian, jnp.asarray(mu))
 
     def momentum(self, xi) -> jax.Array:
         """``dl/dxi``, shape (n,)."""
@@ -130,7 +130,9 @@ def _need_regular(lagrangian: Energy, dim: int) -> None:
 
 
 @eqx.filter_custom_jvp
-def _inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
+def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
+    """xi with ``grad lagrangian (xi) = mu``, shape (n,), by damped Newton; NaN where it finds none."""
+
     def residual(xi):
         return lagrangian.gradient(xi) - mu
 
@@ -159,11 +161,11 @@ def _inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
     return jnp.where(jnp.linalg.norm(r) <= 1e-10 * (1.0 + jnp.linalg.norm(mu)), xi, jnp.nan)
 
 
-@_inverse_gradient.def_jvp
+@inverse_gradient.def_jvp
 def _inverse_gradient_jvp(primals, tangents):
     lagrangian, mu = primals
     lagrangian_dot, mu_dot = tangents
-    xi = _inverse_gradient(lagrangian, mu)
+    xi = inverse_gradient(lagrangian, mu)
     # d(grad l)(xi) + l''(xi) dxi = dmu
     change = jnp.zeros_like(mu) if mu_dot is None else mu_dot
     if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):

@@ -73,8 +73,11 @@ def test_save_every(every):
     assert_same(*both(BODY, X0, (0.0, 30.05), 0.1, save_every=every))
 
 
-def test_newton_on_demand():
-    """The module with a Jacobian is made where a step first asks for it, in the middle of a save interval too."""
+@pytest.mark.parametrize("spelled_out", [1000, 10])
+def test_newton_on_demand(spelled_out, monkeypatch):
+    """Run by Python at first, compiled where steps go on asking for it, in the middle of a save interval too."""
+    monkeypatch.setattr(compiled, "SPELLED_OUT", spelled_out)
+    monkeypatch.setattr(compiled, "_steppers", {})
     stiff = lt.models.rigid_body(rate=200.0)
     a, b = both(stiff, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, save_every=3)
     assert b.stats.newton_iterations > 0

@@ -1,0 +1,111 @@
+"""Weighted graphs between the parts of a composed system, from matrices or lists of edges, checked."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from .errors import InputError
+
+ASYMMETRY = 1e-12
+"""How far a symmetric matrix may be from its transpose, relative to its largest entry."""
+
+
+class Edges(NamedTuple):
+    """Each edge once: its two ends and its weight.
+
+    Attributes
+    ----------
+    first, second : ndarray of int, shape (edges,)
+        With first < second.
+    weight : array, shape (edges,)
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    weight: jax.Array
+
+
+def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
+    """The edges of a symmetric graph without negative weights; those of weight zero are left out.
+
+    Parameters
+    ----------
+    graph : array, shape (nodes, nodes), or SciPy sparse matrix; or sequence of (i, j, weight), each pair once; or a
+        number for the one edge of two nodes
+    nodes : int
+    what : str
+        What the weights are, for messages.
+    names : tuple of str
+        Of the nodes, for messages.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(graph, jax.core.Tracer):  # a matrix that is being swept or differentiated: all of its edges
+        first, second = np.triu_indices(nodes, 1)
+        return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
+    first, second, weight = _listed(graph, nodes, what)
+    for i, j, k in zip(first, second, weight, strict=True):
+        if i == j:
+            raise InputError(f"{what} of {names[i]} with itself is {k:g}: leave the diagonal zero")
+        if not (k >= 0.0 and np.isfinite(k)):
+            raise InputError(f"{what} between {names[i]} and {names[j]} is {k:g}: it must be finite and >= 0")
+    kept = weight > 0.0
+    return Edges(first[kept], second[kept], jnp.asarray(weight[kept]))
+
+
+def parts(graph: Edges, nodes: int) -> np.ndarray:
+    """The number of the connected part that each node belongs to, shape (nodes,)."""
+    matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (nodes, nodes))
+    return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
+
+
+def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if scipy.sparse.issparse(graph) or _is_matrix(graph):
+        return _of_matrix(scipy.sparse.coo_array(graph), nodes, what)
+    if np.ndim(graph) == 0:
+        if nodes != 2:
+            raise InputError(f"{what} as one number is meant for two parts, not {nodes}: give a matrix or edges")
+        graph = [(0, 1, graph)]
+    found: dict[tuple[int, int], float] = {}
+    for edge in graph:
+        try:
+            i, j, k = edge
+            i, j, k = int(i), int(j), float(k)
+        except (TypeError, ValueError):
+            raise InputError(f"{what}: an edge is (i, j, weight), not {edge!r}") from None
+        if not (0 <= i < nodes and 0 <= j < nodes):
+            raise InputError(f"{what}: the edge ({i}, {j}) leaves the {nodes} parts, which count from 0")
+        if (min(i, j), max(i, j)) in found:
+            raise InputError(f"{what}: the edge between {i} and {j} is given twice")
+        found[min(i, j), max(i, j)] = k
+    ends = np.array(list(found), dtype=int).reshape(-1, 2)
+    return ends[:, 0], ends[:, 1], np.array(list(found.values()))
+
+
+def _of_matrix(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if matrix.shape != (nodes, nodes):
+        raise InputError(f"{what} is a ({nodes}, {nodes}) matrix for {nodes} parts, not one of shape {matrix.shape}")
+    asymmetry = abs(matrix - matrix.T).max()
+    if not asymmetry <= ASYMMETRY * abs(matrix).max():
+        raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
+    upper = scipy.sparse.triu(matrix).tocoo()
+    return upper.row.astype(int), upper.col.astype(int), upper.data.astype(float)
+
+
+def _is_matrix(graph) -> bool:
+    try:
+        array = np.asarray(graph, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return array.ndim == 2 and array.shape[0] == array.shape[1] and not _is_edge_list(graph)
+
+
+def _is_edge_list(graph) -> bool:
+    return isinstance(graph, list | tuple) and all(isinstance(edge, tuple) for edge in graph)

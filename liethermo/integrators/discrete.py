@@ -1,0 +1,247 @@
+"""Discrete simple systems: finite difference maps, and what they make of a Lagrangian, of forces and of the constraint.
+
+A pair (q_0, q_1, S_0, S_1) is given to the step equations in the coordinates (q_0, V, S_0, s) with the difference
+quotients ``V = (q_1 - q_0)/h``, ``s = (S_1 - S_0)/h``: differences of nearby positions would lose the digits that
+the step is about.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from manifolds.matrix_functions import solve
+
+from ..errors import InputError
+from ..systems import SimpleClosedSystem
+
+
+class FiniteDifference(eqx.Module):
+    """The finite difference map of the alpha family, in the form of its q-, v- and S-representatives [GBY 3.5, §5.1].
+
+        phi(q_0, q_1, S_0, S_1) = ((1 - alpha) q_0 + alpha q_1, V; (1 - beta) S_0 + beta S_1, s)
+
+    Forces act where q is represented, ``F^-_d = h (1 - alpha) F`` and ``F^+_d = h alpha F``.
+
+    A subclass may represent a pair otherwise: it gives :meth:`position`, :meth:`velocity` or :meth:`entropy`, with
+    ``phi(q, q, S, S) = (q, 0; S, 0)``, and says whether it ``is_symmetric`` under exchange of the two points.
+
+    Parameters
+    ----------
+    alpha : float
+        0 to 1.
+    beta : float, optional
+        0 to 1; alpha by default.
+    weight : float, > 0
+        Beside other maps, with which a discretisation takes the mean of its values.
+    """
+
+    alpha: float = eqx.field(static=True)
+    beta: float = eqx.field(static=True)
+    weight: float = eqx.field(static=True)
+
+    def __init__(self, alpha: float, beta: float | None = None, weight: float = 1.0):
+        beta = alpha if beta is None else beta
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not 0.0 <= value <= 1.0:
+                raise InputError(f"{name} says where between two points a map looks: from 0 to 1, not {value}")
+        if not weight > 0.0:
+            raise InputError(f"the weight of a finite difference map must be > 0, not {weight}")
+        self.alpha, self.beta, self.weight = float(alpha), float(beta), float(weight)
+
+    def position(self, q0, V, h) -> jax.Array:
+        return q0 + (self.alpha * h) * V
+
+    def velocity(self, q0, V, h) -> jax.Array:
+        del q0, h
+        return V
+
+    def entropy(self, S0, s, h) -> jax.Array:
+        """Of two entropies; of two times likewise."""
+        return S0 + (self.beta * h) * s
+
+    def ends(self, q0, V, h, F) -> tuple[jax.Array, jax.Array]:
+        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q . F``, ``D_2 q . F``."""
+        if type(self).position is FiniteDifference.position:
+            return (1.0 - self.alpha) * F, self.alpha * F
+        _, back = jax.vjp(lambda q0, V: self.position(q0, V, h), q0, V)
+        both, second = back(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
+        return both - second / h, second / h
+
+    def mirrored(self) -> FiniteDifference | None:
+        """The map that represents (q_1, q_0, S_1, S_0) backward in time as this one does (q_0, …); None if unknown."""
+        if type(self) is not FiniteDifference:
+            return self if self.is_symmetric else None
+        return FiniteDifference(1.0 - self.alpha, 1.0 - self.beta, self.weight)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether it represents (q_1, q_0, S_1, S_0) backward in time as it does (q_0, q_1, S_0, S_1)."""
+        return type(self) is FiniteDifference and self.alpha == self.beta == 0.5
+
+
+class Point(NamedTuple):
+    """What a map makes of a pair: its part in the mean, and the arguments of the functions."""
+
+    map: FiniteDifference
+    part: float
+    q: jax.Array
+    v: jax.Array
+    S: jax.Array
+    t: jax.Array
+
+
+class Pair(NamedTuple):
+    """A pair of points in the coordinates of the step equations: (q_0, V, S_0, s)."""
+
+    q0: jax.Array
+    V: jax.Array
+    S0: jax.Array
+    s: jax.Array
+
+
+class DiscreteSystem(eqx.Module):
+    """A discrete thermodynamical system [GBY 3.2]: ``L_d``, ``F_d``, ``P_d`` of one step.
+
+    Attributes
+    ----------
+    system : SimpleClosedSystem
+    lagrangian_maps, force_maps, constraint_maps : tuple of FiniteDifference
+    h : step (time)
+    t : time at its start
+    """
+
+    system: SimpleClosedSystem
+    lagrangian_maps: tuple[FiniteDifference, ...]
+    force_maps: tuple[FiniteDifference, ...]
+    constraint_maps: tuple[FiniteDifference, ...]
+    h: jax.Array
+    t: jax.Array
+
+    # -- in difference quotients, per unit of time ------------------------------------------------------------------
+
+    def _points(self, maps, pair: Pair) -> Iterator[Point]:
+        total = sum(map.weight for map in maps)
+        for map in maps:
+            q, v = map.position(pair.q0, pair.V, self.h), map.velocity(pair.q0, pair.V, self.h)
+            S, t = map.entropy(pair.S0, pair.s, self.h), map.entropy(self.t, 1.0, self.h)
+            yield Point(map, map.weight / total, q, v, S, t)
+
+    def action(self, q0, V, S0, s) -> jax.Array:
+        """``L_d / h``."""
+        points = self._points(self.lagrangian_maps, Pair(q0, V, S0, s))
+        return _total([p.part * self.system.action(p.q, p.v, p.S) for p in points])
+
+    def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
+        """``F^-_d / h`` and ``F^+_d / h``."""
+        first = second = jnp.zeros_like(pair.V)
+        for p in self._points(self.force_maps, pair):
+            F = jnp.zeros_like(p.v)
+            F = F + self.system.friction_force(*p[2:]) if friction else F
+            F = F + self.system.external_force(*p[2:]) if external else F
+            at_first, at_second = p.map.ends(pair.q0, pair.V, self.h, p.part * F)
+            first, second = first + at_first, second + at_second
+        return first, second
+
+    def motion(self, p0, pair: Pair) -> jax.Array:
+        """Misfit of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the step before, shape (n,)."""
+        by_q, by_V = jax.grad(self.action, argnums=(0, 1))(*pair)
+        return p0 - by_V + self.h * (by_q + self.impulses(pair)[0])
+
+    def force(self, pair: Pair) -> jax.Array:
+        """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,)."""
+        first, second = self.impulses(pair)
+        return jax.grad(self.action)(*pair) + (first + second)
+
+    def production(self, pair: Pair) -> jax.Array:
+        """``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN where a temperature is not positive [GBY 3.9]."""
+        total = jnp.zeros(())
+        for p in self._points(self.constraint_maps, pair):
+            T = -jax.grad(self.system.action, argnums=2)(p.q, p.v, p.S)
+            gained = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
+            total = total + p.part * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + gained)
+        return total
+
+    def received(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
+        """Work and heat from outside, per unit of time."""
+        first, second = self.impulses(pair, friction=False)
+        heat = _total([p.part * self.system.heating(*p[2:]) for p in self._points(self.constraint_maps, pair)])
+        return jnp.dot(first + second, pair.V), heat
+
+    def energy(self, pair: Pair) -> jax.Array:
+        """``E = v . L_v - L`` at the points of the discrete Lagrangian, the mean."""
+        energy = self.system.contact.energy
+        points = self._points(self.lagrangian_maps, pair)
+        return _total([p.part * energy(jnp.concatenate([p.q, p.v, p.S[None]])) for p in points])
+
+    # -- as in the paper ----------------------------------------------------------------------------------------------
+
+    def pair(self, q0, q1, S0, S1) -> Pair:
+        return Pair(q0, (q1 - q0) / self.h, S0, (S1 - S0) / self.h)
+
+    def lagrangian(self, q0, q1, S0, S1) -> jax.Array:
+        """``L_d`` [GBY 3.10]."""
+        return self.h * self.action(*self.pair(q0, q1, S0, S1))
+
+    def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
+        """``F^-_d`` and ``F^+_d``, shape (n,) each [GBY Definition 3.2]."""
+        first, second = self.impulses(self.pair(q0, q1, S0, S1), friction, external)
+        return self.h * first, self.h * second
+
+    def constraint(self, q0, q1, S0, S1) -> jax.Array:
+        """``P_d``: a pair is on ``C_K^d`` where it vanishes [GBY 3.8]."""
+        return -self.production(self.pair(q0, q1, S0, S1))
+
+    def momenta(self, q0, q1, S0, S1) -> tuple[jax.Array, jax.Array]:
+        """p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
+        by_first, by_second = jax.grad(self.lagrangian, argnums=(0, 1))(q0, q1, S0, S1)
+        first, second = self.forces(q0, q1, S0, S1)
+        return -by_first - first, by_second + second
+
+    def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
+        """The matrix (3.13), shape (n + 1, n + 1): where it is invertible the step from q_1, S_1 is determined."""
+
+        def equations(q1, S1):
+            return -self.momenta(q0, q1, S0, S1)[0], self.constraint(q0, q1, S0, S1)
+
+        (A, B), (C, D) = jax.jacfwd(equations, argnums=(0, 1))(q1, S1)
+        return jnp.block([[A, B[:, None]], [C[None], D[None, None]]])
+
+    def reduced_matrix(self, q0, q1, S0, S1) -> jax.Array:
+        """The matrix (3.15), shape (n, n): (3.13) is invertible where it is and ``D_4 P_d`` is not zero."""
+        matrix = self.regularity_matrix(q0, q1, S0, S1)
+        return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
+
+    def onto_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
+        """S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by so many Newton steps; differentiable."""
+        V = (q1 - q0) / self.h
+
+        def newton(_, s):
+            misfit, slope = jax.jvp(lambda s: self.production(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
+            return s - misfit / slope
+
+        return S0 + self.h * jax.lax.fori_loop(0, steps, newton, jnp.zeros(()))
+
+    def flow(self, q0, q1, S0, S1, steps: int = 12) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """The discrete flow on ``C_K^d``, to (q_1, q_2, S_1, S_2), likewise by Newton steps [GBY 3.14]."""
+        p1, start = self.momenta(q0, q1, S0, S1)[1], jnp.append((q1 - q0) / self.h, (S1 - S0) / self.h)
+
+        def misfit(y):
+            pair = Pair(q1, y[:-1], S1, y[-1])
+            return jnp.append(self.motion(p1, pair), self.production(pair))
+
+        def newton(_, y):
+            return y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
+
+        y = jax.lax.fori_loop(0, steps, newton, start)
+        return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
+
+
+def _total(parts: list[jax.Array]) -> jax.Array:
+    return functools.reduce(operator.add, parts)

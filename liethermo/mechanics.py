@@ -1,0 +1,153 @@
+"""Energies of mechanical systems in states (q, p, S): kinetic and potential energy, discretised term by term."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .energy import Energy, Function, Pullback, Quadratic, is_traced
+from .engine.interpret import at_points
+
+
+class Kinetic(Energy):
+    """``p . G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v . G(q) v / 2`` of (q, v, S) [SML 28].
+
+    G is the inverse of the metric (of the mass matrix) in a Hamiltonian, the metric itself in a Lagrangian. In every
+    scheme its discrete gradient by p is a mean of G times a mean of p: ``(G(q) + G(q')) (p + p') / 4`` for discrete
+    gradients, ``G(q_i) p_i`` at the stages of a collocation method; what corrects it goes along q alone. For a
+    semidefinite G this keeps the entropy of an evolution field from falling at any step.
+
+    Parameters
+    ----------
+    G : array, shape (n, n) symmetric, or (n,) for a diagonal matrix; or function from q, shape (n,), to one
+    """
+
+    G: jax.Array | Callable
+
+    def __init__(self, G):
+        self.G = G if callable(G) else Quadratic(G).A  # checked there
+
+    @property
+    def is_quadratic(self) -> bool:
+        return not callable(self.G)
+
+    def at(self, q) -> jax.Array:
+        """``G(q)``, shape (n, n) or (n,)."""
+        return jnp.asarray(self.G(q)) if callable(self.G) else self.G
+
+    def value(self, x) -> jax.Array:
+        q, p = _halves(x)
+        return 0.5 * jnp.dot(p, _apply(self.at(q), p))
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        (q, p), (dq, dp), (low_q, low_p) = map(_halves, (x, d, jnp.zeros_like(x) + low))
+        middle, nothing = p + (low_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
+        if not callable(self.G):
+            return jnp.concatenate([jnp.zeros_like(q), _apply(self.G, middle), nothing])
+        first, last = p + low_p, p + (low_p + dp)
+
+        def mean(q):  # over both ends in p, of the kinetic energy at q
+            G = self.at(q)
+            return 0.25 * (jnp.dot(first, _apply(G, first)) + jnp.dot(last, _apply(G, last)))
+
+        by_p = 0.5 * (_apply(self.at(q + low_q), middle) + _apply(self.at(q + (low_q + dq)), middle))
+        return jnp.concatenate([scheme.general(Function(mean), q, dq, low_q), by_p, nothing])
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        size = len(path.start)
+        return scheme(self, path, along=np.arange(size) < size // 2)
+
+
+class Potential(Pullback):
+    """A potential ``V(q, S)`` of a state (q, p, S), entropy included: internal energy, springs that heat [SML 28].
+
+    Parameters
+    ----------
+    V : function from q, shape (n,), and S, a scalar, to a scalar
+    """
+
+    def __init__(self, V: Callable):
+        super().__init__(Function(_Apart(V)), _without_momenta)
+
+
+class _Apart(eqx.Module):
+    """V(q, S) as a function of one array."""
+
+    V: Callable
+
+    def __call__(self, y):
+        return self.V(y[:-1], y[-1])
+
+
+def is_mechanical(energy: Energy, dim: int) -> bool:
+    """Whether H is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite [SML 28], and each term known to be of that kind.
+
+    Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes that of a
+    quadratic term at the midpoint. A plain function of the whole state is not known to be of any kind, unless it is
+    quadratic.
+    """
+    if is_traced(energy):
+        return False
+    points = np.random.default_rng(0).standard_normal((4, dim))
+    return all(_is_kinetic(term, points) or is_free_of_momenta(term, points) for term in energy.terms)
+
+
+def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
+    """Whether a term is known not to depend on p (or v)."""
+    n = points.shape[1] // 2
+    return is_free_of(term, points, np.arange(n, 2 * n))
+
+
+def is_free_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
+    """Whether a term is known not to depend on some components, from its coordinates' derivatives at some states."""
+    return isinstance(term, Pullback) and not at_points(_jacobian, term, points)[:, :, components].any()
+
+
+def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
+    """Whether it is a semidefinite form in p, whatever else it is in q and S; without mixed terms."""
+    n = points.shape[1] // 2
+    if isinstance(term, Kinetic):
+        return _is_semidefinite(at_points(_metric, term, points))
+    if not term.is_quadratic:
+        return False
+    slope, hessian = at_points(_by_momenta, term, np.zeros_like(points[:1]))
+    mixed = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
+    return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n])
+
+
+def _is_semidefinite(G: np.ndarray) -> bool:
+    """Of matrices, shape (..., n, n)."""
+    eigenvalues = np.linalg.eigvalsh(G)
+    return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
+
+
+def _metric(term: Kinetic, x):
+    G = term.at(_halves(x)[0])
+    return jnp.diag(G) if G.ndim == 1 else G
+
+
+def _by_momenta(term: Energy, x):
+    n = len(x) // 2
+    return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
+
+
+def _jacobian(term: Pullback, x):
+    return jax.jacfwd(term.of)(x)
+
+
+def _halves(x):
+    n = len(x) // 2
+    return x[:n], x[n : 2 * n]
+
+
+def _apply(G, p):
+    return G * p if G.ndim == 1 else G @ p
+
+
+def _without_momenta(x):
+    n = len(x) // 2
+    return jnp.concatenate([x[:n], x[2 * n :]])

@@ -1,0 +1,86 @@
+"""One gas under a piston, pushed and heated from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..energy import Function
+from ..mechanics import Kinetic
+from ..systems import SimpleClosedSystem
+from ..systems.simple_closed import timed
+from .gas_piston import GAS_CONSTANT, IdealGas
+from .parameters import positive
+
+
+class _UnderPiston(eqx.Module):
+    """Energy of the gas from (q, S)."""
+
+    gas: IdealGas
+    area: jax.Array
+
+    def __call__(self, y):
+        return self.gas.energy(y[1], self.area * y[0])
+
+
+def cylinder(
+    mass: float = 1.0,
+    area: float = 0.01,
+    friction: float = 20.0,
+    moles: float = 1.0,
+    height: float = 2.5,
+    pressure=None,
+    heat_power=None,
+) -> SimpleClosedSystem:
+    """A gas in a cylinder below a piston at height q that rubs and so heats it.
+
+    ``L = m v^2 / 2 - U(S, A q)``, q > 0, ``F_fr = -lambda v``, ``F_ext = -P A``, in SI units and in the state
+    (q, v, S), or (q, v, S, W, Q, t) if anything comes from outside. ``m q'' = (P_gas - P) A - lambda q'``.
+
+    Parameters
+    ----------
+    mass, area : float, > 0
+        Of the piston (kg, m**2).
+    friction : float, >= 0
+        lambda (kg / s).
+    moles, height : float, > 0
+        Of the gas, which is monatomic; its entropy is counted from 300 K below the piston at that height (m).
+    pressure : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
+        P from outside (Pa).
+    heat_power : float, or function likewise; optional
+        Heat given to the gas per time (W).
+    """
+    n, m, A = positive(moles, "moles"), positive(mass, "mass"), positive(area, "area")
+    gas = IdealGas(n, A * positive(height, "height"))
+    push = pressure
+    if pressure is not None:
+        push = _Push(timed(pressure), A) if callable(pressure) else -A * jnp.reshape(jnp.asarray(pressure), 1)
+    return SimpleClosedSystem(
+        Kinetic(m[None]) - Function(_UnderPiston(gas, A)).on([0, 2]),
+        3,
+        friction=friction,
+        external=push,
+        heat_power=heat_power,
+        validate=False,  # half of the normally distributed q lie below the bottom
+    )
+
+
+def cylinder_rest(pressure, T, area: float = 0.01, moles: float = 1.0, height: float = 2.5) -> np.ndarray:
+    """The state (q, v, S) of rest under a pressure (Pa) at a temperature (K), shape (3,): ``P A q = n R T``."""
+    gas = IdealGas(jnp.asarray(moles), jnp.asarray(area * height))
+    volume = moles * GAS_CONSTANT * T / pressure
+    return np.array([volume / area, 0.0, gas.entropy(T, volume)], dtype=float)
+
+
+class _Push(eqx.Module):
+    """``-P A``."""
+
+    pressure: Callable
+    area: jax.Array
+
+    def __call__(self, q, v, S, t):
+        return -self.area * jnp.reshape(self.pressure(q, v, S, t), 1)

@@ -1,0 +1,117 @@
+"""Two containers of ideal gas with a moving piston between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..energy import Function
+from ..mechanics import Kinetic
+from ..systems import ComposedSystem, Subsystem
+from .parameters import positive
+from .thermo_particles import Warmth
+
+GAS_CONSTANT = 8.31446261815324
+"""J / (K mol)."""
+
+
+class IdealGas(eqx.Module):
+    """``U(S, V) = U_0 exp(S / (c n R)) (V / V_0)^(-1/c)`` with ``U_0 = c n R T_0``: S is counted from (T_0, V_0).
+
+    ``T = U / (c n R)``, ``P = n R T / V``.
+
+    Attributes
+    ----------
+    moles : n
+    volume, temperature : V_0 (m**3) and T_0 (K)
+    c : heat capacity at constant volume over R
+    """
+
+    moles: jax.Array
+    volume: jax.Array
+    temperature: float = 300.0
+    c: float = 1.5
+
+    def energy(self, S, V):
+        """U (J) at an entropy (J / K) and a volume."""
+        heat = self.c * self.moles * GAS_CONSTANT
+        return heat * self.temperature * jnp.exp(S / heat) * (V / self.volume) ** (-1.0 / self.c)
+
+    def entropy(self, T, V):
+        """S (J / K) at a temperature and a volume."""
+        nR = self.moles * GAS_CONSTANT
+        return self.c * nR * jnp.log(T / self.temperature) + nR * jnp.log(V / self.volume)
+
+
+class _InCylinder(eqx.Module):
+    """Energy of a gas left or right of the piston, from (q, S)."""
+
+    gas: IdealGas
+    area: jax.Array
+    length: jax.Array
+    right: bool = eqx.field(static=True)
+
+    def volume(self, q):
+        return self.area * (self.length - q if self.right else q)
+
+    def __call__(self, y):
+        return self.gas.energy(y[1], self.volume(y[0]))
+
+
+def gas_piston(
+    moles: Sequence[float] = (1.0, 1.0),
+    mass: float = 1.0,
+    area: float = 0.01,
+    length: float = 1.0,
+    capacity: float = 10.0,
+    conductance: Sequence[float] = (5.0, 5.0),
+    friction: float = 20.0,
+) -> ComposedSystem:
+    """Two gases in a cylinder with a piston that conducts heat and rubs.
+
+    ``H = p^2 / (2 m) + C exp(S_p / C) + U_l(S_l, A q) + U_r(S_r, A (L - q))``, 0 < q < L, in SI units, and in the state
+    (S_l, q, p, S_p, S_r). It rests where the pressures agree, ``q = L n_l / (n_l + n_r)``, and all temperatures,
+    at ``H / ((3/2) (n_l + n_r) R + C)``.
+
+    Parameters
+    ----------
+    moles : two numbers > 0
+        Of the gases, monatomic (c = 3/2); their entropies are counted from 300 K and half the cylinder.
+    mass, area, length : float, > 0
+        Of the piston and the cylinder (kg, m**2, m).
+    capacity : float, > 0
+        Heat capacity C of the piston (J / K).
+    conductance : two numbers >= 0
+        Between the piston and either gas (W / K).
+    friction : float, >= 0
+        Of the piston on the cylinder, which heats the piston (kg / s).
+    """
+    n = positive(moles, "moles", 2)
+    A, L, m = positive(area, "area"), positive(length, "length"), positive(mass, "mass")
+    gases = [_InCylinder(IdealGas(n_i, 0.5 * A * L), A, L, right) for n_i, right in zip(n, (False, True), strict=True)]
+    piston = Kinetic((1.0 / m)[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2])
+    return ComposedSystem(
+        {"left gas": Subsystem(None, 1), "piston": Subsystem(piston, 3, friction), "right gas": Subsystem(None, 1)},
+        coupling=[Function(gas).on([1, place]) for gas, place in zip(gases, (0, 4), strict=True)],
+        conductance=[(0, 1, conductance[0]), (1, 2, conductance[1])],
+        connected=False,  # an adiabatic piston is meant
+        validate=False,  # most normally distributed q lie outside the cylinder
+    )
+
+
+def gas_piston_state(q, temperatures, moles=(1.0, 1.0), area=0.01, length=1.0, capacity=10.0, p=0.0) -> np.ndarray:
+    """The state with the piston at q and the temperatures (K) of left gas, piston and right gas, shape (5,)."""
+    left, right = (IdealGas(jnp.asarray(n), jnp.asarray(0.5 * area * length)) for n in moles)
+    T_left, T_piston, T_right = temperatures
+    S_left, S_right = left.entropy(T_left, area * q), right.entropy(T_right, area * (length - q))
+    return np.array([S_left, q, p, capacity * np.log(T_piston), S_right], dtype=float)
+
+
+def gas_piston_equilibrium(energy, moles=(1.0, 1.0), length=1.0, capacity=10.0) -> tuple[float, float]:
+    """Where the piston rests, q (m), and the temperature of everything (K), at a total energy (J)."""
+    total = float(sum(moles))
+    return length * moles[0] / total, float(energy) / (1.5 * total * GAS_CONSTANT + capacity)

@@ -1,0 +1,118 @@
+"""Bodies of constant heat capacity that exchange heat: at rest, moving freely, on a spring [SML Examples 2-4, 6]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..energy import Function, Quadratic
+from ..graph import edges
+from ..mechanics import Kinetic
+from ..systems import ComposedSystem, Subsystem
+from .parameters import positive, whole
+
+
+class Warmth(eqx.Module):
+    """Internal energy ``c exp(S / c)`` of the last component S of a state: c is the heat capacity."""
+
+    capacity: jax.Array
+
+    def __call__(self, x):
+        return self.capacity * jnp.exp(x[-1] / self.capacity)
+
+
+def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) -> ComposedSystem:
+    """Bodies at rest that exchange heat: ``H = sum c_a exp(S_a / c_a)`` in the state (S_1, S_2, …) [SML Example 2].
+
+    ``S_a' = sum_b k_ab (T_b - T_a) / T_a`` with ``T_a = exp(S_a / c_a)``, so ``c_a T_a' = sum_b k_ab (T_b - T_a)``: all
+    tend to the mean temperature ``sum c_a T_a / sum c_a``. Figs. 3 and 4 start at the temperatures (273.15, 300), with
+    c = 1, k = 1, h = 0.1.
+
+    Parameters
+    ----------
+    capacities : sequence of float, > 0
+        c_a (energy / temperature).
+    conductance : float for two bodies, or a graph as in :class:`liethermo.ComposedSystem`
+        k_ab (power / temperature).
+    """
+    c = positive(capacities, "capacities", len(capacities))
+    return ComposedSystem([Subsystem(Warmth(c_a), 1) for c_a in c], conductance=conductance)
+
+
+def thermo_particles_solution(t, temperatures, capacities=(1.0, 1.0), conductance=1.0) -> np.ndarray:
+    """The exact temperatures at times t, shape (..., N), from those at t = 0: a linear relaxation."""
+    c, count = np.asarray(capacities, dtype=float), len(capacities)
+    graph = edges(conductance, count, "the conductance", tuple(map(str, range(count))))
+    laplacian = np.zeros((count, count))
+    for i, j, k in zip(graph.first, graph.second, np.asarray(graph.weight), strict=True):
+        laplacian[[i, j], [i, j]] += k
+        laplacian[[i, j], [j, i]] -= k
+    root = np.sqrt(c)
+    rates, modes = np.linalg.eigh(laplacian / np.outer(root, root))
+    amplitudes = modes.T @ (root * np.asarray(temperatures, dtype=float))
+    return (np.exp(-np.multiply.outer(np.asarray(t, dtype=float), rates)) * amplitudes) @ modes.T / root
+
+
+def moving_thermo_particles(
+    masses: Sequence[float] = (1.0, 1.0),
+    capacities: Sequence[float] = (1.0, 1.0),
+    conductance=1.0,
+    dimension: int = 1,
+) -> ComposedSystem:
+    """The same bodies, moving freely: ``H = sum p_a^2 / (2 m_a) + c_a exp(S_a / c_a)`` [SML Example 3].
+
+    The motion is uniform and the heat flows as if at rest.
+
+    Parameters
+    ----------
+    masses : sequence of float, > 0
+    capacities, conductance
+        As for :func:`thermo_particles`.
+    dimension : int
+        Of the space; the state is (q_1, p_1, S_1, q_2, …) with q_a and p_a of that many components.
+    """
+    return ComposedSystem(_bodies(masses, capacities, dimension, 0.0), conductance=conductance)
+
+
+def thermo_springs(
+    masses: Sequence[float] = (1.0, 1.0),
+    stiffness: float = 1.0,
+    capacities: Sequence[float] = (1.0, 1.0),
+    conductance: float = 1.0,
+    friction: float = 0.0,
+    drag: float = 0.0,
+) -> ComposedSystem:
+    """Two bodies on a line, joined by a spring, exchange heat: ``V = k (q_1 - q_2)^2 / 2`` [SML Example 4].
+
+    Without friction the motion is as if cold, and the heat flows as if at rest. With drag the bodies stop oscillating
+    and share the heat. The total momentum is kept unless they rub on their surroundings.
+
+    Parameters
+    ----------
+    masses, stiffness, capacities : float, > 0
+    conductance : float, >= 0
+    friction, drag : float, >= 0
+        Coefficients of linear friction of either body on its surroundings, and between the two (mass / time).
+    """
+    k, free = positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
+    return ComposedSystem(
+        _bodies(masses, capacities, 1, friction),
+        coupling=Quadratic(k * np.array([[1.0, -1.0], [-1.0, 1.0]])).on([0, 3]),
+        conductance=conductance,
+        drag=drag,
+        connected=False,  # a conductance of zero is meant
+        momentum_maps={"momentum": Quadratic(np.zeros(6), [0.0, 1.0, 0.0, 0.0, 1.0, 0.0])} if free else {},
+    )
+
+
+def _bodies(masses, capacities, dimension, friction) -> list[Subsystem]:
+    c = positive(capacities, "capacities", len(capacities))
+    m, n = positive(masses, "masses", len(capacities)), whole(dimension, "dimension")
+    return [
+        Subsystem(Kinetic(jnp.full(n, 1.0 / m_a)) + Function(Warmth(c_a)).on([2 * n]), 2 * n + 1, friction)
+        for m_a, c_a in zip(m, c, strict=True)
+    ]

@@ -1,0 +1,122 @@
+"""Chains of bodies on thermoelastic springs: pendulums that heat and cool as they stretch."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..energy import Energy, Function, Quadratic
+from ..errors import InputError
+from ..mechanics import Kinetic
+from ..systems import ComposedSystem, Subsystem
+from .parameters import positive, whole
+
+
+class Thermospring(eqx.Module):
+    """Energy ``e(r^2, S)`` of a spring of length r and entropy S [Romero 2009, §4].
+
+    ``e = C u^2 / 2 + b T_0 u + c (T - T_0)`` with ``u = log(r / r_0)`` and ``T = T_0 exp((S - b u) / c)``: stretching
+    cools a spring with b > 0, and heat makes it longer. The tension is ``(C u - b (T - T_0)) / r``.
+
+    Attributes
+    ----------
+    stiffness : C (energy)
+    expansion : b (energy / temperature)
+    capacity : c, at constant length (energy / temperature)
+    length, temperature : r_0 and T_0, at which it is slack and S = 0
+    """
+
+    stiffness: jax.Array
+    expansion: jax.Array
+    capacity: jax.Array
+    length: jax.Array
+    temperature: jax.Array
+
+    def __call__(self, y):
+        u = 0.5 * jnp.log(y[0] / self.length**2)
+        T = self.temperature * jnp.exp((y[1] - self.expansion * u) / self.capacity)
+        elastic = 0.5 * self.stiffness * u**2 + self.expansion * self.temperature * u
+        return elastic + self.capacity * (T - self.temperature)
+
+
+class _Span(eqx.Module):
+    """The squared length of a spring and its entropy, from a state; the first spring hangs at the origin."""
+
+    body: int = eqx.field(static=True)
+    dimension: int = eqx.field(static=True)
+
+    def __call__(self, x):
+        size = 2 * self.dimension + 1
+        mine = x[self.body * size : (self.body + 1) * size]
+        before = x[(self.body - 1) * size :][: self.dimension] if self.body > 0 else jnp.zeros(self.dimension)
+        return jnp.stack([jnp.sum((mine[: self.dimension] - before) ** 2), mine[-1]])
+
+
+def thermoelastic_chain(
+    bodies: int = 2,
+    dimension: int = 2,
+    mass: float = 1.0,
+    stiffness: float = 100.0,
+    expansion: float = 0.2,
+    capacity: float = 1.0,
+    length: float = 1.0,
+    temperature: float = 10.0,
+    conductance: float = 0.5,
+    gravity: float = 0.0,
+) -> ComposedSystem:
+    """N bodies on N springs in a row, the first hung at the origin; neighbouring springs exchange heat.
+
+    The a-th state is (q_a, p_a, S_a) with S_a the entropy of the spring that body a hangs on. With two bodies it is the
+    double thermoelastic pendulum of Romero (2009) and of García Orden & Romero (2012). Stretching, temperature and the
+    flow of heat act on each other, and the oscillation of the springs dies out. The springs enter by their squared
+    lengths, so that the angular momentum about the origin is kept exactly.
+
+    Parameters
+    ----------
+    bodies, dimension : int
+        N, and the dimension of the space, 1 to 3.
+    mass, capacity, length, temperature : float, > 0
+        Of each body, and of each spring: see :class:`Thermospring`.
+    stiffness : float, > 0
+    expansion : float
+    conductance : float, >= 0
+        Between springs that meet (power / temperature).
+    gravity : float
+        Acceleration against the last axis; without it the angular momentum is constant, and audited.
+    """
+    N, n = whole(bodies, "bodies"), whole(dimension, "dimension")
+    if n > 3:
+        raise InputError(f"dimension is 1, 2 or 3, not {n}")
+    spring = Thermospring(
+        positive(stiffness, "stiffness"),
+        jnp.asarray(expansion, dtype=jnp.float64),
+        positive(capacity, "capacity"),
+        positive(length, "length"),
+        positive(temperature, "temperature"),
+    )
+    m = positive(mass, "mass")
+    body: Energy = Kinetic(jnp.full(n, 1.0 / m))
+    heavy = not (isinstance(gravity, float | int) and gravity == 0.0)
+    if heavy:
+        body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * gravity))
+    return ComposedSystem(
+        {f"spring {a + 1}": Subsystem(body, 2 * n + 1) for a in range(N)},
+        coupling=[Function(spring).on(_Span(a, n)) for a in range(N)],
+        conductance=[(a, a + 1, conductance) for a in range(N - 1)],
+        connected=False,  # a conductance of zero is meant
+        momentum_maps={} if heavy else _angular_momentum(N, n),
+    )
+
+
+def _angular_momentum(N: int, n: int) -> dict[str, Quadratic]:
+    """``sum q x p``: one function for each pair of axes."""
+    size, maps = 2 * n + 1, {}
+    for i, j in zip(*np.triu_indices(n, 1), strict=True):
+        A = np.zeros((N * size, N * size))
+        for start in range(0, N * size, size):
+            for a, b, sign in (i, j, 1.0), (j, i, -1.0):
+                A[start + a, start + n + b] = A[start + n + b, start + a] = sign
+        maps[f"angular momentum {'xyz'[i]}{'xyz'[j]}"] = Quadratic(A)
+    return maps

@@ -1,0 +1,254 @@
+"""The Lagrangian side of contact systems: Herglotz' equations on TQ x R, and the Legendre transform to T*Q x R."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds.matrix_functions import inverse
+
+from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..engine.interpret import at_points
+from ..errors import InputError
+from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
+from .euler_poincare import inverse_gradient
+from .evolution import (
+    ContactSystem,
+    EvolutionSystem,
+    LiouvilleFriction,
+    OnContactManifold,
+    ReebDrift,
+    decay,
+    degrees_of_freedom,
+    entropy_component,
+    tangency,
+)
+
+
+class OnVelocities(OnContactManifold):
+    """What the two systems of a Lagrangian share; the state is (q, v, S)."""
+
+    lagrangian: Energy
+
+    @property
+    def contact(self) -> mf.LagrangianContact:
+        """The contact structure ``eta_L = dS - L_v dq`` [SML §3.1]."""
+        return cast(mf.LagrangianContact, self.poisson.contact)
+
+    def _prepare(self, lagrangian, dim: int | None) -> tuple[mf.Cosymplectic, int, Energy]:
+        """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
+        L = as_energy(lagrangian, "the Lagrangian")
+        if dim is None and isinstance(L, Quadratic):
+            dim = L.A.shape[0]
+        if dim is None:
+            raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
+        n = degrees_of_freedom(dim)
+        check_scalar(L, dim, "the Lagrangian")
+        self.lagrangian = L = recognised(L, dim)
+        contact = mf.LagrangianContact(L.value, n)
+        _need_regular(contact)
+        return mf.Cosymplectic(contact), dim, _energy(L, dim)
+
+    def legendre(self, x) -> jax.Array:
+        """``FL(q, v, S) = (q, L_v, S)``, a state of :meth:`hamiltonian_system`, or a batch, shape (..., dim)."""
+        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.state(x, batch=True))
+
+
+class ThermodynamicHerglotz(OnVelocities):
+    """Thermodynamic Herglotz equations: the evolution field of a Lagrangian L(q, v, S) [SML 12].
+
+    ``d/dt L_v - L_q = L_v L_S`` and ``S' = v . L_v``, in the state (q, v, S). It is the field ``Gamma_L`` of
+    ``eta_L = dS - L_v dq`` and of the energy ``E_L = v . L_v - L``, which it conserves; its Legendre transform is the
+    :class:`EvolutionSystem` of ``H = E_L o FL^-1``. The temperature is ``T = -L_S``.
+
+    For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the entropy falls at no step of the metriplectic
+    schemes, as there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
+
+    Parameters
+    ----------
+    lagrangian : function from (q, v, S) in one array, shape (dim,), to a scalar, or an Energy
+        Regular: ``L_vv`` has an inverse.
+    dim : int
+        Number of state components, 2n + 1; known by itself of an ``lt.Quadratic``.
+    momentum_maps, validate
+        As for :class:`EvolutionSystem`.
+
+    Raises
+    ------
+    AxiomError, FunctionError, InputError
+
+    Attributes
+    ----------
+    contact : manifolds.LagrangianContact
+    lagrangian : Energy
+    """
+
+    production_name: ClassVar[str] = "Delta(L)"
+
+    def __init__(self, lagrangian, dim: int | None = None, momentum_maps=(), validate: bool = True):
+        structure, dim, energy = self._prepare(lagrangian, dim)
+        friction = LiouvilleFriction(is_mechanical(self.lagrangian, dim))
+        self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
+
+    def hamiltonian_system(self) -> EvolutionSystem:
+        """The same dynamics on T*Q x R, in the state (q, p, S)."""
+        return EvolutionSystem(_hamiltonian(self.lagrangian, self.dim), self.dim, validate=False)
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        return tangency(self, x)
+
+
+class Herglotz(OnVelocities):
+    """Herglotz' equations of 1930, the contact field of a Lagrangian, for comparison [SML 10].
+
+    ``d/dt L_v - L_q = L_v L_S`` and ``S' = L``, in the state (q, v, S): S is the action, and ``E_L' = L_S E_L``.
+
+    Parameters
+    ----------
+    lagrangian, dim, momentum_maps, validate
+        As for :class:`ThermodynamicHerglotz`.
+    """
+
+    def __init__(self, lagrangian, dim: int | None = None, momentum_maps=(), validate: bool = True):
+        structure, dim, energy = self._prepare(lagrangian, dim)
+        self._build(structure, dim, energy, None, ReebDrift(), momentum_maps, validate)
+
+    def hamiltonian_system(self) -> ContactSystem:
+        """The same dynamics on T*Q x R, in the state (q, p, S)."""
+        return ContactSystem(_hamiltonian(self.lagrangian, self.dim), self.dim, validate=False)
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        return decay(self, x)
+
+
+# -- the energy E_L ---------------------------------------------------------------------------------------------------
+
+
+def _energy(L: Energy, dim: int) -> Energy:
+    """``E_L = v . L_v - L``, term by term, so that a discretisation sees of each what it is."""
+    points = np.random.default_rng(0).standard_normal((4, dim))
+    first, *others = (_energy_of_term(term, points) for term in L.terms)
+    return sum(others, first)
+
+
+def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
+    if isinstance(term, Kinetic):
+        return term
+    if isinstance(term, Quadratic):
+        return _energy_of_quadratic(term)
+    return -term if not is_traced(term) and is_free_of_momenta(term, points) else _LegendreEnergy(term)
+
+
+def _energy_of_quadratic(L: Quadratic) -> Quadratic:
+    """What is of degree k in v is multiplied by k - 1."""
+    dim = L.A.shape[0]
+    degree = (np.arange(dim) // (dim // 2) == 1).astype(float)
+    factor = 2.0 * degree - 1.0 if L.A.ndim == 1 else np.add.outer(degree, degree) - 1.0
+    return Quadratic(L.A * factor, None if L.b is None else L.b * (degree - 1.0), -L.c)
+
+
+class _LegendreEnergy(Energy):
+    """``v . L_v - L`` of any term."""
+
+    lagrangian: Energy
+
+    def value(self, x) -> jax.Array:
+        n = len(x) // 2
+        return jnp.dot(x[n : 2 * n], self.lagrangian.gradient(x)[n : 2 * n]) - self.lagrangian.value(x)
+
+
+# -- the Hamiltonian --------------------------------------------------------------------------------------------------
+
+
+def _hamiltonian(L: Energy, dim: int) -> Energy:
+    """``H = E_L o FL^-1``, in closed form for a quadratic Lagrangian and for kinetic minus potential energy."""
+    if isinstance(L, Quadratic):
+        return _hamiltonian_of_quadratic(L)
+    points = np.random.default_rng(0).standard_normal((4, dim))
+    moving = [term for term in L.terms if is_traced(term) or not is_free_of_momenta(term, points)]
+    if len(moving) == 1 and isinstance(moving[0], Kinetic):
+        return sum((-term for term in L.terms if term is not moving[0]), Kinetic(_inverse_metric(moving[0].G)))
+    return LegendreTransform(L)
+
+
+@eqx.filter_jit
+def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
+    """``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
+    dim = L.A.shape[0]
+    moving, still = np.split(np.roll(np.arange(dim), -(dim // 2)), [dim // 2])
+    A, b = jnp.diag(L.A) if L.A.ndim == 1 else L.A, jnp.zeros(dim) if L.b is None else L.b
+    inverted = inverse(A[np.ix_(moving, moving)])
+    shift = jnp.zeros((dim // 2, dim)).at[:, moving].set(jnp.eye(dim // 2)).at[:, still].set(-A[np.ix_(moving, still)])
+    rest = jnp.zeros((dim, dim)).at[np.ix_(still, still)].set(A[np.ix_(still, still)])
+    raised = 0.5 * (inverted + inverted.T) @ shift
+    c = b[moving]
+    return Quadratic(shift.T @ raised - rest, -c @ raised - b.at[moving].set(0.0), 0.5 * c @ inverted @ c - L.c)
+
+
+class _InverseMetric(eqx.Module):
+    metric: Callable
+
+    def __call__(self, q):
+        G = self.metric(q)
+        return 1.0 / G if G.ndim == 1 else inverse(G)
+
+
+def _inverse_metric(G):
+    if callable(G):
+        return _InverseMetric(G)
+    if G.ndim == 1:
+        return 1.0 / G
+    inverted = inverse(G)
+    return 0.5 * (inverted + inverted.T)
+
+
+class LegendreTransform(Energy):
+    """``H(q, p, S) = p . v - L(q, v, S)`` at the v with ``L_v = p``, by damped Newton; NaN where it finds none."""
+
+    lagrangian: Energy
+
+    def velocity(self, x) -> jax.Array:
+        """v at (q, p, S), shape (n,)."""
+        n = len(x) // 2
+        return inverse_gradient(_OfVelocity(self.lagrangian, x[:n], x[2 * n :]), x[n : 2 * n])
+
+    def value(self, x) -> jax.Array:
+        v, n = self.velocity(x), len(x) // 2
+        return jnp.dot(x[n : 2 * n], v) - self.lagrangian.value(x.at[n : 2 * n].set(v))
+
+    def gradient(self, x) -> jax.Array:
+        v, n = self.velocity(x), len(x) // 2
+        return (-self.lagrangian.gradient(x.at[n : 2 * n].set(v))).at[n : 2 * n].set(v)
+
+
+class _OfVelocity(Energy):
+    """A Lagrangian at fixed q and S."""
+
+    lagrangian: Energy
+    q: jax.Array
+    S: jax.Array
+
+    def value(self, x) -> jax.Array:
+        return self.lagrangian.value(jnp.concatenate([self.q, x, self.S]))
+
+
+def _need_regular(contact: mf.LagrangianContact) -> None:
+    if is_traced(contact):
+        return
+    points = np.random.default_rng(0).standard_normal((4, contact.dim))
+    singular = np.linalg.svd(at_points(_hessian, contact, points), compute_uv=False)
+    if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+        raise InputError(
+            "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
+            "does not determine the velocity"
+        )
+
+
+def _hessian(contact: mf.LagrangianContact, x):
+    return contact.hessian(x)

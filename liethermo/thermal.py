@@ -1,0 +1,167 @@
+"""Dissipation in composed systems: heat that flows, friction that heats [SML §5].
+
+All act on states (q_1, p_1, S_1, q_2, …) of several bodies, see :class:`manifolds.ExtendedPhaseSpace`. Temperatures and
+velocities are components of the gradient of the energy that they are handed: from a discrete gradient they are discrete
+ones, and both laws hold exactly, for every energy, as long as the discrete temperatures are positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from .dissipation import Dissipation, Law
+from .graph import Edges
+
+
+class HeatConduction(Dissipation):
+    """Fourier's law on a graph: ``S_i' = sum_j k_ij (T_j - T_i) / T_i``, ``T = H_S`` [SML 32].
+
+    In terms of the Fourier factors ``K_ij = k_ij (1/T_i - 1/T_j)``, which are skew, ``S_i' = sum_j K_ij T_j``, so the
+    energy is constant; the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In
+    metriplectic form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
+
+    Parameters
+    ----------
+    graph : Edges
+        Of bodies, with their conductances (power / temperature).
+    """
+
+    first: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)
+    conductance: jax.Array
+
+    def __init__(self, graph: Edges):
+        self.first, self.second = tuple(graph.first.tolist()), tuple(graph.second.tolist())
+        self.conductance = graph.weight
+
+    def force(self, system, x, dH, dS, dL):
+        S, (i, j) = _places(system).S, (np.array(self.first), np.array(self.second))
+        T, along = _positive(dH[S]), dS[S]
+        heat = self.conductance * (along[i] * T[j] - along[j] * T[i])
+        return jnp.zeros_like(x).at[S[i]].add(heat / T[i]).at[S[j]].add(-heat / T[j])
+
+
+class LinearFriction(Dissipation):
+    """Friction against the surroundings, that heats the body itself: ``p' = -R v``, ``S' = v . R v / T``, v = H_p.
+
+    In metriplectic form K is ``z R z^T / T`` with ``z = -T d/dp + v d/dS``.
+
+    Parameters
+    ----------
+    R : array, shape (m,) for a diagonal matrix, or (m, m); or function from the state of the body to one
+        Positive semidefinite (mass / time).
+    body : int, optional
+        Whose m momenta these are; by default R is diagonal and has an entry for every momentum of the whole system.
+    """
+
+    R: jax.Array | Callable
+    body: int | None = eqx.field(static=True, default=None)
+
+    def force(self, system, x, dH, dS, dL):
+        places = _places(system)
+        mine = np.arange(len(places.p)) if self.body is None else np.flatnonzero(places.owner == self.body)
+        p, S = places.p[mine], places.S[places.owner[mine]]
+        R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
+        v, T = dH[p], _positive(dH[S])
+        flux = _apply(R, (v * dS[S] - T * dS[p]) / T)
+        return jnp.zeros_like(x).at[p].set(-T * flux).at[S].add(v * flux)
+
+
+class Drag(Dissipation):
+    """Friction between bodies: the force ``-c_ij (v_i - v_j)`` on i, and half the heat for either.
+
+    ``S_i' = sum_j c_ij |v_i - v_j|^2 / (2 T_i)``; the total momentum is conserved. In metriplectic form K is
+    ``c_ij z z^T / theta`` with ``z = -d/dp_i + d/dp_j + (v_i - v_j) (d/dS_i / T_i + d/dS_j / T_j) / 2`` and
+    ``theta = (1/T_i + 1/T_j) / 2``, summed over edges and components.
+
+    Parameters
+    ----------
+    graph : Edges
+        Of bodies with the same number of degrees of freedom, with coefficients c (mass / time).
+    """
+
+    first: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)
+    coefficient: jax.Array
+
+    def __init__(self, graph: Edges):
+        self.first, self.second = tuple(graph.first.tolist()), tuple(graph.second.tolist())
+        self.coefficient = graph.weight
+
+    def force(self, system, x, dH, dS, dL):
+        places = _places(system)
+        i, j, edge = _pairs(self.first, self.second, places)
+        S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
+        T_i, T_j, w = _positive(dH[S_i]), _positive(dH[S_j]), dH[p_i] - dH[p_j]
+        along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
+        flux = self.coefficient[edge] * along * (2.0 * T_i * T_j / (T_i + T_j))
+        made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
+        return made.at[p_i].add(-flux).at[p_j].add(flux)
+
+
+class ContactFriction(Dissipation):
+    """The friction of evolution fields, in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
+
+    A skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is
+    ``p . G(q) p / 2 + V(q, S)``, in terms of that form; for other energies nothing is promised.
+
+    Parameters
+    ----------
+    bodies : tuple of int
+    nondecreasing : bool
+        Whether their energies are known to be of that form.
+    """
+
+    bodies: tuple[int, ...] = eqx.field(static=True)
+    nondecreasing: bool = eqx.field(static=True, default=False)
+
+    @property
+    def entropy_law(self) -> Law | None:
+        return "nondecreasing" if self.nondecreasing else None
+
+    @property
+    def symmetric(self) -> bool:
+        return False
+
+    def force(self, system, x, dH, dS, dL):
+        places = _places(system)
+        mine = np.flatnonzero(np.isin(places.owner, self.bodies))
+        p, S = places.p[mine], places.S[places.owner[mine]]
+        return jnp.zeros_like(x).at[p].set(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
+
+
+# -- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _places(system) -> mf.contact.Places:
+    return system.poisson.places
+
+
+def _positive(T):
+    """Temperatures, NaN where they are not positive: the step is then refused."""
+    return jnp.where(T > 0.0, T, jnp.nan)
+
+
+def _apply(R, v):
+    return R * v if jnp.ndim(R) < 2 else R @ v
+
+
+def _of_body(places: mf.contact.Places, mine: np.ndarray) -> np.ndarray:
+    """The components of the state of the body that some of the momenta belong to."""
+    return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
+
+
+def _pairs(first: tuple[int, ...], second: tuple[int, ...], places: mf.contact.Places):
+    """For each edge and component: the numbers of the two momenta, and of the edge."""
+    starts = np.searchsorted(places.owner, np.arange(len(places.S)))
+    sizes = np.bincount(places.owner, minlength=len(places.S))[list(first)]
+    edge = np.repeat(np.arange(len(first)), sizes)
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return starts[np.array(first)][edge] + within, starts[np.array(second)][edge] + within, edge

@@ -1,0 +1,390 @@
+"""Contact structures: a one-form eta with ``eta ^ (d eta)^n != 0`` on R^(2n+1) [SML §2, §3.1].
+
+Coordinates are (q, p, S) on T*Q x R and (q, v, S) on TQ x R. A two-form or bivector is given by its matrix,
+``omega(u, v) = u @ omega @ v``, and ``(i_v omega)_j = v_i omega_ij``. The sign of the brackets is the paper's,
+``[p, q] = 1``: it is the opposite of that of :class:`manifolds.PoissonStructure`, so that f' = [H, f].
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._arrays import real_components
+from .errors import ParameterError, ShapeError
+from .matrix_functions import determinant, inverse, solve
+from .poisson import PoissonStructure
+
+
+class ContactStructure(eqx.Module):
+    """A contact structure; subclasses give :meth:`form`, and whatever they know in closed form.
+
+    Attributes
+    ----------
+    dim : int
+        Number of coordinates, 2n + 1.
+    """
+
+    @property
+    @abstractmethod
+    def dim(self) -> int: ...
+
+    @abstractmethod
+    def form(self, x) -> jax.Array:
+        """The contact form eta at one point: its components, shape (dim,)."""
+
+    # -- what the form determines -------------------------------------------------------------------------------------
+
+    def differential(self, x) -> jax.Array:
+        """The two-form d eta at x, ``d_i eta_j - d_j eta_i``, shape (dim, dim)."""
+        jacobian = jax.jacfwd(self.form)(x)
+        return jacobian.T - jacobian
+
+    def volume(self, x) -> jax.Array:
+        """``|eta ^ (d eta)^n| / n!`` in these coordinates, shape (): positive where the form is a contact form."""
+        return jnp.sqrt(jnp.abs(determinant(self._flat_matrix(x))))
+
+    def flat(self, x, v) -> jax.Array:
+        """``i_v d eta + eta(v) eta``: an isomorphism of vectors and covectors, both of shape (dim,)."""
+        form = self.form(x)
+        return v @ self.differential(x) + jnp.dot(form, v) * form
+
+    def sharp(self, x, alpha) -> jax.Array:
+        """The inverse of :meth:`flat`; not finite where the form is not a contact form."""
+        return solve(self._flat_matrix(x), alpha[:, None])[:, 0]
+
+    def reeb(self, x) -> jax.Array:
+        """The Reeb vector field R, shape (dim,): ``eta(R) = 1`` and ``i_R d eta = 0``."""
+        return self.sharp(x, self.form(x))
+
+    def horizontal(self, x, v) -> jax.Array:
+        """The part of v in the kernel of eta, ``v - eta(v) R`` [SML 1]."""
+        return v - jnp.dot(self.form(x), v) * self.reeb(x)
+
+    def bivector(self, x) -> jax.Array:
+        """``Lambda(alpha, beta) = -d eta(sharp alpha, sharp beta)`` as a matrix, shape (dim, dim) [SML 3, 11]."""
+        raised = inverse(self._flat_matrix(x))
+        return -raised.T @ self.differential(x) @ raised
+
+    def bivector_sharp(self, x, alpha) -> jax.Array:
+        """``Lambda(alpha, .)`` as a vector, shape (dim,): ``sharp(alpha) - alpha(R) R``, in the kernel of eta."""
+        reeb = self.reeb(x)
+        return self.sharp(x, alpha) - jnp.dot(alpha, reeb) * reeb
+
+    def _flat_matrix(self, x) -> jax.Array:
+        form = self.form(x)
+        return self.differential(x).T + jnp.outer(form, form)
+
+    # -- brackets and fields of functions -----------------------------------------------------------------------------
+
+    def cartan_bracket(self, f: Callable, g: Callable) -> Callable:
+        """The function ``[f, g] = Lambda(df, dg)``: obeys Leibniz' rule, but not the Jacobi identity [SML §2.1]."""
+
+        def value(x):
+            x = real_components(x, self.dim, "x")
+            return jnp.dot(self.bivector_sharp(x, jax.grad(f)(x)), jax.grad(g)(x))
+
+        return value
+
+    def jacobi_bracket(self, f: Callable, g: Callable) -> Callable:
+        """The function ``{f, g} = Lambda(df, dg) + f E(g) - g E(f)``, E = -R [SML §2.1].
+
+        It obeys the Jacobi identity, but of Leibniz' rule only the generalised form
+        ``{f, g h} = g {f, h} + h {f, g} + g h E(f)`` [SML 5, where E(h) is printed].
+        """
+
+        def value(x):
+            x = real_components(x, self.dim, "x")
+            reeb, df, dg = self.reeb(x), jax.grad(f)(x), jax.grad(g)(x)
+            return jnp.dot(self.bivector_sharp(x, df), dg) - f(x) * jnp.dot(reeb, dg) + g(x) * jnp.dot(reeb, df)
+
+        return value
+
+    def evolution_vector_field(self, f: Callable) -> Callable:
+        """The field ``E_f = Lambda(df, .)``, which conserves f and lies in the kernel of eta [SML 7, Prop. 2.1]."""
+
+        def field(x):
+            x = real_components(x, self.dim, "x")
+            return self.bivector_sharp(x, jax.grad(f)(x))
+
+        return field
+
+    def hamiltonian_vector_field(self, f: Callable) -> Callable:
+        """The contact field ``X_f = Lambda(df, .) - f R``, along which ``f' = -R(f) f`` [SML §2.2, Prop. 2.1]."""
+
+        def field(x):
+            x = real_components(x, self.dim, "x")
+            return self.bivector_sharp(x, jax.grad(f)(x)) - f(x) * self.reeb(x)
+
+        return field
+
+
+class ContactForm(ContactStructure):
+    """A structure given by its form, a function from x, shape (dim,), to the components of eta.
+
+    Nothing is checked here: ``volume`` measures at a point whether the form is a contact form.
+    """
+
+    function: Callable
+    size: int = eqx.field(static=True)
+
+    def __init__(self, function: Callable, dim: int):
+        if not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
+            raise ParameterError(f"a contact structure has an odd number of coordinates, 2n + 1 >= 3, not {dim!r}")
+        shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        if shape != (dim,):
+            raise ShapeError(f"a form on {dim} coordinates has {dim} components, but this one has shape {shape}")
+        self.function, self.size = function, dim
+
+    @property
+    def dim(self) -> int:
+        return self.size
+
+    def form(self, x) -> jax.Array:
+        return jnp.asarray(self.function(x))
+
+
+class SplitContact(ContactStructure):
+    """A contact structure whose bivector is a Poisson bivector and a rest: ``Lambda = Lambda_0 + Delta ^ R`` [SML 6].
+
+    Of the brackets, ``[f, g] = {f, g}_0 + {f, g}_Delta``: a reversible part, for which S is a Casimir function, and
+    the thermodynamic one. Delta is the Liouville field ``p d/dp`` on T*Q x R [SML 2].
+    """
+
+    degrees_of_freedom: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
+            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+
+    @property
+    def dim(self) -> int:
+        return 2 * self.degrees_of_freedom + 1
+
+    @abstractmethod
+    def liouville(self, x) -> jax.Array:
+        """The Liouville vector field Delta, shape (dim,)."""
+
+    @abstractmethod
+    def cosymplectic_sharp(self, x, alpha) -> jax.Array:
+        """``Lambda_0(alpha, .)``, shape (dim,)."""
+
+    @abstractmethod
+    def liouville_sharp(self, x, alpha) -> jax.Array:
+        """``(Delta ^ R)(alpha, .) = alpha(Delta) R - alpha(R) Delta``, shape (dim,)."""
+
+    def bivector_sharp(self, x, alpha) -> jax.Array:
+        return self.cosymplectic_sharp(x, alpha) + self.liouville_sharp(x, alpha)
+
+    def cosymplectic_bracket(self, f: Callable, g: Callable) -> Callable:
+        """The function ``{f, g}_0 = Lambda_0(df, dg)``, a Poisson bracket [SML §2.1]."""
+        return self._bracket(self.cosymplectic_sharp, f, g)
+
+    def liouville_bracket(self, f: Callable, g: Callable) -> Callable:
+        """The function ``{f, g}_Delta = R(g) Delta(f) - R(f) Delta(g)`` [SML §2.1]."""
+        return self._bracket(self.liouville_sharp, f, g)
+
+    def _bracket(self, sharp, f, g):
+        def value(x):
+            x = real_components(x, self.dim, "x")
+            return jnp.dot(sharp(x, jax.grad(f)(x)), jax.grad(g)(x))
+
+        return value
+
+    def _split(self, x):
+        """The parts (q, p, S) or (q, v, S) of a point, a vector or a covector; S has shape (1,)."""
+        n = self.degrees_of_freedom
+        return x[:n], x[n : 2 * n], x[2 * n :]
+
+
+class CanonicalContact(SplitContact):
+    """``eta = dS - p dq`` on T*R^n x R, coordinates (q_1 … q_n, p_1 … p_n, S) [SML §2].
+
+    ``Lambda = d/dp ^ (d/dq + p d/dS)`` (4), and the evolution field of f is
+    ``q' = f_p, p' = -f_q - p f_S, S' = p . f_p`` (7).
+    """
+
+    def form(self, x) -> jax.Array:
+        q, p, S = self._split(x)
+        return jnp.concatenate([-p, jnp.zeros_like(q), jnp.ones_like(S)])
+
+    def reeb(self, x) -> jax.Array:
+        return jnp.zeros(self.dim).at[-1].set(1.0)
+
+    def liouville(self, x) -> jax.Array:
+        q, p, S = self._split(x)
+        return jnp.concatenate([jnp.zeros_like(q), p, jnp.zeros_like(S)])
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return self.bivector_sharp(x, alpha) + alpha[-1] * self.reeb(x)
+
+    def cosymplectic_sharp(self, x, alpha) -> jax.Array:
+        del x  # Lambda_0 is constant
+        by_q, by_p, by_S = self._split(alpha)
+        return jnp.concatenate([by_p, -by_q, jnp.zeros_like(by_S)])
+
+    def liouville_sharp(self, x, alpha) -> jax.Array:
+        p, (by_q, by_p, by_S) = self._split(x)[1], self._split(alpha)
+        return jnp.concatenate([jnp.zeros_like(by_q), -p * by_S, jnp.dot(p, by_p)[None]])
+
+
+class LagrangianContact(SplitContact):
+    """``eta_L = dS - L_v dq`` on TQ x R, coordinates (q, v, S): the canonical structure in the chart FL [SML §3.1].
+
+    A contact form where the Lagrangian is regular, that is where its Hessian ``W = L_vv`` is invertible.
+
+    Parameters
+    ----------
+    lagrangian : function from (q, v, S) in one array, shape (2n + 1,), to a scalar
+    degrees_of_freedom : int
+    """
+
+    lagrangian: Callable
+
+    def __init__(self, lagrangian: Callable, degrees_of_freedom: int):
+        self.lagrangian, self.degrees_of_freedom = lagrangian, degrees_of_freedom
+
+    def momentum(self, x) -> jax.Array:
+        """``p = L_v``, shape (n,)."""
+        return self._split(jax.grad(self.lagrangian)(x))[1]
+
+    def legendre(self, x) -> jax.Array:
+        """The Legendre transform ``FL(q, v, S) = (q, p, S)``, shape (dim,)."""
+        q, _, S = self._split(x)
+        return jnp.concatenate([q, self.momentum(x), S])
+
+    def hessian(self, x) -> jax.Array:
+        """``W = L_vv``, shape (n, n) [SML 8]."""
+        n = self.degrees_of_freedom
+        return jax.jacfwd(self.momentum)(x)[:, n : 2 * n]
+
+    def energy(self, x) -> jax.Array:
+        """``E_L = v . L_v - L``, shape ()."""
+        return jnp.dot(self._split(x)[1], self.momentum(x)) - self.lagrangian(x)
+
+    def form(self, x) -> jax.Array:
+        return self._canonical.form(self.legendre(x))
+
+    def reeb(self, x) -> jax.Array:
+        return self._pulled_back(x, lambda y, _: self._canonical.reeb(y), jnp.zeros(self.dim))
+
+    def liouville(self, x) -> jax.Array:
+        return self._pulled_back(x, lambda y, _: self._canonical.liouville(y), jnp.zeros(self.dim))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return self._pulled_back(x, self._canonical.sharp, alpha)
+
+    def bivector_sharp(self, x, alpha) -> jax.Array:
+        return self._pulled_back(x, self._canonical.bivector_sharp, alpha)
+
+    def cosymplectic_sharp(self, x, alpha) -> jax.Array:
+        return self._pulled_back(x, self._canonical.cosymplectic_sharp, alpha)
+
+    def liouville_sharp(self, x, alpha) -> jax.Array:
+        return self._pulled_back(x, self._canonical.liouville_sharp, alpha)
+
+    @property
+    def _canonical(self) -> CanonicalContact:
+        return CanonicalContact(self.degrees_of_freedom)
+
+    def _pulled_back(self, x, sharp: Callable, alpha) -> jax.Array:
+        """``TFL^-1 sharp(FL(x), TFL^-T alpha)``: with p = L_v, ``dp = L_vq dq + W dv + L_vS dS``."""
+        n = self.degrees_of_freedom
+        rates = jax.jacfwd(self.momentum)(x)
+        by_q, W, by_S = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
+        alpha_q, alpha_v, alpha_S = self._split(alpha)
+        beta_p = solve(W, alpha_v[:, None])[:, 0]  # W is symmetric
+        beta = jnp.concatenate([alpha_q - beta_p @ by_q, beta_p, alpha_S - beta_p @ by_S])
+        q_dot, p_dot, S_dot = self._split(sharp(self.legendre(x), beta))
+        v_dot = solve(W, (p_dot - by_q @ q_dot - by_S @ S_dot)[:, None])[:, 0]
+        return jnp.concatenate([q_dot, v_dot, S_dot])
+
+
+class Cosymplectic(PoissonStructure):
+    """The Poisson structure Lambda_0 of a split contact structure: S is a Casimir function [SML §2.1].
+
+    On T*R^n x R it is the canonical one, ``q' = H_p, p' = -H_q, S' = 0``.
+    """
+
+    contact: SplitContact
+
+    @property
+    def dim(self) -> int:
+        return self.contact.dim
+
+    def tensor(self, x) -> jax.Array:
+        return jax.vmap(lambda alpha: self.sharp(x, alpha), out_axes=1)(jnp.eye(self.dim))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return self.contact.cosymplectic_sharp(x, alpha)
+
+
+class Places(NamedTuple):
+    """Where things are in a state of several (q_a, p_a, S_a): indices of all q, p and S, and whose each q is."""
+
+    q: np.ndarray
+    p: np.ndarray
+    S: np.ndarray
+    owner: np.ndarray
+
+
+class ExtendedPhaseSpace(PoissonStructure):
+    """``T*R^n_1 x R x … x T*R^n_N x R``, coordinates (q_1, p_1, S_1, q_2, …): canonical in all (q, p) [SML §5].
+
+    Every S_a is a Casimir function. An n_a of 0 leaves S_a alone.
+    """
+
+    degrees_of_freedom: tuple[int, ...] = eqx.field(static=True)
+
+    def __check_init__(self):
+        numbers = self.degrees_of_freedom
+        if not (isinstance(numbers, tuple) and numbers and all(isinstance(n, int) and n >= 0 for n in numbers)):
+            raise ParameterError(f"degrees of freedom are a tuple of integers >= 0, not {numbers!r}")
+
+    @property
+    def dim(self) -> int:
+        return 2 * sum(self.degrees_of_freedom) + len(self.degrees_of_freedom)
+
+    @property
+    def places(self) -> Places:
+        """Indices into a state."""
+        return _places(self.degrees_of_freedom)
+
+    def tensor(self, x) -> jax.Array:
+        del x  # constant
+        return jnp.asarray(np.eye(self.dim)[self._conjugate] * self._sign[:, None])
+
+    def sharp(self, x, alpha) -> jax.Array:
+        del x
+        return self._sign * alpha[self._conjugate]
+
+    @property
+    def _conjugate(self) -> np.ndarray:
+        q, p, S, _ = self.places
+        partner = np.empty(self.dim, dtype=int)
+        partner[q], partner[p], partner[S] = p, q, S
+        return partner
+
+    @property
+    def _sign(self) -> np.ndarray:
+        q, p, _, _ = self.places
+        sign = np.zeros(self.dim)
+        sign[q], sign[p] = 1.0, -1.0
+        return sign
+
+
+@functools.lru_cache(maxsize=64)
+def _places(degrees_of_freedom: tuple[int, ...]) -> Places:
+    n = np.array(degrees_of_freedom)
+    ends = np.cumsum(2 * n + 1)
+    owner = np.repeat(np.arange(len(n)), n)
+    within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    q = (ends - (2 * n + 1))[owner] + within
+    return Places(q, q + n[owner], ends - 1, owner)

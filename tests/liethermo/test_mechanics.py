@@ -1,0 +1,151 @@
+"""Terms that know their coordinates: discrete gradients of pulled-back, kinetic and potential energies."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import liethermo as lt
+from liethermo.gradients import GRADIENTS
+from liethermo.mechanics import is_mechanical
+from tests.cases import EPS
+
+seeds = st.integers(0, 10**6)
+each_gradient = pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=list(GRADIENTS))
+DIM, N = 5, 2
+
+
+def distances(x):
+    """Squared distance of two points on a line, and their mean: quadratic and linear in the state."""
+    return jnp.array([(x[1] - x[0]) ** 2, 0.5 * (x[0] + x[1])])
+
+
+def metric(q):
+    return jnp.array([[2.0 + jnp.sin(q[0]), 0.3 * q[1]], [0.3 * q[1], 1.5 + 0.1 * q[1] ** 2]])
+
+
+def bumpy(y):
+    return jnp.cos(jnp.sum(y)) + 0.1 * y[0] ** 4
+
+
+TERMS = {
+    "indices": lt.Function(bumpy).on([0, -1]),
+    "quadratic map": lt.Function(bumpy).on(distances),
+    "nested": lt.Quadratic([[2.0, 0.5], [0.5, 1.0]], [1.0, -1.0], 0.3).on([1, 0]).on(distances),
+    "kinetic": lt.Kinetic([[2.0, 0.5], [0.5, 1.0]]),
+    "kinetic of q": lt.Kinetic(metric),
+    "potential": lt.Potential(lambda q, S: jnp.exp(S / 2) * jnp.cos(q[0]) + q[1] ** 4),
+    "sum": lt.Kinetic(metric) - lt.Potential(lambda q, S: S * q[0] ** 2) + lt.Quadratic(np.ones(DIM)) - bumpy,
+}
+
+
+@eqx.filter_jit
+def discrete(gradient, term, x, d, low=0.0):
+    return gradient(term, x, d, low), term.value(x + (low + d)) - term.value(x), term.gradient(x)
+
+
+@pytest.mark.parametrize(
+    ("name", "gradient"),
+    [*((name, "gonzalez") for name in TERMS), *(("sum", gradient) for gradient in GRADIENTS if gradient != "gonzalez")],
+)
+@given(seed=seeds)
+def test_discrete_gradients(name, gradient, seed):
+    """Both defining properties (34), at steps of every size, from a state of which rounding has kept a part."""
+    term, (x, d) = TERMS[name], np.random.default_rng(seed).standard_normal((2, DIM))
+    for size in (1.0, 1e-3, 1e-7):
+        step, low = size * d, 0.4 * EPS * x
+        found, difference, slope = (np.asarray(a) for a in discrete(GRADIENTS[gradient], term, x, step, low))
+        values = sum(abs(float(t(x))) + abs(float(t(x + step))) for t in term.terms)
+        allowed = 40 * EPS * (values + np.linalg.norm(slope) * np.linalg.norm(x))
+        assert abs(found @ step - difference) <= allowed
+        assert np.abs(found - slope).max() <= 50 * size * np.linalg.norm(d) + 100 * EPS * np.abs(slope).max()
+
+
+@each_gradient
+def test_a_term_is_corrected_along_its_own_coordinates_alone(gradient):
+    x, d = np.random.default_rng(0).standard_normal((2, DIM))
+    found, _, _ = discrete(gradient, TERMS["potential"], x, d)
+    assert np.array_equal(found[2:4], [0.0, 0.0])
+    if isinstance(gradient, lt.Gonzalez):  # control: the same function, not told
+        whole, _, _ = discrete(gradient, lt.Function(TERMS["potential"].value), x, d)
+        assert np.abs(np.asarray(whole[2:4])).min() > 1e-3
+
+
+def test_invariances_of_coordinates_are_kept():
+    """Distances: the discrete forces of a pair add up to nothing and turn nothing, also in a step of size one."""
+
+    def squared(x):  # distance of two points in the plane
+        return jnp.sum((x[2:4] - x[:2]) ** 2)[None]
+
+    def sum_and_torque(energy):
+        force = np.asarray(discrete(lt.Gonzalez(), energy, x, d)[0]).reshape(2, 2)
+        torques = [np.linalg.det(pair) for pair in zip((x + d / 2).reshape(2, 2), force, strict=True)]
+        return np.abs(force.sum(axis=0)).max(), abs(sum(torques))
+
+    root, (x, d) = lt.Function(lambda y: jnp.sqrt(y[0])), np.random.default_rng(1).standard_normal((2, 4))
+    assert max(sum_and_torque(root.on(squared))) < 1e-14
+    assert min(sum_and_torque(lt.Function(root.on(squared).value))) > 1e-3  # control: the same function, not told
+
+
+@each_gradient
+def test_a_kinetic_energy_by_momenta_is_a_metric_times_their_mean(gradient):
+    x, d = np.random.default_rng(2).standard_normal((2, DIM))
+    q, p, end = x[:N], x[N : 2 * N] + d[N : 2 * N] / 2, x[:N] + d[:N]
+    found = np.asarray(discrete(gradient, lt.Kinetic(metric), x, d)[0])
+    assert np.allclose(found[N : 2 * N], 0.5 * (metric(q) + metric(end)) @ p, rtol=0, atol=1e-14)
+    assert found[-1] == 0.0
+
+
+def test_arithmetic():
+    x = np.random.default_rng(3).standard_normal(DIM)
+    for term in TERMS.values():
+        assert float((-term)(x)) == -float(term(x))
+        assert np.array_equal((-term).gradient(x), -term.gradient(x))
+        opposite = -term
+        assert float((-opposite)(x)) == float(term(x))
+        assert float((bumpy - term)(x)) == pytest.approx(float(bumpy(x) - term(x)), rel=1e-14)
+    assert isinstance(-lt.Quadratic(np.ones(3)), lt.Quadratic)
+
+
+V = lt.Potential(lambda q, S: S * q[0])
+
+
+@pytest.mark.parametrize(
+    ("energy", "expected"),
+    [
+        (lt.Kinetic([1.0, 2.0]) + V, True),
+        (lt.Kinetic(metric) + V, True),
+        (lt.Quadratic(np.ones(DIM), [1.0, 0, 0, 0, 1.0]), True),
+        (lt.Quadratic(np.diag([-1.0, 1.0, 2.0, 0.0, 1.0])) - V + lt.Function(bumpy).on([4]), True),
+        (lt.Kinetic([1.0, -1.0]) + V, False),  # Lorentzian
+        (lt.Kinetic(lambda q: jnp.array([1.0, -1.0])), False),
+        (lt.Quadratic(np.ones(DIM), [0, 0, 1.0, 0, 0]), False),  # p . H_p has a sign of its own
+        (lt.Quadratic(np.ones((DIM, DIM))), False),
+        (lt.Kinetic([1.0, 2.0]) + lt.Function(bumpy).on([0, 2]), False),
+        (lt.Kinetic([1.0, 2.0]) + lt.Function(lambda x: x[0] * x[4]), False),  # not known to be free of p
+        (-lt.Kinetic([1.0, 2.0]), False),
+    ],
+)
+def test_which_energies_are_known_to_produce_entropy(energy, expected):
+    assert is_mechanical(energy, DIM) is expected
+    assert jax.eval_shape(lambda x: jnp.asarray(is_mechanical(lt.Quadratic(x), DIM)), jnp.ones(DIM)).dtype == bool
+
+
+@pytest.mark.parametrize(
+    ("energy", "error", "words"),
+    [
+        (lt.Function(bumpy).on([0, 3]), lt.InputError, "component 3 of a state with 3"),
+        (lt.Function(bumpy).on([-4]), lt.InputError, "component -4"),
+        (lt.Function(bumpy).on(jnp.sin), lt.InputError, r"not a quadratic function.*miss.*tolerance.*square"),
+        (lt.Function(bumpy).on(lambda x: jnp.linalg.norm(x)[None]), lt.InputError, "not a quadratic function"),
+        (lt.Function(bumpy).on(lambda x: x @ jnp.ones(4)), lt.FunctionError, "coordinates of a term"),
+    ],
+)
+def test_coordinates_that_cannot_be_used(energy, error, words):
+    with pytest.raises(error, match=words):
+        lt.EvolutionSystem(energy, 3)
+    with pytest.raises(lt.InputError, match="not symmetric"):
+        lt.Kinetic([[1.0, 1.0], [0.0, 1.0]])

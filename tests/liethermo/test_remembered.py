@@ -1,0 +1,76 @@
+"""What is kept between calls for systems and methods: found again for the same objects, and for no others."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engine.remembered import KEPT, fingerprint, remembered
+
+
+def counted():
+    calls = []
+
+    @remembered
+    def function(*arguments):
+        calls.append(arguments)
+        return len(calls)
+
+    return function, calls
+
+
+def test_the_same_objects_are_found_again():
+    function, calls = counted()
+    first, second = lt.models.rigid_body(), lt.models.rigid_body()
+    assert [function(first), function(second), function(first), function(first, second)] == [1, 2, 1, 3]
+    assert len(calls) == 3
+
+
+def test_no_object_takes_the_place_of_another():
+    """Objects are kept alive as long as what was found for them, and both for so long only."""
+    function, _ = counted()
+    assert [function((float(i),)) for i in range(2 * KEPT)] == list(range(1, 2 * KEPT + 1))
+
+
+def test_what_can_change_is_not_remembered():
+    """An array of NumPy, which may be written to between two runs, and what is being traced."""
+    function, calls = counted()
+    weights = np.ones(3)
+    assert [function(weights), function(weights)] == [1, 2]
+    jax.jit(lambda x: (function(x), function(x), x)[2])(1.0)
+    assert len(calls) == 4
+
+
+class Weighted(eqx.Module):
+    weights: np.ndarray
+
+    def __call__(self, mu):
+        return 0.5 * jnp.sum(self.weights * mu**2)
+
+
+def test_a_run_sees_parameters_that_were_changed_in_place():
+    energy = Weighted(np.array([1.0, 2.0, 3.0]))
+    system = lt.LiePoissonSystem(mf.so(3), energy)
+    before = [lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")]
+    energy.weights[:] = [3.0, 1.0, 2.0]
+    after = [lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")]
+    assert np.abs(before[0] - before[1]).max() < 1e-14
+    assert np.abs(after[0] - after[1]).max() < 1e-14
+    assert np.abs(after[0] - before[0]).max() > 0.1
+
+
+def test_fingerprints():
+    """By the values of arrays; None for what has no identity that lasts."""
+    same = [fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(np.ones(3)))) for _ in range(2)]
+    assert same[0] == same[1]
+    assert same[0] != fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(2 * np.ones(3))))
+    assert fingerprint({1}) is None
+
+
+def test_a_method_with_arrays_of_its_own_can_be_compiled():
+    system = lt.LiePoissonSystem(mf.so(3), lambda mu: 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0])))
+    method = lt.MetriplecticGauss(1, preserve=lt.Quadratic(np.ones(3)))
+    a, b = (lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, method, engine=e) for e in ("array", "compiled"))
+    assert np.abs(a.x - b.x).max() < 1e-14

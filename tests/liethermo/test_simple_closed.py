@@ -1,0 +1,167 @@
+"""Simple closed systems: the equations (2.4), both balances, the ledger, and bad input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+from liethermo.engine.interpret import at_points
+from tests.cases import tolerance
+
+from .closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl
+
+each_system = pytest.mark.parametrize(
+    "system", [*ISOLATED.values(), *OPEN.values()], ids=[*ISOLATED, *(f"{name}, open" for name in OPEN)]
+)
+
+
+def residuals(system, x):
+    """Of q' = v, of both equations (2.4), of E' = F_ext . v + P_H and S' = (P_H - F_fr . v)/T; the production."""
+    n, rate = system.degrees_of_freedom, system.vector_field(x)
+    q, v, S, t = system.parts(x)
+    by_q, by_v, by_S = jax.grad(system.action, argnums=(0, 1, 2))(q, v, S)
+    change = jax.jvp(system.momentum, (q, v, S), (rate[:n], rate[n : 2 * n], rate[2 * n]))[1]
+    F, push, heat = (f(q, v, S, t) for f in (system.friction_force, system.external_force, system.heating))
+    energy_rate = jax.jvp(system.own_energy, (x,), (rate,))[1]
+    found = {
+        "q' = v": rate[:n] - v,
+        "momentum": change - by_q - F - push,
+        "heat": -by_S * rate[2 * n] - heat + F @ v,
+        "energy balance": energy_rate - push @ v - heat,
+        "E": system.own_energy(x) - (v @ by_v - system.action(q, v, S)),
+        "energy law": jnp.dot(system.energy.gradient(x), rate),
+    }
+    if system.receives:
+        found["ledger"] = rate[2 * n + 1 :] - jnp.stack([push @ v, heat, 1.0])
+    return found, energy_rate, -F @ v / -by_S
+
+
+@each_system
+def test_the_equations_and_both_balances(system):
+    points = np.random.default_rng(0).standard_normal((8, system.dim))
+    found, energy_rate, production = at_points(residuals, system, points)
+    for name, residual in found.items():
+        assert np.abs(residual).max() < 2e-12, name
+    assert production.min() > 1e-4
+    assert (np.abs(energy_rate).max() > 0.1) == system.receives  # so the balance is one of something
+    assert system.check(points).passed
+
+
+SMALL = lt.SimpleClosedSystem(
+    lt.Quadratic([-1.0, 2.0, 0.0]) - lt.Function(lambda y: jnp.exp(y[0])).on([2]),
+    3,
+    0.3,
+    lambda q, v, S, t: jnp.cos(t) - q,
+    0.1,
+)
+
+
+@pytest.mark.parametrize(
+    ("system", "x0"),
+    [
+        pytest.param(SMALL, [0.4, 0.5, 0.2], id="small"),
+        *(pytest.param(system, X0, marks=pytest.mark.slow) for system in [*ISOLATED.values(), *OPEN.values()]),
+    ],
+)
+def test_the_metriplectic_schemes_run_it_and_keep_its_laws(system, x0):
+    """The energy with the ledger is that of an isolated system."""
+    solution = lt.integrate(system, x0, (0.0, 2.0), 0.05, engine="array")
+    assert solution.audit().energy_drift <= tolerance("energy")
+    if not system.receives:
+        assert solution.stats.least_entropy_increment > 0.0
+        assert solution.audit().passed
+
+
+def test_the_ledger_in_the_audit():
+    system = SMALL
+    solution = lt.integrate(system, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05, engine="array")
+    work, heat = solution.casimirs["work received"], solution.casimirs["heat received"]
+    assert min(abs(work[-1]), abs(heat[-1])) > 0.01
+    gained = np.asarray(system.own_energy(solution.x)) - work - heat
+    assert np.ptp(gained) < 1e-13
+    printed = {row.law: row.value for row in solution.audit().rows}
+    assert printed["work received"] == work[-1]
+    assert printed["heat received"] == heat[-1]
+    assert "from outside" in str(solution.audit())
+    assert solution.t[-1] == pytest.approx(solution.x[-1, -1], abs=1e-12)  # the ledger's clock
+
+
+def test_a_ledger_is_written_and_read(tmp_path):
+    solution = lt.integrate(SMALL, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05, engine="array")
+    again = lt.load(solution.save(tmp_path / "run.nc"))
+    assert str(again.audit()) == str(solution.audit())
+
+
+def _rate(system, x):
+    return system.vector_field(x)
+
+
+def test_the_same_lagrangian_in_its_different_forms():
+    """Three arguments, one array, and a sum of energies; a coefficient of friction and the force that it means."""
+    R = np.array([[0.5, 0.1], [0.1, 0.3]])
+
+    def L(q, v, S):
+        return 0.5 * v @ v - 0.5 * q @ q - jnp.exp(S)
+
+    forms = [
+        lt.SimpleClosedSystem(L, 5, friction=R),
+        lt.SimpleClosedSystem(lambda x: L(x[:2], x[2:4], x[4]), 5, friction=lambda q, v, S: -R @ v),
+        lt.SimpleClosedSystem(
+            lt.Kinetic(np.ones(2)) - lt.Potential(lambda q, S: 0.5 * q @ q + jnp.exp(S)), 5, friction=R
+        ),
+    ]
+    fields = [at_points(_rate, system, np.array([X0])) for system in forms]
+    for field in fields[1:]:
+        assert np.abs(field - fields[0]).max() < 1e-14
+
+
+# -- bad input --------------------------------------------------------------------------------------------------------
+
+
+def test_friction_that_injects_energy():
+    def pushing(q, v, S):
+        return jnp.array([0.1 * v[0], -v[1]])
+
+    with pytest.raises(lt.AxiomError, match=r"entropy law|F_fr"):
+        lt.SimpleClosedSystem(MECHANICAL, 5, friction=pushing)
+    report = lt.SimpleClosedSystem(MECHANICAL, 5, friction=pushing, validate=False).check()
+    assert not report.passed
+    assert [row.axiom for row in report.rows if row.passed is False] == ["entropy law", "F_fr . v <= 0"]
+    heated = lt.SimpleClosedSystem(MECHANICAL, 5, friction=pushing, heat_power=1.0, validate=False).check()
+    assert [row.axiom for row in heated.rows if row.passed is False] == ["F_fr . v <= 0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"lagrangian": lambda q, v, S: 0.5 * v[0] ** 2 - S}, lt.InputError, "singular"),
+        ({"lagrangian": lambda q, v, S: v @ q - S}, lt.InputError, "singular"),
+        ({"dim": 4}, lt.InputError, r"2n \+ 1"),
+        ({"dim": None}, lt.InputError, "dim"),
+        ({"friction": -1.0}, lt.InputError, "inject"),
+        ({"friction": np.diag([1.0, -0.1])}, lt.IndefiniteError, "negative"),
+        ({"friction": np.ones(3)}, lt.InputError, "shape"),
+        ({"friction": lambda q, v, S: -v[:1]}, lt.FunctionError, r"shape \(2,\), not \(1,\)"),
+        ({"external": lambda q, v, S: q[5] * jnp.ones(3)}, lt.FunctionError, "external force"),
+        ({"external": lambda q: q}, lt.FunctionError, "external force could not be evaluated"),
+        ({"heat_power": lambda q, v, S: v}, lt.FunctionError, "heat power"),
+    ],
+)
+def test_unusable_arguments(arguments, error, words):
+    given = {"lagrangian": MECHANICAL, "dim": 5, "friction": friction} | arguments
+    with pytest.raises(error, match=words):
+        lt.SimpleClosedSystem(**given)
+
+
+def test_a_run_starts_at_a_positive_temperature():
+    system = lt.SimpleClosedSystem(lambda q, v, S: 0.5 * v @ v - S + 0.5 * S**2, 3, friction=0.1, validate=False)
+    with pytest.raises(lt.InputError, match=r"temperature -dL/dS is -1"):
+        lt.integrate(system, [0.0, 1.0, 2.0], (0.0, 1.0), 0.1)
+
+
+def test_initial_states_may_leave_out_the_ledger():
+    system = lt.SimpleClosedSystem(MECHANICAL, 5, external=swirl)
+    assert np.array_equal(system.state(X0), [*X0, 0.0, 0.0, 0.0])
+    with pytest.raises(lt.InputError, match="shape"):
+        system.state([*X0, 0.0])
