@@ -244,15 +244,15 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, low, d, k, h, b = path.start, path.low, path.step, path.slopes, path.h, path.b
-    new, new_low = _rounded(x, low + d)
-    points, slopes = (jnp.zeros((0, *k.shape[1:])),) * 2 if path.further is None else path.further
+    new, new_low = compensated(x, low + d)
+    further = () if path.further is None else (path.further[0],)
     # one map for all points, as one is what a compiler has to work on
-    found = jax.vmap(term.gradient)(jnp.concatenate([path.points, points, jnp.stack([x, new])]))
+    found = jax.vmap(term.gradient)(jnp.concatenate([path.points, *further, jnp.stack([x, new])]))
     gradients, between, ends = found[: len(k)], found[len(k) : -2], found[-2:]
     mean, smooth = b @ gradients, jnp.zeros(())
     spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
     if path.finer is not None and path.further is not None:
-        rates = jnp.sum(between * slopes, axis=1)
+        rates = jnp.sum(between * path.further[1], axis=1)
         smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
     before, after = _values(term, jnp.stack([x, new]))
@@ -269,8 +269,8 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     return gradients + alpha * direction
 
 
-def _rounded(x, d):
-    """x + d as a double, and what rounding keeps from it (two-sum)."""
+def compensated(x, d) -> tuple[jax.Array, jax.Array]:
+    """x + d as a double, and what rounding keeps from it (Neumaier's two-sum)."""
     new = x + d
     back = new - x
     return new, (x - (new - back)) + (d - back)

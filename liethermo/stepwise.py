@@ -264,7 +264,7 @@ def run(
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0
             if event and event.happens(value, after):
-                h, new = _located(event, system, method, advance, state, new, h, value, after)
+                h, new = _located(event, advance, system, method, state, new, h, value, after)
                 if h > UNDERFLOW * (end - span[0]):
                     keep(t, t + h, h, state, new)
                     outcome.state = new
@@ -306,7 +306,7 @@ def _first_step(state, length: float) -> float:
     return min(length, 0.01 * size / speed) if speed > 0.0 and size > 0.0 else 1e-3 * length
 
 
-def _located(event: Event, system, method, advance: Callable, state, new, h: float, before: float, after: float):
+def _located(event: Event, advance: Callable, system, method, state, new, h: float, before: float, after: float):
     """The step that ends where the event happens, to rounding: its size and the state it leads to.
 
     Looked for among steps from the same state, so that the event is as accurate as the method and the laws hold there;

@@ -29,9 +29,9 @@ from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
-SMALL_DIM, SMALL_PROGRAM = 8, 1500
-"""Components of a state and operations of a step up to which numba compiles it about as fast as XLA does (5 s), so that
-"auto" always takes it. Beyond, its time grows as their square: half a minute for 2,700 operations."""
+SMALL_DIM, SMALL_PROGRAM = 16, 4000
+"""Components of a state and operations of a step up to which it is compiled in about the time that XLA takes (two or
+three seconds), so that "auto" always takes it."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
@@ -88,7 +88,7 @@ def integrate(
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled"}
         JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
-        more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 8
+        more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 16
         components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
         with a warning, where the system uses what cannot be compiled.
     on_failure : {"raise", "return"}

@@ -1,14 +1,15 @@
 """The compiled engine: a user's plain functions at the speed of C, for small systems on the CPU.
 
-The step equations of a method on a system are traced, unrolled to scalar programs (:mod:`.scalarize`) and placed before
-the step loop (:mod:`.step_loop`) in a module that numba compiles. The system's parameters (the arrays among its leaves)
-stay arguments: a sweep compiles once. Modules are kept on disk under the hash of their text, so that another process
-finds them compiled.
+The step equations of a method on a system are traced, unrolled to scalar programs (:mod:`.scalarize`), translated
+(:mod:`.straight_line`) and placed before the step loop (:mod:`.step_loop`) in a module that numba compiles. The
+system's parameters (the arrays among its leaves) stay arguments: a sweep compiles once. Modules are kept on disk under
+the hash of their text, so that another process finds them compiled.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib.util
 import inspect
@@ -32,9 +33,11 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..systems import System
 from . import array, step_loop
+from . import straight_line as straight_line_module
 from .array import State
 from .remembered import fingerprint, remembered
 from .scalarize import Program, scalarize
+from .straight_line import is_plain
 
 VECTORS = {"x": "X", "low": "LOW", "k": "K", "before": "BEFORE"}
 
@@ -60,8 +63,8 @@ NUMBERS = {
 WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS"
 """The other rows of one number."""
 
-VECTORS_OF_NEWTON = {"LINEAR": "linear", "DIRECTION": "direction", "CHANGES": "change"}
-"""Arrays that lie outside the rows, for one lane at a time, and their names in the step loop."""
+OF_NEWTON = ("DIRECTION", "CHANGES", "LINEAR")
+"""What Newton's method works with, for one lane at a time: one after another in an array of its own."""
 
 CONSTANTS = """FIXED_POINT_LIMIT FLOOR HARD IDLE ITERATING NEWTON_LIMIT NEWTON_REUSE NON_FINITE NOT_CONVERGED PLATEAU
 SHRINKING SLOW SOLVED"""
@@ -263,8 +266,7 @@ class Stepper:
         with self._lock:
             if self._slow is None:
                 self._slow = ModuleType("spelled_out")
-                text = self._text(True, "lambda **options: lambda f: f").replace("CACHE", "False")
-                exec(compile(text, "<step>", "exec"), self._slow.__dict__)
+                exec(compile(self._text(True, spelled_out=True), "<step>", "exec"), self._slow.__dict__)
             return self._slow
 
     def _try_out(self, module: ModuleType) -> None:
@@ -272,40 +274,44 @@ class Stepper:
         blocks, done = np.zeros((0, self._height * self.lanes)), np.zeros(0, dtype=np.int64)
         module.advance(np.zeros(self._shapes["P"]), blocks, done, 0, 1, np.zeros((0, 0, 0)), 0)
 
-    def _text(self, newton: bool, compiled: str = "numba.njit") -> str:
+    def _text(self, newton: bool, spelled_out: bool = False) -> str:
+        """The module; with Newton's method or without, to be compiled or to be run by Python."""
         lanes, n, m = self.lanes, self._shapes["X"][0], math.prod(self._shapes["K"])
-        lines = ["import math", "", "import numba", "import numpy as np", "", f"compiled = {compiled}"]
-        lines += ["entry = compiled(cache=CACHE, error_model='numpy', nogil=True)"]
-        # inlined, the programs keep their values in registers; with Newton's method there are too many calls for that
-        lines += [f"njit = compiled(error_model='numpy', nogil=True, forceinline={not newton})"]
-        lines += [f"N, M, LANES, NEWTON = {n}, {m}, {lanes}, {newton}"]
-        derivative, size = self._derivative_programs(newton)
-        lines += [f"LINEAR = {size}"]
+        programs = dict(self._programs)
+        size = self._add_derivative(programs) if newton else 0
+        lines = ["import math", "", "import numpy as np", ""]
+        if spelled_out:
+            lines += ["njit = entry = lambda function: function"]
+        else:
+            lines += ["import numba", "", "from liethermo.engine.straight_line import straight_line", ""]
+            lines += [f"# translated by {_translator()}"]
+            options = "error_model='numpy', nogil=True, no_cfunc_wrapper=True"
+            lines += [f"entry = numba.njit(cache=CACHE, {options})"]
+            # inlined, programs keep their values in registers; with Newton's method there are too many calls for that
+            lines += [f"njit = numba.njit({options}, no_cpython_wrapper=True, forceinline={not newton})"]
+        lines += [f"N, M, LANES, NEWTON, LENGTH = {n}, {m}, {lanes}, {newton}, {2 * m + size}"]
         lines += [f"{name} = {getattr(step_loop, name)!r}" for name in CONSTANTS.split()]
         lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]
         lines += [f"RELAXING = {self._relaxing * lanes}"]
-        for name, pieces in self._programs.items():
+        for name, pieces in programs.items():
+            looped = name in self._programs
             body = [line for i, piece in enumerate(pieces) for line in self._body(piece, f"_{i}")]
-            loop = ["    for l in range(first, last):", *(f"        {line}" for line in body)]
-            lines += ["", "", "@njit", f"def {name}(p, w, first, last):", *loop]
-        for heading, body in derivative.items():
-            lines += ["", "", "@njit", f"def {heading}:", *(f"    {line}" for line in body)]
+            plain = not spelled_out and all(is_plain(piece.program) for piece in pieces)
+            lines += ["", "", *_function(name, body, looped, plain)]
+        if not newton:
+            lines += ["", "", "linearise = along = njit(lambda p, w, l, v: None)"]
         return "\n".join(lines) + "\n\n\n" + _template()
 
-    def _derivative_programs(self, newton: bool) -> tuple[dict[str, list[str]], int]:
-        """The functions of Newton's method, empty where it is not wanted; the length of what the first hands on."""
-        first, second = "linearise(p, w, l, linear)", "along(p, w, l, linear, direction, change)"
-        if not newton:
-            return {first: ["pass"], second: ["pass"]}, 1
+    def _add_derivative(self, programs: dict[str, list[_Piece]]) -> int:
+        """Add the programs of Newton's method; the length of what the first hands to the second."""
         linear, along = self._derivative()
         (size,) = self._shapes["LINEAR"] = linear.shapes[0]
         arguments = f"{self._step_arguments} DIRECTION"
-        return {
-            first: self._body(_Piece(linear, arguments, "LINEAR")),
-            second: self._body(_Piece(along, f"{arguments} LINEAR", "CHANGES")),
-        }, max(1, size)
+        programs["linearise"] = [_Piece(linear, arguments, "LINEAR")]
+        programs["along"] = [_Piece(along, f"{arguments} LINEAR", "CHANGES")]
+        return size
 
-    def _body(self, piece: _Piece, prefix: str = "") -> list[str]:
+    def _body(self, piece: _Piece, prefix: str) -> list[str]:
         return piece.program.body(self._cells(piece.arguments), self._cells(piece.results), prefix)
 
     def _cells(self, names: str) -> list[str]:
@@ -315,16 +321,16 @@ class Stepper:
             size = math.prod(self._shapes[name])
             if name == "P":
                 cells += [f"w[{next(own) * lanes} + l]" if v else f"p[{i}]" for i, v in enumerate(self._varies)]
-            elif name in VECTORS_OF_NEWTON:
-                cells += [f"{VECTORS_OF_NEWTON[name]}[{i}]" for i in range(size)]
+            elif name in OF_NEWTON:
+                cells += [f"v[{OF_NEWTON.index(name) * math.prod(self._shapes['K']) + i}]" for i in range(size)]
             else:
                 cells += [f"w[{(self._rows[name] + i) * lanes} + l]" for i in range(size)]
         return cells
 
 
-SPELLED_OUT = 1000
-"""Steps with Newton's method, times lanes, up to which it is not compiled: the program of a derivative is long, and a
-single large step would cost half a minute. Python takes some milliseconds for one."""
+SPELLED_OUT = 300
+"""Steps with Newton's method, times lanes, up to which it is not compiled: Python takes some milliseconds for one, and
+the program of a derivative is long."""
 
 
 class _Piece(NamedTuple):
@@ -407,6 +413,23 @@ def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndar
     leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
     parameters = np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
     return stepper_of(Form.of(system), parameters, method), parameters
+
+
+def _function(name: str, body: list[str], looped: bool, plain: bool) -> list[str]:
+    """A program as lines of a module: translated where it is plain, else left to numba."""
+    arguments = "p, w, first, last" if looped else "p, w, l, v"
+    if plain:
+        text = "\n".join(body)
+        yielded = [f"_{name} = straight_line({text!r}, {looped})"]
+        return [*yielded, "", "", "@njit", f"def {name}({arguments}):", f"    _{name}({arguments})"]
+    lines = ["for l in range(first, last):", *(f"    {line}" for line in body)] if looped else body
+    return ["@njit", f"def {name}({arguments}):", *(f"    {line}" for line in lines or ["pass"])]
+
+
+@functools.cache
+def _translator() -> str:
+    """What tells versions of the translation apart, whose machine code is not the same."""
+    return hashlib.sha256(inspect.getsource(straight_line_module).encode()).hexdigest()[:12]
 
 
 def _template() -> str:

@@ -26,10 +26,10 @@ from .array import (
 IDLE, ITERATING, SOLVED, HARD = 0, 1, 2, 3
 """Phases of a lane within a step."""
 
-N = M = LANES = LINEAR = 1
+N = M = LANES = LENGTH = 1
 NEWTON = False
-"""Components of the state, of all stage slopes together; trajectories in a block; numbers of ``linearise``; whether the
-last two programs are there."""
+"""Components of the state, of all stage slopes together; trajectories in a block; length of v; whether the last two
+programs are there."""
 
 X = LOW = K = BEFORE = GUESS = NEW = AFTER = AFTER_LOW = AFTER_ENERGY = AFTER_ENTROPY = CHECK = 0
 H = SIZE = UPDATE = SLOPE = PREVIOUS = BEST = STALLED = PHASE = CHANGE = TRIES = CORRECTIONS = 0
@@ -46,12 +46,12 @@ def iterate(p, w, first, last):
     """NEW, the slopes at GUESS; UPDATE, their largest difference; SLOPE, the largest of them."""
 
 
-def linearise(p, w, lane, linear):
-    """What the derivative of NEW by GUESS, at GUESS, needs in every direction."""
+def linearise(p, w, l, v):
+    """What the derivative of NEW by GUESS needs, at the GUESS of lane l, in every direction: v from 2 M on."""
 
 
-def along(p, w, lane, linear, direction, change):
-    """The derivative of NEW - GUESS by GUESS in one direction."""
+def along(p, w, l, v):
+    """The derivative of NEW - GUESS by GUESS in the direction v[:M], as v[M:2 M]."""
 
 
 def finish(p, w, first, last):
@@ -130,16 +130,16 @@ def substitute(A, order, b):
 
 
 @njit
-def jacobian(p, w, l, matrix, linear, direction, change):
+def jacobian(p, w, l, matrix, v):
     """The derivative of NEW - GUESS by GUESS, column by column."""
-    linearise(p, w, l, linear)
-    direction[:] = 0.0
+    linearise(p, w, l, v)
+    v[:M] = 0.0
     for j in range(M):
-        direction[j] = 1.0
-        along(p, w, l, linear, direction, change)
-        direction[j] = 0.0
+        v[j] = 1.0
+        along(p, w, l, v)
+        v[j] = 0.0
         for i in range(M):
-            matrix[i, j] = change[i]
+            matrix[i, j] = v[M + i]
 
 
 @njit
@@ -153,7 +153,7 @@ def misfit(p, w, l):
 
 
 @njit
-def solve_by_newton(p, w, l, matrix, order, b, linear, direction):
+def solve_by_newton(p, w, l, matrix, order, b, v):
     """Simplified Newton for one lane."""
     # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may wander.
     prepare(p, w, l, l + 1)
@@ -165,7 +165,7 @@ def solve_by_newton(p, w, l, matrix, order, b, linear, direction):
     status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
     while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:
-            jacobian(p, w, l, matrix, linear, direction, b)
+            jacobian(p, w, l, matrix, v)
             if not factorise(matrix, order):
                 status, update = NON_FINITE, np.nan
                 break
@@ -198,7 +198,7 @@ def solve_by_newton(p, w, l, matrix, order, b, linear, direction):
 
 
 @njit
-def take_step(p, w, matrix, order, b, linear, direction):
+def take_step(p, w, matrix, order, b, v):
     """One step of every lane that is running; where one fails its state stays and a status says why.
 
     False, and nothing has happened, where some lane needs Newton's method and the module has none.
@@ -226,7 +226,7 @@ def take_step(p, w, matrix, order, b, linear, direction):
             return False
         for l in range(LANES):
             if w[PHASE + l] == HARD:
-                solve_by_newton(p, w, l, matrix, order, b, linear, direction)
+                solve_by_newton(p, w, l, matrix, order, b, v)
     finish(p, w, 0, LANES)
     for l in range(LANES):
         solved = w[PHASE + l] == SOLVED
@@ -270,8 +270,7 @@ def advance(p, blocks, done, saves, every, out, most):
     No further than ``most`` steps, or to where a block needs Newton's method and the module has none: the number of
     that block is returned, and another call, with a module that has, goes on there; otherwise the number of blocks.
     """
-    matrix, order, b = np.empty((M, M)), np.empty(M, np.int64), np.empty(M)
-    linear, direction = np.empty(LINEAR), np.empty(M)
+    matrix, order, b, v = np.empty((M, M)), np.empty(M, np.int64), np.empty(M), np.empty(LENGTH)
     for block in range(len(blocks)):
         w, end = blocks[block], min(saves * every, done[block] + most)
         while done[block] < end:
@@ -280,7 +279,7 @@ def advance(p, blocks, done, saves, every, out, most):
                 running += 1 if w[STATUS + l] == 0.0 else 0
             if running == 0:
                 break
-            if not take_step(p, w, matrix, order, b, linear, direction):
+            if not take_step(p, w, matrix, order, b, v):
                 return block
             done[block] += 1
             if done[block] % every == 0:

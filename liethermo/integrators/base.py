@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
+from ..gradients import compensated
 from ..systems import System
 from .tableaus import at_start
 
@@ -107,13 +108,6 @@ class OneStepMethod(eqx.Module):
 
     def __str__(self) -> str:
         return type(self).__name__
-
-
-def compensated(x, d) -> tuple[jax.Array, jax.Array]:
-    """x + d as a double, and what rounding keeps from it (Neumaier's two-sum)."""
-    new = x + d
-    back = new - x
-    return new, (x - (new - back)) + (d - back)
 
 
 def collocation_error(system: System, x, low, h, k) -> jax.Array:

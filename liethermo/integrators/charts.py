@@ -8,11 +8,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import manifolds as mf
 
 from ..errors import InputError
+from ..gradients import EPS
 from ..systems import ChartSystem, System
 from .base import OneStepMethod, collocation_error
 
@@ -71,23 +71,24 @@ class InCharts(OneStepMethod):
     def along(self, system: System, x, v) -> jax.Array:
         return self.retraction.space.to_vector(self.retraction.chart._point(system.points(x), system.points(v)))
 
-    def check(self, system: System) -> None:
-        self.method.check(system)
-
-    def error(self, system: System, x, low, h, k) -> jax.Array:
-        return collocation_error(system, x, low, h, k)
-
     def jacobian(self, system: System, x, low, h, k) -> jax.Array:
-        """By one-sided differences, with half of the digits, which is enough for Newton's method.
+        """By one-sided differences, half of the digits, which is enough for Newton's method.
 
         The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
         what is hardly ever needed.
         """
         size = jnp.max(jnp.abs(k))
-        step = _ROOT_EPS * jnp.where(size > 0.0, size, 1.0)
+        step = EPS**0.5 * jnp.where(size > 0.0, size, 1.0)
         shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
-        values = jax.lax.map(lambda shift: self.slopes(system, x, low, h, k + shift.reshape(k.shape)).ravel(), shifts)
-        return ((values[1:] - values[0]) / step).T - jnp.eye(k.size)
+        misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
+        values = jax.lax.map(lambda shift: misfit(k.ravel() + shift), shifts)
+        return ((values[1:] - values[0]) / step).T
+
+    def check(self, system: System) -> None:
+        self.method.check(system)
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        return collocation_error(system, x, low, h, k)
 
     def explain(self, system: System, x, k, h) -> str:
         x, k = jnp.asarray(x), jnp.asarray(k)
@@ -141,9 +142,6 @@ class InCharts(OneStepMethod):
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"
-
-
-_ROOT_EPS = float(np.finfo(np.float64).eps) ** 0.5
 
 
 class _Step(NamedTuple):

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
+from ..gradients import compensated
 from ..systems import AttitudeSystem
-from .base import OneStepMethod, compensated
+from .base import OneStepMethod
 from .tableaus import gauss
 
 RECONSTRUCTIONS = ("cayley", "exp")

@@ -30,8 +30,9 @@ Maps = FiniteDifference | Sequence[FiniteDifference]
 class VariationalIntegrator(OneStepMethod):
     """``D_1 L_d(r_k) + D_2 L_d(r_k-1) + F^-_d(r_k) + F^+_d(r_k-1) = 0`` and ``P_d(r_k) = 0`` [GBY 3.12].
 
-    Here ``r_k = (q_k, q_k+1, S_k, S_k+1)``. With finite difference maps phi_i and their weights w_i, of sum 1, ``L_d = h sum w_i L(phi_i)`` (3.10),
-    ``F^±_d`` is the share of ``h sum w_i F(phi_i)`` at either end, and ``P_d = 0`` (3.9) is
+    Here ``r_k = (q_k, q_k+1, S_k, S_k+1)``. With finite difference maps phi_i and their weights w_i, of sum 1,
+    ``L_d = h sum w_i L(phi_i)`` (3.10), ``F^±_d`` is the share of ``h sum w_i F(phi_i)`` at either end, and ``P_d = 0``
+    (3.9) is
 
         sum w_i T_i (S_k+1 - S_k)/h = sum w_i (P_H - F_fr . v)_i,    T = -L_S.
 
@@ -41,11 +42,11 @@ class VariationalIntegrator(OneStepMethod):
     ``p_k = L_v(q_k, v_k, S_k) = -D_1 L_d(r_k) - F^-_d(r_k)`` and ``p_k+1 = D_2 L_d(r_k) + F^+_d(r_k)`` are (3.12), and
     make the first step from (q_0, v_0, S_0) one like the others. :meth:`state` starts from (q_0, q_1, S_0).
 
-    The entropy falls at no step, for every L, friction and step size, since temperatures are positive (where one is not,
-    the run stops). The energy is not kept: its error oscillates or stays bounded, see the paper. The flow obeys (4.7);
-    it is symplectic where nothing depends on S. Order 2 where the maps are symmetric, else 1. One equation of the size
-    of (q, S) a step, solved by Newton's method with the matrix (3.13); where the motion does not depend on S_k+1 and is
-    affine in q_k+1 it is solved outright.
+    The entropy falls at no step, for every L, friction and step size, since temperatures are positive (where one is
+    not, the run stops). The energy is not kept: its error oscillates or stays bounded, see the paper. The flow obeys
+    (4.7); it is symplectic where nothing depends on S. Order 2 where the maps are symmetric, else 1. One equation of
+    the size of (q, S) a step, solved by Newton's method with the matrix (3.13); where the motion does not depend on
+    S_k+1 and is affine in q_k+1 it is solved outright.
 
     Parameters
     ----------
