@@ -13,7 +13,7 @@ from benchmarks import child, laws, native, page, reference
 from benchmarks.__main__ import main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
-from benchmarks.measurements import memory
+from benchmarks.measurements import memory, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
@@ -90,6 +90,14 @@ def test_c_runs_the_same_scheme(source, parameters, system):
     assert difference(Body(source, parameters(1.0)), system(1.0)) <= 1e-12
     with pytest.raises(RuntimeError, match="differ by"):  # another rate is another trajectory
         difference(Body(source, parameters(1.001)), system(1.0))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "number", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
+def test_c_runs_the_same_variational_scheme(number):
+    assert variational.difference(number) <= 1e-12
 
 
 @needs_compiler

@@ -3,6 +3,7 @@
 NAMES = (
     "single_body",
     "general",
+    "variational",
     "ensemble",
     "work_precision",
     "dimension",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -154,10 +155,15 @@ def _widest_level(pattern: scipy.sparse.csr_array) -> int:
 
 def _coloured(pattern: scipy.sparse.csr_array) -> np.ndarray:
     """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
+    columnwise = scipy.sparse.csc_array(pattern)
+    return _compiled_greedy()(pattern.indptr, pattern.indices, columnwise.indptr, columnwise.indices)
+
+
+@functools.cache
+def _compiled_greedy() -> Callable:
     from numba import njit  # which takes a while to import and is not always needed
 
-    columnwise = scipy.sparse.csc_array(pattern)
-    return njit(_greedy)(pattern.indptr, pattern.indices, columnwise.indptr, columnwise.indices)
+    return njit(_greedy)
 
 
 def _greedy(starts, columns, column_starts, rows):

@@ -9,6 +9,8 @@ from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
 from .variational import VariationalIntegrator
+from .variational_gauss import VariationalGauss
+from .variational_lie import LieVariational
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
     "Reference": Reference
@@ -21,10 +23,12 @@ __all__ = [
     "DiscreteSystem",
     "FiniteDifference",
     "InCharts",
+    "LieVariational",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "OneStepMethod",
     "Reference",
+    "VariationalGauss",
     "VariationalIntegrator",
     "WithAttitude",
     "registered_methods",

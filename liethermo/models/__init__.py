@@ -5,6 +5,7 @@ A function ``model_solution`` beside a model, in its module, is the exact soluti
 
 from __future__ import annotations
 
+from .body_with_wheels import body_with_wheels
 from .cylinder import cylinder
 from .gas_piston import gas_piston
 from .heat_grid import heat_grid
@@ -15,6 +16,7 @@ from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_
 from .thermoelastic_chain import thermoelastic_chain
 
 __all__ = [
+    "body_with_wheels",
     "cylinder",
     "damped_oscillator",
     "free_rigid_body",

@@ -6,6 +6,7 @@ from .bodies import Copies, Subsystem
 from .chart import ChartSystem
 from .composed import ComposedSystem
 from .euler_poincare import EulerPoincareSystem, Legendre
+from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
@@ -18,6 +19,7 @@ __all__ = [
     "ComposedSystem",
     "ContactSystem",
     "Copies",
+    "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
     "Herglotz",

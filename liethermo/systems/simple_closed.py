@@ -16,6 +16,7 @@ from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, Law, semidefinite
 from ..energy import Energy, Quadratic, is_traced
+from ..engine.interpret import at_points
 from ..errors import FunctionError, InputError
 from .herglotz import OnVelocities
 
@@ -214,7 +215,7 @@ class SimpleClosedSystem(OnVelocities):
     # -- checks -----------------------------------------------------------------------------------------------------
 
     def outside(self, x) -> str:
-        T = float(self.temperature(x))
+        T = float(at_points(_temperature, self, np.asarray(x)[None])[0])
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
@@ -223,6 +224,10 @@ class SimpleClosedSystem(OnVelocities):
         size = jnp.linalg.norm(force) * jnp.linalg.norm(v)
         injected = jnp.maximum(jnp.dot(force, v), 0.0)
         return {"F_fr . v <= 0": injected / jnp.where(size > 0.0, size, 1.0)}
+
+
+def _temperature(system: SimpleClosedSystem, x):
+    return system.temperature(x)
 
 
 class _WithLedger(mf.PoissonStructure):

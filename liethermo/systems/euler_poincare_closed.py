@@ -1,0 +1,179 @@
+"""Euler-Poincaré equations with entropy: simple closed systems on a Lie group, reduced [after GBY §2, BFM §3]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds.matrix_functions import solve
+
+from ..dissipation import Dissipation, Law
+from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..engine.interpret import at_points
+from ..errors import FunctionError, InputError
+from .base import System
+
+
+class EulerPoincareClosedSystem(System):
+    """``d/dt l_xi = ad*_xi l_xi + f(xi, S)``, ``T S' = -f . xi``, ``T = -l_S > 0``: a body that its friction heats.
+
+    These are the equations (2.4) of a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2
+    with ``delta xi = eta' + [xi, eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is
+    constant and the entropy does not fall, as long as ``f . xi <= 0``, which :meth:`check` tests. The spatial momentum
+    ``Ad*_{g^-1} l_xi`` is constant in the directions that commute with all others in which f acts: friction between the
+    parts of a body does not touch its angular momentum.
+
+    The state is (xi, S), shape (dim + 1,).
+
+    Parameters
+    ----------
+    algebra : manifolds.LieAlgebra
+    lagrangian : function of (xi, S), xi of shape (dim,), to a scalar
+        l, regular: ``l_xi xi`` has an inverse.
+    friction : function of (xi, S) to a covector, shape (dim,), optional
+        f.
+    momentum_maps, validate
+        As for :class:`System`; functions of (xi, S).
+
+    Raises
+    ------
+    AxiomError, FunctionError, InputError
+
+    Attributes
+    ----------
+    algebra : manifolds.LieAlgebra
+    """
+
+    algebra: mf.LieAlgebra
+    lagrangian: Callable
+    friction: Callable | None
+
+    domain: ClassVar[str] = "a positive temperature"
+
+    def __init__(self, algebra: mf.LieAlgebra, lagrangian, friction=None, momentum_maps=(), validate: bool = True):
+        n = algebra.dim
+        self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
+        check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
+        if friction is not None:
+            _check_covector(friction, n)
+        structure = OnAlgebra(algebra, lagrangian)
+        if not is_traced(lagrangian):
+            hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
+            singular = np.linalg.svd(hessians, compute_uv=False)
+            if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+                raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
+        entropy = Quadratic(jnp.zeros(n + 1), jnp.zeros(n + 1).at[n].set(1.0))
+        energy = recognised(ReducedEnergy(lagrangian), n + 1)
+        forces = None if friction is None else AlgebraFriction(friction)
+        self._build(structure, n + 1, energy, entropy, forces, momentum_maps, validate)
+
+    def momentum(self, xi, S) -> jax.Array:
+        """``l_xi`` at one point, shape (dim,)."""
+        return jax.grad(self.lagrangian)(xi, S)
+
+    def friction_force(self, xi, S) -> jax.Array:
+        """f at one point, shape (dim,)."""
+        return jnp.zeros_like(xi) if self.friction is None else jnp.asarray(self.friction(xi, S))
+
+    def temperature(self, x) -> jax.Array:
+        """``T = -l_S`` at a state or a batch of states, shape (...)."""
+        by_S = jax.grad(self.lagrangian, argnums=1)
+        return jnp.vectorize(lambda y: -by_S(y[:-1], y[-1]), signature="(n)->()")(self.state(x, batch=True))
+
+    def momenta(self, x) -> jax.Array:
+        """``l_xi``, shape (..., dim), at a state or a batch of states."""
+        return jnp.vectorize(lambda y: self.momentum(y[:-1], y[-1]), signature="(n)->(m)")(self.state(x, batch=True))
+
+    def outside(self, x) -> str:
+        T = float(at_points(_temperature, self, np.asarray(x)[None])[0])
+        return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        force, xi = self.friction_force(x[:-1], x[-1]), x[:-1]
+        size = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
+        return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(size > 0.0, size, 1.0)}
+
+
+class ReducedEnergy(Energy):
+    """``xi . l_xi - l``."""
+
+    lagrangian: Callable
+
+    def value(self, x) -> jax.Array:
+        value, momentum = jax.value_and_grad(self.lagrangian)(x[:-1], x[-1])
+        return jnp.dot(x[:-1], momentum) - value
+
+
+class OnAlgebra(mf.PoissonStructure):
+    """The Lie-Poisson structure on g* x R in the chart ``(xi, S) -> (l_xi, S)``; S is a Casimir function."""
+
+    algebra: mf.LieAlgebra
+    lagrangian: Callable
+
+    @property
+    def dim(self) -> int:
+        return self.algebra.dim + 1
+
+    def rates(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """``mu = l_xi`` and its derivatives by xi and S."""
+        momentum = jax.grad(self.lagrangian)
+        by_xi, by_S = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
+        return momentum(x[:-1], x[-1]), by_xi, by_S
+
+    def tensor(self, x) -> jax.Array:
+        return jax.vmap(lambda alpha: self.sharp(x, alpha), out_axes=1)(jnp.eye(self.dim))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        mu, W, _ = self.rates(x)
+        xi = solve(W, alpha[:-1, None])[:, 0]
+        return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
+
+
+class AlgebraFriction(Dissipation):
+    """The force f and the heat that it makes, for discrete gradients too."""
+
+    friction: Callable
+
+    @property
+    def entropy_law(self) -> Law | None:
+        return "nondecreasing"
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    @property
+    def symmetric(self) -> bool:
+        return False
+
+    def force(self, system, x, dH, dS, dL):
+        _, W, by_S = system.poisson.rates(x)
+        xi = solve(W, dH[:-1, None])[:, 0]
+        T, f = dH[-1] - jnp.dot(by_S, xi), self.friction(xi, x[-1])
+        S_dot = -jnp.dot(f, xi) / jnp.where(T > 0.0, T, jnp.nan)
+        return jnp.append(solve(W, (f - by_S * S_dot)[:, None])[:, 0], S_dot)
+
+
+def _temperature(system: EulerPoincareClosedSystem, x):
+    return system.temperature(x)
+
+
+def _hessian(structure: OnAlgebra, x):
+    return structure.rates(x)[1]
+
+
+def _check_covector(friction: Callable, n: int) -> None:
+    vector, number = jax.ShapeDtypeStruct((n,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
+    try:
+        shape = jax.eval_shape(lambda xi, S: jnp.asarray(friction(xi, S)), vector, number).shape
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(
+            f"the friction could not be evaluated at (xi, S): {type(error).__name__}: {error}"
+        ) from error
+    if shape != (n,):
+        raise FunctionError(f"the friction has shape ({n},), not {shape}")
