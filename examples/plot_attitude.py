@@ -36,8 +36,7 @@ in_space = np.einsum("tij,tj->ti", tumbling.attitude, tumbling.x)
 print(f"the spatial momentum of the free body drifts by {np.abs(in_space - in_space[0]).max():.0e}")
 
 # %%
-# The box seen from outside, with its momentum: at first about the middle axis, in the end about the shortest edge. The
-# arrow moves as well, since friction inside the body leaves its energy as it is and not its momentum.
+# The box seen from outside, with its momentum, which is at first along the middle edge, in the end along the shortest.
 
 corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2
 faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
@@ -54,7 +53,7 @@ for place, moment in enumerate(times):
     ax.quiver(0, 0, 0, *(1.5 * momentum / np.linalg.norm(momentum)), color="#D55E00", lw=2, zorder=9)
     limits = (-1.1, 1.1)
     ax.set(xlim=limits, ylim=limits, zlim=limits, title=f"t = {solution.t[i]:.0f}")
-    ax.set_box_aspect((1, 1, 1), zoom=1.2)
+    ax.set_box_aspect((1, 1, 1), zoom=1.0)
     ax.view_init(25, 25)
     ax.set_axis_off()
 

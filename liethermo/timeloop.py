@@ -131,19 +131,10 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    state = system.state(x0)
-    if reason := system.outside(state):
-        raise InputError(f"the run cannot start at this x0: {reason}")
-    if isinstance(system, LiePoissonSystem) and system.group is not None and isinstance(method, OneStepMethod):
-        assert system.reconstruction is not None
-        method = WithAttitude(method.on(system), system.reconstruction)
-        system = AttitudeSystem(system)
-        state = system.begin(state, attitude)
-    elif attitude is not None:
-        raise InputError("an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)")
-    if isinstance(method, OneStepMethod):
-        method = method.on(system)
+    system, method = _as_run(system, method)
     _prepared(system, method)  # refuses what the method cannot run
+    if attitude is not None and not isinstance(system, AttitudeSystem):
+        raise InputError("an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)")
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -151,7 +142,10 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    run = _Run(system, method, state, table, save_to, engine)
+    x = system.begin(x0, attitude) if isinstance(system, AttitudeSystem) else system.state(x0)
+    if reason := system.outside(x):
+        raise InputError(f"the run cannot start at this x0: {reason}")
+    run = _Run(system, method, x, table, save_to, engine)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
@@ -459,6 +453,17 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
 
 def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
     warnings.warn(f"{error}; the array engine runs it instead", CompiledEngineWarning, stacklevel=stacklevel)
+
+
+@remembered
+def _as_run(system: System, method) -> tuple[System, Any]:
+    """The system and the method as they are run: with attitudes where there is a group, in charts on a manifold."""
+    if not isinstance(method, OneStepMethod):
+        return system, method
+    method = method.on(system)
+    if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
+        return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
+    return system, method
 
 
 @remembered

@@ -8,20 +8,14 @@ the hash of their text, so that another process finds them compiled.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
-import importlib.util
 import inspect
 import itertools
 import math
-import os
-import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -35,6 +29,7 @@ from ..systems import System
 from . import array, step_loop
 from . import straight_line as straight_line_module
 from .array import State
+from .module_cache import load
 from .remembered import fingerprint, remembered
 from .scalarize import Program, scalarize
 from .straight_line import is_plain
@@ -436,58 +431,3 @@ def _template() -> str:
     """The step loop, as the module :mod:`.step_loop` has it below its mark."""
     source = inspect.getsource(step_loop)
     return source[source.index("@njit\ndef settle") :]
-
-
-# -- modules on disk ----------------------------------------------------------------------------------------------
-
-
-def cache_folder() -> Path:
-    """Where compiled modules are kept: ``$LIETHERMO_CACHE``, or a folder under the user's cache directory."""
-    named = os.environ.get("LIETHERMO_CACHE")
-    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "liethermo"
-
-
-def load(text: str, try_out: Callable[[ModuleType], None]) -> ModuleType:
-    """The module with this text, compiled by ``try_out`` or found so on disk; from memory alone where that fails."""
-    name = "liethermo_step_" + hashlib.sha256(text.encode()).hexdigest()[:24]
-    try:
-        module = _imported(name, _written(name, text.replace("CACHE", "True")))
-        try_out(module)
-        return module
-    except Exception:  # a folder that cannot be written, a file that was damaged: numba raises what it meets
-        sys.modules.pop(name, None)
-        with contextlib.suppress(OSError):
-            for file in cache_folder().glob(f"**/{name}*"):
-                file.unlink()
-    module = ModuleType(name)
-    exec(compile(text.replace("CACHE", "False"), f"<{name}>", "exec"), module.__dict__)
-    try_out(module)  # an error that is not the disk's shows here
-    return module
-
-
-def _written(name: str, text: str) -> Path:
-    """The file of a module, which appears whole or not at all, so that a killed process leaves nothing broken."""
-    folder = cache_folder()
-    path = folder / f"{name}.py"
-    if not (path.is_file() and path.read_text() == text):
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".part")
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(text)
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
-    return path
-
-
-def _imported(name: str, path: Path) -> ModuleType:
-    if name in sys.modules:
-        return sys.modules[name]
-    specification = importlib.util.spec_from_file_location(name, path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    sys.modules[name] = module
-    return module

@@ -91,6 +91,7 @@ class InCharts(OneStepMethod):
         return collocation_error(system, x, low, h, k)
 
     def explain(self, system: System, x, k, h) -> str:
+        x, k = jnp.asarray(x), jnp.asarray(k)
         reach = float(self._reach(system, x, self.increment(h, k)))
         if not reach >= 0.5:
             return ""

@@ -28,7 +28,7 @@ def tolerance(name: str) -> float:
 
 INERTIA = np.array([1.0, 2.0, 4.0])
 SPHERE, SPIN, BATH = mf.Sphere(2), mf.LiePoisson(mf.so(3)), mf.Sphere(2) * mf.Euclidean(1)
-START = np.array([-1.0, -1.0, 1.0]) / np.sqrt(3)
+START = np.array([0.6, 0.64, 0.48])
 
 
 def cubic(s):
