@@ -15,7 +15,7 @@ from liethermo.models.body_with_wheels import body_with_wheels_rest
 
 body, method, h = lt.models.body_with_wheels(friction=0.05), lt.LieVariational(), 0.05
 x0 = [0.05, 1.0, 0.05, 0.0, 0.0, 0.0, 0.0]  # about the middle axis, which is unstable; wheels at rest in the body
-solution = lt.integrate(body, x0, (0.0, 150.0), h, method)
+solution = lt.integrate(body, x0, (0.0, 150.0), h, method, engine="array")
 print(solution.audit(energy=1e-3))  # of a variational scheme, which does not keep it to rounding
 
 # %%
