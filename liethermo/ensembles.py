@@ -22,9 +22,9 @@ from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .family import Family, common_size
 from .integrators import MetriplecticMidpoint, OneStepMethod
+from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, laws_of, warn_of_fallback
 from .solution import Laws
-from .systems import System
-from .timeloop import COMPILED_DIM, check_choice, laws_of, warn_of_fallback
+from .systems import AttitudeSystem, System
 from .timetable import CHUNK_STEPS, Timetable
 
 LANES = 16
@@ -73,6 +73,8 @@ class Ensemble:
     engine : str
     wall_time : float
         Seconds, compilation included.
+    attitude : ndarray, shape (B, m, m) or (B, times, m, m), or None
+        Elements of the group, where the system has one and states are kept.
     """
 
     t: np.ndarray
@@ -91,6 +93,7 @@ class Ensemble:
     laws: Laws
     engine: str
     wall_time: float
+    attitude: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.status)
@@ -156,6 +159,7 @@ def ensemble(
     outputs: Literal["final", "trajectory", "summary"] = "final",
     save_every: int = 1,
     engine: Literal["auto", "array", "compiled"] = "auto",
+    attitude=None,
 ) -> Ensemble:
     """Integrate many trajectories of one system, or of a family of systems.
 
@@ -179,6 +183,9 @@ def ensemble(
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
 
+    attitude : array, shape (m, m) or (B, m, m), optional
+        As for :func:`integrate`; one for all, or one each.
+
     Raises
     ------
     InputError
@@ -195,11 +202,16 @@ def ensemble(
     states = np.atleast_2d(np.asarray(member.state(x0s, batch=True)))
     if states.ndim > 2:
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
-    size = common_size(len(states), family.size)
+    attitudes = len(attitude) if np.ndim(attitude) == 3 else 1
+    size = common_size(len(states), family.size, attitudes)
     states = np.broadcast_to(states, (size, states.shape[1]))
     times = Timetable(t_span, step, save_every if outputs == "trajectory" else None)
     family.check(states)
-    method = method.on(member)
+    member, method = as_run(member, method)
+    if isinstance(member, AttitudeSystem):
+        family, states = family.through(AttitudeSystem), np.asarray(member.begin(states, attitude, batch=True))
+    elif attitude is not None:
+        raise InputError(NO_GROUP)
     method.check(member)
     record = _Record(size, member, times, outputs)
 
@@ -269,6 +281,9 @@ class _Record:
         x, energy, entropy, t = self.x, self.rows.pop("energy"), self.rows.pop("entropy"), self.times.times[-1:]
         if self.path is not None:
             x, energy, entropy, t = self.path[..., :-2], self.path[..., -2], self.path[..., -1], self.times.times
+        attitude = None
+        if isinstance(self.system, AttitudeSystem) and x is not None:
+            x, attitude = map(np.asarray, self.system.split(x))
         return Ensemble(
             t=t,
             x=x,
@@ -280,6 +295,7 @@ class _Record:
             laws=laws,
             engine=engine,
             wall_time=wall_time,
+            attitude=attitude,
             **self.rows,
         )
 

@@ -88,6 +88,11 @@ class Family:
             ) from error
         return family
 
+    def through(self, change: Callable[..., System]) -> Family:
+        """The family of what a function, one that has an identity, makes of the members."""
+        form = self.form
+        return Family(Form((form.key, change), form.shapes, lambda arrays: change(form.rebuild(arrays))), self.values)
+
     # -- members --------------------------------------------------------------------------------------------------
 
     @property

@@ -94,6 +94,7 @@ from .spaces import (  # noqa: E402
     Stiefel,
     registered_spaces,
 )
+from .statistics import dispersion, frechet_mean  # noqa: E402
 
 __all__ = [
     "GL",
@@ -159,6 +160,8 @@ __all__ = [
     "bianchi",
     "coordinates_around",
     "direct_sum",
+    "dispersion",
+    "frechet_mean",
     "from_geomstats",
     "galilei",
     "gl",

@@ -73,8 +73,8 @@ class AttitudeSystem(System):
         parts = g[..., None, :, :] if self._parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
         return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1)], axis=-1)
 
-    def begin(self, mu, attitude=None) -> jax.Array:
-        """The state with a momentum and an attitude, the identity by default.
+    def begin(self, mu, attitude=None, batch: bool = False) -> jax.Array:
+        """The state with a momentum and an attitude, the identity by default; or several, with ``batch``.
 
         Raises
         ------
@@ -82,12 +82,16 @@ class AttitudeSystem(System):
             If the attitude is not in the group.
         """
         g = self.group.identity if attitude is None else self.group._element(attitude, "attitude")
-        if not bool(self.group.belongs(g)):
-            residual = float(self.group.defect(g))
+        if not bool(self.group.belongs(g).all()):
+            residual = float(self.group.defect(g).max())
             raise InputError(
                 f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
             )
-        return self.join(self.body.state(mu), g)
+        mu = self.body.state(mu, batch)
+        size = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
+        if size and not batch:
+            raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
+        return self.join(jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:])))
 
     def points(self, x):
         """The momenta: what functions of the state are functions of."""

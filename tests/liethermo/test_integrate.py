@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo import timeloop as loop
+from liethermo import running as loop
 from liethermo.engine import array
 
 BODY = lt.models.rigid_body()

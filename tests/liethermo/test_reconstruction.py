@@ -172,3 +172,40 @@ def test_what_is_refused():
         lt.integrate(body(), START, (0.0, 1.0), 0.1, attitude=1.1 * np.eye(3))
     with pytest.raises(lt.InputError, match="system with a group"):
         lt.integrate(lt.LiePoissonSystem(so3, H), START, (0.0, 1.0), 0.1, attitude=np.eye(3))
+
+
+# -- ensembles --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["array", "compiled"])
+def test_ensembles_carry_attitudes(engine):
+    """Each as a run of its own; one attitude may be for all, and states that are not kept have none."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lt.Quadratic(1.0 / np.array([3.0, 2.0, 1.0])),
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.1),
+        group=mf.SO(3),
+    )
+    rng = np.random.default_rng(0)
+    mu, g = rng.standard_normal((4, 3)), mf.SO(3).exp(rng.standard_normal((4, 3)))
+    many = lt.ensemble(system, mu, (0.0, 2.0), 0.1, attitude=g, outputs="trajectory", engine=engine)
+    assert (many.x.shape, many.attitude.shape) == ((4, 21, 3), (4, 21, 3, 3))
+    one = lt.integrate(system, mu[2], (0.0, 2.0), 0.1, attitude=g[2])
+    assert np.abs(many.attitude[2] - one.attitude).max() < 1e-13
+    assert np.abs(many.x[2] - one.x).max() < 1e-13
+    same = lt.ensemble(system, mu[2], (0.0, 2.0), 0.1, attitude=g, engine=engine)
+    assert np.abs(same.attitude @ mf.SO(3).inverse(g) @ g[2] - same.attitude[2]).max() > 1e-3  # g acts from the left
+    assert np.abs(g[2] @ mf.SO(3).inverse(g) @ same.attitude - same.attitude[2]).max() < 1e-13
+    assert lt.ensemble(system, mu, (0.0, 2.0), 0.1, outputs="summary", engine=engine).attitude is None
+
+
+def test_attitudes_that_cannot_be_used():
+    free = lt.models.free_rigid_body()
+    with pytest.raises(lt.InputError, match=r"group=mf\.SO\(3\)"):
+        lt.ensemble(free, [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, attitude=np.eye(3))
+    turning = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.ones(3)), group=mf.SO(3))
+    with pytest.raises(lt.InputError, match="one attitude"):
+        lt.integrate(turning, [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, attitude=np.stack([np.eye(3)] * 2))
+    with pytest.raises(lt.InputError, match=r"not in SO\(3\)"):
+        lt.ensemble(turning, np.eye(3), (0.0, 1.0), 0.1, attitude=np.stack([np.eye(3), np.eye(3), 2 * np.eye(3)]))

@@ -1,0 +1,86 @@
+"""Means and dispersions of points of a state space, such as the attitudes of an ensemble."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .errors import DomainError, ParameterError
+from .spaces.base import Space
+
+LIMIT = 200
+"""Iterations: each of them gains a digit or more within the ball in which the mean is known to be one point."""
+
+
+def frechet_mean(space: Space, points, weights=None) -> jax.Array:
+    """The point with the least mean square distance from some points, shape (*space.shape).
+
+    Found by ``m <- exp(m, sum_i w_i log(m, x_i))``, from the point of the space nearest to the mean of the arrays,
+    until rounding stops it. The mean is unique for points in a ball of less than half the injectivity radius, and of
+    less than ``pi / (4 sqrt(K))`` for sectional curvatures up to K > 0 [Karcher 1977]; of points further apart a point
+    is found at which the mean square distance is stationary.
+
+    Parameters
+    ----------
+    space : Space
+    points : array, shape (..., *space.shape)
+    weights : array, shape (...), optional
+        Not negative, with a positive sum.
+
+    Raises
+    ------
+    DomainError
+        If a point is at the cut locus of the mean as far as it is found, or the iteration does not come to rest.
+    OffManifoldError, ParameterError
+    """
+    x, w = _sample(space, points, weights)
+    try:
+        mean = space.project(jnp.tensordot(w, x, axes=1))
+    except DomainError:  # as of antipodal points
+        mean = x[0]
+    size, best, stalled = np.inf, np.inf, 0
+    for _ in range(LIMIT):
+        step = jnp.tensordot(w, space.log(mean, x), axes=1)
+        size = float(space.norm(mean, step))
+        stalled = 0 if size < 0.5 * best else stalled + 1
+        best = min(best, size)
+        if size == 0.0 or (stalled > 2 and size < 1e-12 * max(1.0, float(jnp.max(jnp.abs(mean))))):
+            return mean
+        mean = space.exp(mean, step)
+    raise DomainError(
+        f"the mean on {space.name} did not come to rest: the last of {LIMIT} steps had the length {size:.3g}. The "
+        "points may be too far apart for one mean: take those of a smaller region"
+    )
+
+
+def dispersion(space: Space, points, weights=None, mean=None) -> jax.Array:
+    """The mean square distance of points from their Fréchet mean, a scalar.
+
+    Parameters
+    ----------
+    space, points, weights
+        As for :func:`frechet_mean`.
+    mean : array, shape (*space.shape), optional
+        Another point, from which distances are taken.
+    """
+    x, w = _sample(space, points, weights)
+    mean = frechet_mean(space, x, w) if mean is None else mean
+    return jnp.dot(w, space.distance(mean, x) ** 2)
+
+
+def _sample(space: Space, points, weights) -> tuple[jax.Array, jax.Array]:
+    """The points in one row, and their weights with the sum 1."""
+    x = space.point(points)
+    batch = x.shape[: x.ndim - len(space.shape)]
+    x = x.reshape(-1, *space.shape)
+    if len(x) == 0:
+        raise ParameterError("no points: they have no mean")
+    if weights is None:
+        return x, jnp.full(len(x), 1.0 / len(x))
+    w = jnp.asarray(weights, dtype=jnp.float64)
+    if w.shape != batch:
+        raise ParameterError(f"one weight for each point, of shape {batch}, not {w.shape}")
+    if not bool((w >= 0.0).all() & (w.sum() > 0.0) & jnp.isfinite(w).all()):
+        raise ParameterError("weights are finite and not negative, with a positive sum")
+    return x, w.ravel() / w.sum()
