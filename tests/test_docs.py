@@ -32,8 +32,14 @@ def scratch(tmp_path, monkeypatch):
     plt.close("all")
 
 
+def _pages():
+    for page in PAGES:
+        if BLOCK.search(page.read_text()):
+            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem == "on_manifolds" else ())
+
+
 @pytest.mark.filterwarnings("ignore::manifolds.NoPolynomialCasimirWarning")  # a page shows it
-@pytest.mark.parametrize("page", [page for page in PAGES if BLOCK.search(page.read_text())], ids=_name)
+@pytest.mark.parametrize("page", list(_pages()))
 def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
     text, namespace = page.read_text(), {"__name__": "__main__"}
     for block in BLOCK.finditer(text):
@@ -41,13 +47,13 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
         exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
 
 
-SLOW = ("plot_orders", "plot_spin_relaxation", "plot_spin_chain", "plot_covariance_relaxation", "plot_attitude")
-"""Examples that compute or compile for long."""
+QUICK = ("plot_relaxed_rigid_body", "plot_own_lie_algebra", "plot_damped_oscillator", "plot_discrete_herglotz")
+"""Examples that compile little; the others are in the slow tier."""
 
 
 def _examples():
     for path in EXAMPLES:
-        yield pytest.param(path, id=_name(path), marks=pytest.mark.slow if path.stem in SLOW else ())
+        yield pytest.param(path, id=_name(path), marks=() if path.stem in QUICK else pytest.mark.slow)
 
 
 @pytest.mark.parametrize("example", list(_examples()))

@@ -132,6 +132,7 @@ def test_both_laws_with_every_discrete_gradient(name):
     assert solution.audit().passed
 
 
+@pytest.mark.slow
 def test_the_same_energy_as_one_plain_function():
     """Control: not told what is kinetic, the scheme keeps the first law and loses the second, in coarse steps."""
 

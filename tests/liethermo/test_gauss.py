@@ -248,6 +248,7 @@ def body(entropy=lambda m: jnp.log(1.0 + jnp.dot(m, m)), rate=0.3):
     return lt.LiePoissonSystem(mf.so(3), energy, entropy, friction)
 
 
+@pytest.mark.slow
 def test_dependent_and_vanishing_constraints():
     """Functions that say the same twice, or whose gradient is zero where the motion goes, change nothing."""
     system, x0 = body(lt.Quadratic(np.ones(3)), rate=None), np.array([0.8, 0.5, 0.9])
@@ -290,6 +291,7 @@ def test_what_it_says_of_itself():
 # -- the parts of the construction, each of which matters -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_stage_is_the_midpoint_scheme():
     """With Gonzalez' gradient, where S is quadratic."""
     system, x0 = body(lt.Quadratic(np.ones(3))), np.array([0.8, 0.5, 0.9])
@@ -312,6 +314,7 @@ class WithoutProjector(lt.MetriplecticGauss):
         return system.field(u, dH, dS, dL)
 
 
+@pytest.mark.slow
 def test_without_the_correction_the_energy_drifts():
     x0 = np.array([0.8, 0.5, 0.9])
     drifts = [
@@ -321,6 +324,7 @@ def test_without_the_correction_the_energy_drifts():
     assert drifts[1] > 1e-9
 
 
+@pytest.mark.slow
 def test_without_the_projector_the_entropy_falls():
     """Bianchi VI has a Casimir that is not a polynomial; with hardly any friction the motion decides."""
     g = mf.bianchi("VI", h=-0.5)

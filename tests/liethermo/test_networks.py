@@ -142,6 +142,7 @@ def warm_of_one(y):
 # -- sparse Jacobian matrices -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
 )
@@ -218,6 +219,7 @@ def test_the_engines_agree(h):
     assert_both_laws(runs[1])
 
 
+@pytest.mark.slow
 def test_every_solver_solves_the_same_steps(monkeypatch):
     """And both solve those of the array engine; here steps that are stiff, but not too stiff for that."""
     system, x0 = lt.models.heat_grid((5, 4)), np.log(np.random.default_rng(0).uniform(200.0, 400.0, 20))

@@ -176,6 +176,7 @@ def test_axioms(build):
 # -- where it comes to rest -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_spin_comes_to_rest_where_its_energy_is_least(build):
     end = final(build("bath"), starts("bath"), GAUSS, 400, T=400.0).x[-1, :3]
     gradient = np.asarray(jax.grad(cubic)(end))

@@ -60,7 +60,7 @@ def spatial(solution):
     ("kind", "method"),
     [
         pytest.param("cayley", lt.MetriplecticMidpoint(), id="cayley-midpoint"),
-        pytest.param("exp", lt.MetriplecticGauss(2), id="exp-gauss2"),
+        pytest.param("exp", lt.MetriplecticGauss(2), id="exp-gauss2", marks=pytest.mark.slow),
         *(
             pytest.param(kind, method, id=f"{kind}-{name}", marks=pytest.mark.slow)
             for kind, method, name in [
@@ -177,7 +177,7 @@ def test_what_is_refused():
 # -- ensembles --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["array", "compiled"])
+@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
 def test_ensembles_carry_attitudes(engine):
     """Each as a run of its own; one attitude may be for all, and states that are not kept have none."""
     system = lt.LiePoissonSystem(

@@ -237,6 +237,7 @@ def test_orders_against_the_exact_solution(name, friction):
     assert (np.abs(_slopes(errors) - order) < 0.2).all(), errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name == "scheme 3" else pytest.mark.slow) for name in ORDERS],
@@ -268,6 +269,7 @@ def test_the_entropy_grows_at_every_step(name):
 # -- starts -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "scheme 2" else pytest.mark.slow) for n in SCHEMES])
 def test_two_ways_to_start(name):
     """From (q_0, q_1, S_0) the first step leads to q_1; from (q_0, v_0, S_0) it is exact: v_0 = L_v^-1(p_0)."""

@@ -52,6 +52,7 @@ def test_the_equations(system):
     assert system.check(points).passed
 
 
+@pytest.mark.slow
 def test_a_body_that_heats_itself():
     """Both ends of the balance, the sign of the production, and the spatial momentum, which friction does not touch."""
     h = 0.1

@@ -75,6 +75,7 @@ def _flat(q0, q1, S0, S1):
     return jnp.concatenate([q0, q1, jnp.stack([S0, S1])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name"),
     [

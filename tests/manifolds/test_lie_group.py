@@ -49,7 +49,15 @@ def duals(group, seed):
     return np.random.default_rng(10_000 + seed).standard_normal((BATCH, group.dim))
 
 
-@pytest.fixture(scope="module", params=list(mf.registered_groups()), ids=lambda group: group.name)
+OTHERS = ("SO(2)", "SE(2)", "SL(3)", "GL(2)", "Heisenberg(2)")
+"""Groups of the slow tier: of each family one or two are in the default one."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(g, marks=pytest.mark.slow if g.name in OTHERS else ()) for g in mf.registered_groups()],
+    ids=lambda group: group.name,
+)
 def G(request):
     """Module scope: pytest then runs all tests of one group together, which share its compiled maps."""
     return request.param
