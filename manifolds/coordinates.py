@@ -27,11 +27,11 @@ class Place(NamedTuple):
 
     Attributes
     ----------
-    point : array, shape (..., *shape)
+    point : array, shape ``(..., *shape)``
     lift : function
         From a covector of R^dim, shape (..., dim), to the ambient covector that is paired with tangent vectors alike.
     lower : function
-        From a tangent vector, shape (..., *shape), to the velocity of its coordinates, shape (..., dim).
+        From a tangent vector, shape ``(..., *shape)``, to the velocity of its coordinates, shape (..., dim).
     """
 
     point: jax.Array
@@ -47,7 +47,7 @@ class Coordinates(eqx.Module):
 
     @abstractmethod
     def point(self, c) -> jax.Array:
-        """The point with the coordinates c, shape (..., *shape)."""
+        """The point with the coordinates c, shape ``(..., *shape)``."""
 
     @abstractmethod
     def components(self, v) -> jax.Array:
@@ -67,7 +67,7 @@ class Coordinates(eqx.Module):
 
 
 def coordinates_around(chart: Chart, z) -> Coordinates:
-    """Coordinates around a point, shape (*space.shape), or around each point of a batch."""
+    """Coordinates around a point, shape ``(*space.shape)``, or around each point of a batch."""
     if isinstance(chart.space, Product):
         parts = zip(chart.space.factors, chart.space.split(z), strict=True)
         return _Joined(chart.space, tuple(coordinates_around(_on(chart, factor), part) for factor, part in parts))

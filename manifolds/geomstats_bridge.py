@@ -101,7 +101,7 @@ class GeomstatsSpace(Space):
         return tuple(int(n) for n in self.source.shape)
 
     def random(self, key_or_seed, size=()) -> jax.Array:
-        """Points from geomstats' own distribution, shape (*size, *shape); not under tracing."""
+        """Points from geomstats' own distribution, shape ``(*size, *shape)``; not under tracing."""
         seed = int(jax.random.randint(random_key(key_or_seed), (), 0, 2**31 - 1))
         state = np.random.get_state()  # noqa: NPY002
         try:
@@ -199,7 +199,7 @@ class GeomstatsSpace(Space):
         return self.shape if _SIGNATURES[kernel][1] == "array" else ()
 
     def _on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
-        """A kernel on arrays of shape (count, *shape): all at once, or one by one where some are refused."""
+        """A kernel on arrays of shape ``(count, *shape)``: all at once, or one by one where some are refused."""
         count = len(arrays[0])
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():  # what comes of it is looked at
@@ -249,7 +249,7 @@ class GeomstatsSpace(Space):
         return moved
 
 
-# -- what geomstats computes, on arrays of shape (count, *shape) --------------------------------------------------
+# -- what geomstats computes, on arrays of shape ``(count, *shape)`` --------------------------------------------------
 
 
 def _checked_log(space: GeomstatsSpace, x, y):

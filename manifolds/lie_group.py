@@ -138,7 +138,7 @@ class MatrixGroup:
 
         Returns
         -------
-        array, shape (*size, m, m)
+        array, shape ``(*size, m, m)``
         """
         key = jax.random.key(key_or_seed) if isinstance(key_or_seed, int | np.integer) else key_or_seed
         return self.exp(scale * jax.random.normal(key, (*size, self.dim)))

@@ -53,15 +53,15 @@ class Retraction(ABC):
 
         Parameters
         ----------
-        z : array, shape (..., *space.shape)
+        z : array, shape ``(..., *space.shape)``
             Base point.
-        v : array, shape (..., *space.shape)
+        v : array, shape ``(..., *space.shape)``
             Tangent vector at z: a velocity, where h is a time.
         h : float
 
         Returns
         -------
-        x, y : array, shape (..., *space.shape)
+        x, y : array, shape ``(..., *space.shape)``
 
         Raises
         ------
@@ -84,12 +84,12 @@ class Retraction(ABC):
 
         Parameters
         ----------
-        x, y : array, shape (..., *space.shape)
+        x, y : array, shape ``(..., *space.shape)``
         h : float
 
         Returns
         -------
-        z, v : array, shape (..., *space.shape)
+        z, v : array, shape ``(..., *space.shape)``
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Chart(Retraction):
         return self
 
     def point(self, z, v) -> jax.Array:
-        """The point of the space that the chart around z gives the tangent vector v, shape (..., *space.shape).
+        """The point of the space that the chart around z gives the tangent vector v, shape ``(..., *space.shape)``.
 
         Defined beyond the domain of :meth:`vector` too.
         """

@@ -14,7 +14,7 @@ LIMIT = 200
 
 
 def frechet_mean(space: Space, points, weights=None) -> jax.Array:
-    """The point with the least mean square distance from some points, shape (*space.shape).
+    """The point with the least mean square distance from some points, shape ``(*space.shape)``.
 
     Found by ``m <- exp(m, sum_i w_i log(m, x_i))``, from the point of the space nearest to the mean of the arrays,
     until rounding stops it. The mean is unique for points in a ball of less than half the injectivity radius, and of
@@ -24,7 +24,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     Parameters
     ----------
     space : Space
-    points : array, shape (..., *space.shape)
+    points : array, shape ``(..., *space.shape)``
     weights : array, shape (...), optional
         Not negative, with a positive sum.
 
@@ -61,7 +61,7 @@ def dispersion(space: Space, points, weights=None, mean=None) -> jax.Array:
     ----------
     space, points, weights
         As for :func:`frechet_mean`.
-    mean : array, shape (*space.shape), optional
+    mean : array, shape ``(*space.shape)``, optional
         Another point, from which distances are taken.
     """
     x, w = _sample(space, points, weights)

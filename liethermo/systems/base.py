@@ -145,7 +145,7 @@ class System(eqx.Module):
     # -- the manifold ---------------------------------------------------------------------------------------------
 
     def points(self, x) -> jax.Array:
-        """State vectors, shape (..., n), as points of the space, shape (..., *space.shape)."""
+        """State vectors, shape (..., n), as points of the space, shape ``(..., *space.shape)``."""
         return jnp.asarray(x) if self.space is None else self.space.from_vector(x)
 
     def raised(self, x, alpha) -> jax.Array:

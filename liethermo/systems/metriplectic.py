@@ -32,7 +32,7 @@ class MetriplecticSystem(System):
         defined at normally distributed points, and use ``system.check(points=...)``.
     space : manifolds.Space, optional
         The manifold that the states live on; native, a product, or from ``manifolds.from_geomstats``. Energy, entropy
-        and momentum maps are then functions of its points, shape (*space.shape), and their gradients may be those of
+        and momentum maps are then functions of points, shape ``(*space.shape)``, and their gradients may be those of
         the ambient array: only their action on tangent vectors matters. What is handed to a Poisson structure or to a
         dissipation are flat real arrays, shape (space.size,), as ``space.to_vector`` makes them: a state x, and
         covectors that Pi(x) and K(x) have to take to tangent vectors.

@@ -86,11 +86,11 @@ class Space(ABC):
     # -- points ---------------------------------------------------------------------------------------------------
 
     def point(self, x, project: bool = False, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
-        """``x`` as a point of the space, or a batch of points, shape (..., *shape).
+        """``x`` as a point of the space, or a batch of points, shape ``(..., *shape)``.
 
         Parameters
         ----------
-        x : array, shape (..., *shape)
+        x : array, shape ``(..., *shape)``
         project : bool
             Move it to the space first (see :meth:`project`), however far away it is.
         tolerance : float
@@ -113,7 +113,7 @@ class Space(ABC):
         return self.residual(x) <= tolerance
 
     def project(self, x) -> jax.Array:
-        """A point of the space near x, the nearest one where that has a simple form, shape (..., *shape).
+        """A point of the space near x, the nearest one where that has a simple form, shape ``(..., *shape)``.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class Space(ABC):
         return y
 
     def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
-        """Random points, shape (*size, *shape): uniform on a compact space, within a few units of a centre otherwise.
+        """Random points, shape ``(*size, *shape)``: uniform on a compact space, else within a few units of a centre.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class Space(ABC):
         return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
 
     def from_vector(self, x) -> jax.Array:
-        """The inverse of :meth:`to_vector`, shape (..., *shape)."""
+        """The inverse of :meth:`to_vector`, shape ``(..., *shape)``."""
         x = jnp.asarray(as_numeric(x, "x"))
         if x.shape[-1:] != (self.size,):
             raise ShapeError(f"x must have last axis {self.size} for {self.name}, but its shape is {x.shape}")
@@ -160,7 +160,7 @@ class Space(ABC):
     # -- tangent vectors ------------------------------------------------------------------------------------------
 
     def project_tangent(self, x, w) -> jax.Array:
-        """The tangent vector at x nearest to the ambient array w in the Euclidean sense, shape (..., *shape)."""
+        """The tangent vector at x nearest to the ambient array w in the Euclidean sense, shape ``(..., *shape)``."""
         return self._compiled("_project_tangent", self._checked_point(x, "x"), self._array(w, "w"))
 
     def random_tangent(self, key_or_seed, x, scale: float = 1.0) -> jax.Array:
@@ -170,7 +170,7 @@ class Space(ABC):
         return self.from_coordinates(x, scale * jax.random.normal(random_key(key_or_seed), (*batch, self.dim)))
 
     def frame(self, x) -> jax.Array:
-        """An orthonormal basis of the tangent space at x, shape (..., dim, *shape)."""
+        """An orthonormal basis of the tangent space at x, shape ``(..., dim, *shape)``."""
         return self._compiled("_frame", self._checked_point(x, "x"))
 
     def coordinates(self, x, v) -> jax.Array:
@@ -195,7 +195,7 @@ class Space(ABC):
         return self._compiled("_norm", *self._checked_vectors(x, v=v))
 
     def flat(self, x, v) -> jax.Array:
-        """The covector ``w -> inner(x, v, w)``, as an ambient array, shape (..., *shape)."""
+        """The covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
         return self._compiled("_flat", *self._checked_vectors(x, v=v))
 
     def sharp(self, x, alpha) -> jax.Array:
@@ -203,8 +203,8 @@ class Space(ABC):
 
         Parameters
         ----------
-        x : array, shape (..., *shape)
-        alpha : array, shape (..., *shape)
+        x : array, shape ``(..., *shape)``
+        alpha : array, shape ``(..., *shape)``
             An ambient covector; only its action on tangent vectors matters.
         """
         return self._compiled("_sharp", self._checked_point(x, "x"), self._array(alpha, "alpha"))
@@ -212,7 +212,7 @@ class Space(ABC):
     # -- geodesics ------------------------------------------------------------------------------------------------
 
     def exp(self, x, v) -> jax.Array:
-        """Riemannian exponential map: where the geodesic from x with velocity v is at time 1, shape (..., *shape)."""
+        """Riemannian exponential map: the geodesic from x with velocity v, at time 1, shape ``(..., *shape)``."""
         return self._compiled("_exp", *self._checked_vectors(x, v=v))
 
     def log(self, x, y) -> jax.Array:
@@ -220,7 +220,7 @@ class Space(ABC):
 
         Parameters
         ----------
-        x, y : array, shape (..., *shape)
+        x, y : array, shape ``(..., *shape)``
 
         Raises
         ------
@@ -247,7 +247,7 @@ class Space(ABC):
         return d
 
     def midpoint(self, x, y) -> jax.Array:
-        """The point half way along the shortest geodesic from x to y, shape (..., *shape); raises as :meth:`log`."""
+        """Half way along the shortest geodesic from x to y, shape ``(..., *shape)``; raises as :meth:`log`."""
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         z = self._midpoint(x, y)
         self._refuse_nan(z, len(self.shape), x, y, "midpoint")
@@ -258,7 +258,7 @@ class Space(ABC):
 
         Returns
         -------
-        array, shape (..., *shape)
+        array, shape ``(..., *shape)``
             A tangent vector at ``exp(x, v)``. Inner products are kept.
         """
         return self._compiled("_transport", *self._checked_vectors(x, v=v, u=u))

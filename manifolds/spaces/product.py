@@ -180,7 +180,7 @@ class Product(Space):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Power(Space):
-    """The product of ``count`` copies of one space, also written ``A**count``: points of shape (count, *base.shape).
+    """The product of ``count`` copies of a space, also written ``A**count``: points of shape ``(count, *base.shape)``.
 
     ``Sphere(2) ** 100`` holds the states of a chain of a hundred spins. The copies are run as one batch.
     """
