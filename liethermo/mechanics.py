@@ -15,7 +15,7 @@ from .engine.interpret import at_points
 
 
 class Kinetic(Energy):
-    """``p . G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v . G(q) v / 2`` of (q, v, S) [SML 28].
+    """``p·G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v·G(q) v / 2`` of (q, v, S) [SML 28].
 
     G is the inverse of the metric (of the mass matrix) in a Hamiltonian, the metric itself in a Lagrangian. In every
     scheme its discrete gradient by p is a mean of G times a mean of p: ``(G(q) + G(q')) (p + p') / 4`` for discrete

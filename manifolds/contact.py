@@ -266,7 +266,7 @@ class LagrangianContact(SplitContact):
         return jax.jacfwd(self.momentum)(x)[:, n : 2 * n]
 
     def energy(self, x) -> jax.Array:
-        """``E_L = v . L_v - L``, shape ()."""
+        """``E_L = v·L_v - L``, shape ()."""
         return jnp.dot(self._split(x)[1], self.momentum(x)) - self.lagrangian(x)
 
     def form(self, x) -> jax.Array:

@@ -67,7 +67,7 @@ class FiniteDifference(eqx.Module):
         return S0 + (self.beta * h) * s
 
     def ends(self, q0, V, h, F) -> tuple[jax.Array, jax.Array]:
-        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q . F``, ``D_2 q . F``."""
+        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q·F``, ``D_2 q·F``."""
         if type(self).position is FiniteDifference.position:
             return (1.0 - self.alpha) * F, self.alpha * F
         _, back = jax.vjp(lambda q0, V: self.position(q0, V, h), q0, V)

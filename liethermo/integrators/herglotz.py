@@ -18,7 +18,7 @@ from .base import OneStepMethod
 
 class DiscreteHerglotz(OneStepMethod):
     """``D_1 L_d(q_1, q_2, S_1) + (1 + D_S L_d(q_1, q_2, S_1)) D_2 L_d(q_0, q_1, S_0) = 0`` for q_2 [SML 40],
-    ``S_1 - S_0 = (q_1 - q_0) . D_2 L_d(q_0, q_1, S_0)`` [SML 41].
+    ``S_1 - S_0 = (q_1 - q_0)·D_2 L_d(q_0, q_1, S_0)`` [SML 41].
 
     Run here as a one-step method on states (q, p, S) of an :class:`liethermo.EvolutionSystem`, with the momentum
     ``p_1 = D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1). The discrete Lagrangian alone makes the step;

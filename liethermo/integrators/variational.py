@@ -173,7 +173,7 @@ class VariationalIntegrator(OneStepMethod):
         return np.concatenate([q0, v0, S0[None], rest])
 
     def energies(self, system: SimpleClosedSystem, x, h: float) -> np.ndarray:
-        """``E = v . L_v - L`` at the scheme's own points between consecutive states, as the paper records it.
+        """``E = v·L_v - L`` at the scheme's own points between consecutive states, as the paper records it.
 
         Parameters
         ----------

@@ -20,7 +20,7 @@ NEWTON_STEPS = 20
 
 
 class LieVariational(OneStepMethod):
-    """``(dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1``, ``T_k s_k = -f_k . xi_k``.
+    """``(dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1``, ``T_k s_k = -f_k·xi_k``.
 
     The discrete principle of GBY Definition 3.7 with ``L_d = h l(xi_k, (S_k + S_k+1)/2)`` and
     ``g_k+1 = g_k tau(h xi_k)``, tau the Cayley map, varied along ``g_k exp(eta_k)``; without heat, the scheme of

@@ -20,7 +20,7 @@ from .base import System
 
 
 class EulerPoincareClosedSystem(System):
-    """``d/dt l_xi = ad*_xi l_xi + f(xi, S)``, ``T S' = -f . xi``, ``T = -l_S > 0``: a body that its friction heats.
+    """``d/dt l_xi = ad*_xi l_xi + f(xi, S)``, ``T S' = -f·xi``, ``T = -l_S > 0``: a body that its friction heats.
 
     These are the equations (2.4) of a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2
     with ``delta xi = eta' + [xi, eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is

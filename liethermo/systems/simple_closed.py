@@ -178,7 +178,7 @@ class SimpleClosedSystem(OnVelocities):
         return jnp.vectorize(lambda y: -self.lagrangian.gradient(y)[-1], signature="(n)->()")(self._mechanical(x))
 
     def own_energy(self, x) -> jax.Array:
-        """``E = v . L_v - L``, without the ledger, shape (...)."""
+        """``E = v·L_v - L``, without the ledger, shape (...)."""
         return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._mechanical(x))
 
     def _mechanical(self, x) -> jax.Array:

@@ -199,7 +199,7 @@ class SpecialUnitary(BiInvariantSpace):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class SpecialEuclidean(GroupSpace):
-    """Rigid motions of R^n, with ``inner = tr(W^T W') / 2 + u . u' / length^2`` of velocities W of rotation and u.
+    """Rigid motions of R^n, with ``inner = tr(W^T W') / 2 + u·u' / length^2`` of velocities W of rotation and u.
 
     The metric is left-invariant and that of the product of SO(n) and R^n: geodesics turn at a constant rate while the
     origin of the body goes straight. They are not the one-parameter subgroups, which are screw motions: for those take

@@ -17,7 +17,7 @@ from .base import Space, register, safe_sqrt
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Hyperbolic(Space):
-    """Points with ``-x_0^2 + x_1^2 + ... + x_n^2 = -1``, ``x_0 > 0``, shape (n + 1,), and the metric of curvature -1.
+    """Points with ``-x_0^2 + x_1^2 + … + x_n^2 = -1``, ``x_0 > 0``, shape (n + 1,), and the metric of curvature -1.
 
     Closed forms throughout. A point at distance r from the apex (1, 0, ..., 0) has coordinates of the size e^r, so
     results there are known to about 1e-16 e^(2r): keep the states of interest near the apex.
