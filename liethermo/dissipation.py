@@ -64,6 +64,11 @@ class Dissipation(eqx.Module):
         return None
 
     @property
+    def terms(self) -> tuple[Dissipation, ...]:
+        """The summands, or this one alone."""
+        return (self,)
+
+    @property
     def preserve(self) -> tuple[Energy, ...]:
         return ()
 
@@ -100,13 +105,17 @@ class Dissipation(eqx.Module):
         return None
 
     def __add__(self, other: Dissipation) -> Dissipation:
-        return Several((*_parts(self), *_parts(other)))
+        return Several((*self.terms, *other.terms))
 
 
 class Several(Dissipation):
     """A sum of dissipations acting together; a law holds if every part obeys it."""
 
     parts: tuple[Dissipation, ...]
+
+    @property
+    def terms(self) -> tuple[Dissipation, ...]:
+        return self.parts
 
     @property
     def energy_law(self) -> Law | None:
@@ -144,6 +153,18 @@ class Several(Dissipation):
             part.force(system, x, dH, dS, tuple(kept.get(id(L), L.gradient(x)) for L in part.preserve))
             for part in self.parts
         )
+
+
+class SkewFriction(Dissipation):
+    """A skew bracket with the energy alone, so that the energy is conserved: friction that heats [SML 6]."""
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    @property
+    def symmetric(self) -> bool:
+        return False
 
 
 class InnerProductDissipation(Dissipation):
@@ -500,10 +521,6 @@ class EulerPoincareForce(Dissipation):
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
-
-
-def _parts(dissipation: Dissipation) -> tuple[Dissipation, ...]:
-    return dissipation.parts if isinstance(dissipation, Several) else (dissipation,)
 
 
 def _at(form, x):

@@ -367,6 +367,17 @@ def check_scalar(energy: Energy, dim: int, role: str) -> None:
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
 
 
+def check_shape(function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str):
+    """Raise FunctionError unless a function of arrays of these shapes gives one of ``shape``; ``at`` names them."""
+    given = [jax.ShapeDtypeStruct(a, jnp.float64) for a in arguments]
+    try:
+        found = jax.eval_shape(lambda *a: jnp.asarray(function(*a)), *given).shape
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
+    if found != shape:
+        raise FunctionError(f"{what} has shape {shape}, not {found}")
+
+
 def is_traced(tree) -> bool:
     """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))

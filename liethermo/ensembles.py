@@ -22,7 +22,7 @@ from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .family import Family, common_size
 from .integrators import MetriplecticMidpoint, OneStepMethod
-from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, laws_of, warn_of_fallback
+from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
 from .solution import Laws
 from .systems import AttitudeSystem, System
 from .timetable import CHUNK_STEPS, Timetable
@@ -215,8 +215,8 @@ def ensemble(
     method.check(member)
     record = _Record(size, member, times, outputs)
 
-    small = member.unrollable and member.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
-    chosen = "compiled" if engine == "compiled" or (engine == "auto" and small) else "array"
+    small = engine == "auto" and is_small(member, COMPILED_DIM)
+    chosen = "compiled" if engine == "compiled" or small else "array"
     if chosen == "compiled":
         try:
             _run_compiled(family, method, states, times, record)

@@ -69,8 +69,7 @@ class Run:
         self.event_time: float | None = None
         self.dense: Dense | None = None
         wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
-        small = system.unrollable and system.dim <= wanted and jax.default_backend() == "cpu"
-        self.engine = ("compiled" if small else "array") if engine == "auto" else engine
+        self.engine = ("compiled" if is_small(system, wanted) else "array") if engine == "auto" else engine
         self.sparse: SparseEngine | None = None
         if engine == "sparse" or (engine == "auto" and system.dim >= SPARSE_DIM):
             self.sparse = self._sparse(needed=engine == "sparse")
@@ -341,6 +340,11 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
     if given not in choices:
         *others, last = map(repr, choices)
         raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+
+
+def is_small(system: System, most: int) -> bool:
+    """Whether a system is worth trying to compile: unrolled code, on the CPU, for ``most`` components at most."""
+    return system.unrollable and system.dim <= most and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:

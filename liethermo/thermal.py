@@ -17,7 +17,7 @@ import scipy.sparse
 
 import manifolds as mf
 
-from .dissipation import Dissipation, Law
+from .dissipation import Dissipation, Law, SkewFriction
 from .graph import Edges
 from .indices import Indices, as_pattern, cliques
 
@@ -121,7 +121,7 @@ class Drag(Dissipation):
         return cliques(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
 
 
-class ContactFriction(Dissipation):
+class ContactFriction(SkewFriction):
     """The friction of evolution fields, in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
 
     A skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is
@@ -140,10 +140,6 @@ class ContactFriction(Dissipation):
     @property
     def entropy_law(self) -> Law | None:
         return "nondecreasing" if self.nondecreasing else None
-
-    @property
-    def symmetric(self) -> bool:
-        return False
 
     def force(self, system, x, dH, dS, dL):
         places = _places(system)

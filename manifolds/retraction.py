@@ -174,9 +174,12 @@ class Chart(Retraction):
     @abstractmethod
     def _carry(self, z, v, u): ...
 
-    @abstractmethod
+    def _reach(self, z, v):
+        return self.space._reach(z, v)
+
     def _midpoint_reach(self, z, v):
         """Reach of the step v with z in its middle."""
+        return self.space._reach(z, v)
 
     def _differential(self, z, v, w):
         v, w = jnp.broadcast_arrays(v, w)
@@ -223,12 +226,6 @@ class RiemannianRetraction(Chart):
 
     def _carry(self, z, v, u):
         return self.space._transport(z, v, u)
-
-    def _reach(self, z, v):
-        return self.space._reach(z, v)
-
-    def _midpoint_reach(self, z, v):
-        return self.space._reach(z, v)
 
 
 @jax.tree_util.register_static
@@ -292,12 +289,6 @@ class GroupRetraction(_GroupChart):
 
     def _vector(self, z, x):
         return self.space._group_log(z, x)
-
-    def _reach(self, z, v):
-        return self.space._reach(z, v)
-
-    def _midpoint_reach(self, z, v):
-        return self.space._reach(z, v)
 
 
 @jax.tree_util.register_static

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from ..errors import InputError
 from ..gradients import compensated
 from ..systems import System
-from .tableaus import at_start
+from .tableaus import MOST_STAGES, at_start, beyond, gauss
 
 _registry: list[OneStepMethod] = []
 
@@ -108,6 +108,33 @@ class OneStepMethod(eqx.Module):
 
     def __str__(self) -> str:
         return type(self).__name__
+
+
+class GaussMethod(OneStepMethod):
+    """What methods on the Gauss nodes share: as many stages as nodes, order 2s, slopes that extend to the next step."""
+
+    number: int = eqx.field(static=True)
+
+    @property
+    def stages(self) -> int:
+        return self.number
+
+    @property
+    def order(self) -> int:
+        return 2 * self.number
+
+    def increment(self, h, k) -> jax.Array:
+        return h * (gauss(self.number).b @ k)
+
+    def predict(self, k, before) -> jax.Array:
+        return 2.0 * k - before if self.number == 1 else beyond(self.number) @ k
+
+
+def checked_stages(stages) -> int:
+    """A number of Gauss nodes that there is a tableau for."""
+    if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
+        raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
+    return stages
 
 
 def collocation_error(system: System, x, low, h, k) -> jax.Array:

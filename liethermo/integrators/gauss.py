@@ -11,18 +11,18 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, Several
+from ..dissipation import Dissipation
 from ..energy import Energy, as_energy, check_scalar, on_points
 from ..engine.interpret import at_points
 from ..errors import InputError
 from ..gradients import stage_gradients
 from ..systems import ChartSystem, System
-from .base import OneStepMethod, collocation_error, register
+from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register
 from .charts import in_charts
-from .tableaus import MOST_STAGES, beyond, finer, gauss
+from .tableaus import finer, gauss
 
 
-class MetriplecticGauss(OneStepMethod):
+class MetriplecticGauss(GaussMethod):
     """``k_i = Pi_d gH_i + K_d gS_i`` at the Gauss nodes ``u_i = x + h sum_j A_ij k_j``, ``x' = x + h sum_i b_i k_i``.
 
     The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha k_i``, such that
@@ -50,14 +50,11 @@ class MetriplecticGauss(OneStepMethod):
         On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
     """
 
-    number: int = eqx.field(static=True)
     functions: tuple[Energy, ...]
     retraction: str | mf.Retraction | None = eqx.field(static=True)
 
     def __init__(self, stages: int = 2, preserve: Sequence = (), retraction: str | mf.Retraction | None = None):
-        if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
-            raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
-        self.number = stages
+        self.number = checked_stages(stages)
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
         self.retraction = retraction
@@ -74,14 +71,6 @@ class MetriplecticGauss(OneStepMethod):
         if not self.functions:
             return self
         return eqx.tree_at(lambda m: m.functions, self, tuple(map(change, self.functions)))
-
-    @property
-    def stages(self) -> int:
-        return self.number
-
-    @property
-    def order(self) -> int:
-        return 2 * self.number
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -127,7 +116,7 @@ class MetriplecticGauss(OneStepMethod):
         held = list(zip(dC, (C.gradient(u) for C in self.functions), strict=True))
         off = _projector(held if entropy is None else [(dS, entropy.gradient(u)), *held])
         motion = off(system.poisson.sharp(u, off(dH)))
-        for part in _parts(system.dissipation):
+        for part in () if system.dissipation is None else system.dissipation.terms:
             motion = motion + self._force(part, system, u, dH, dS, dL, held)
         return motion
 
@@ -150,12 +139,6 @@ class MetriplecticGauss(OneStepMethod):
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)
 
-    def increment(self, h, k) -> jax.Array:
-        return h * (gauss(self.number).b @ k)
-
-    def predict(self, k, before) -> jax.Array:
-        return 2.0 * k - before if self.number == 1 else beyond(self.number) @ k
-
     def __str__(self) -> str:
         kept = f", preserve={len(self.functions)} functions" if self.functions else ""
         return f"MetriplecticGauss(stages={self.number}{kept})"
@@ -167,12 +150,6 @@ def _gradients(functions: tuple[Energy, ...], x):
 
 def _name(function: Energy) -> str:
     return getattr(getattr(function, "function", None), "__name__", str(function))
-
-
-def _parts(dissipation: Dissipation | None) -> tuple[Dissipation, ...]:
-    if dissipation is None:
-        return ()
-    return dissipation.parts if isinstance(dissipation, Several) else (dissipation,)
 
 
 def _projector(gradients):

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from manifolds.matrix_functions import solve
 
-from ..errors import InputError
 from ..systems import SimpleClosedSystem, System
-from .base import OneStepMethod
-from .tableaus import MOST_STAGES, beyond, gauss
+from .base import GaussMethod, checked_stages
+from .tableaus import gauss
 from .variational import need_simple_closed, velocity_slope
 
 
-class VariationalGauss(OneStepMethod):
+class VariationalGauss(GaussMethod):
     """The variational principle on polynomials of degree s, with Gauss quadrature: of order 2s.
 
     The discrete action is ``L_d = h sum b_i L(q_i, V_i, S_i)`` on ``q_i = q_0 + h sum A_ij V_j``, varied over the
@@ -37,20 +35,8 @@ class VariationalGauss(OneStepMethod):
         1 to 8.
     """
 
-    number: int = eqx.field(static=True)
-
     def __init__(self, stages: int = 2):
-        if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
-            raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
-        self.number = stages
-
-    @property
-    def stages(self) -> int:
-        return self.number
-
-    @property
-    def order(self) -> int:
-        return 2 * self.number
+        self.number = checked_stages(stages)
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -83,12 +69,6 @@ class VariationalGauss(OneStepMethod):
         if system.receives:
             columns += [received, jnp.ones((self.number, 1))]
         return jnp.concatenate(columns, axis=1)
-
-    def increment(self, h, k) -> jax.Array:
-        return h * (gauss(self.number).b @ k)
-
-    def predict(self, k, before) -> jax.Array:
-        return 2.0 * k - before if self.number == 1 else beyond(self.number) @ k
 
     def __str__(self) -> str:
         return f"VariationalGauss(stages={self.number})"

@@ -109,7 +109,8 @@ class LieVariational(OneStepMethod):
 
 def _dtau_inverse(algebra: mf.LieAlgebra, xi) -> jax.Array:
     """The matrix of ``eta -> (I - xi/2) eta (I + xi/2)``, shape (dim, dim): right-trivialised; of -xi, the left one."""
-    half, one = 0.5 * algebra.hat(xi), jnp.eye(algebra.hat(xi).shape[-1])
+    half = 0.5 * algebra.hat(xi)
+    one = jnp.eye(len(half))
     return jax.vmap(lambda eta: algebra.vee((one - half) @ eta @ (one + half)), out_axes=1)(jnp.asarray(algebra.basis))
 
 

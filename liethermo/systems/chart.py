@@ -57,10 +57,10 @@ class ChartSystem(System):
         if system.dissipation is None:
             self.dissipation = None
             return
-        known = {id(L): self.pulled(L) for part in _parts(system.dissipation) for L in part.preserve}
+        known = {id(L): self.pulled(L) for part in system.dissipation.terms for L in part.preserve}
         parts = tuple(
             _Force(part, tuple(known[id(L)] for L in part.preserve), system, coordinates, place)
-            for part in _parts(system.dissipation)
+            for part in system.dissipation.terms
         )
         self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
 
@@ -139,7 +139,3 @@ class _Force(Dissipation):
         place = _Place(self.system, self.coordinates, self.place, x)
         dL = tuple(map(place.lift, dL))
         return place.lower(self.part.force(self.system, place.state, place.lift(dH), place.lift(dS), dL))
-
-
-def _parts(dissipation: Dissipation) -> tuple[Dissipation, ...]:
-    return dissipation.parts if isinstance(dissipation, Several) else (dissipation,)

@@ -15,7 +15,7 @@ import scipy.sparse
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, Function, Quadratic, check_scalar, is_traced
+from ..energy import Energy, Function, check_scalar, is_traced
 from ..errors import InputError
 from ..graph import Edges, edges, parts
 from ..indices import as_pattern, pattern, union
@@ -23,6 +23,7 @@ from ..mechanics import is_free_of, is_mechanical
 from ..thermal import ContactFriction, Drag, HeatConduction, LinearFriction
 from .base import System
 from .bodies import Copies, Subsystem, named
+from .evolution import entropy_component
 
 
 class ComposedSystem(System):
@@ -94,7 +95,7 @@ class ComposedSystem(System):
         )
         energy = self._energy(structure, coupling)
         check_scalar(energy, structure.dim, "the energy")
-        entropy = Quadratic(jnp.zeros(structure.dim), jnp.zeros(structure.dim).at[structure.places.S].set(1.0))
+        entropy = entropy_component(structure.dim, structure.places.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected)
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 

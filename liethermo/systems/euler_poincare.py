@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, EulerPoincareForce
-from ..energy import Energy, Quadratic, as_energy, check_scalar
+from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced
 from ..errors import InputError
 from .lie_poisson import LiePoissonSystem
 
@@ -121,12 +121,17 @@ def _hamiltonian(lagrangian: Energy, dim: int) -> Energy:
 
 
 def _need_regular(lagrangian: Energy, dim: int) -> None:
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(lagrangian)):
+    if is_traced(lagrangian):
         return
     points = np.random.default_rng(0).standard_normal((4, dim))
-    singular = np.linalg.svd(jax.vmap(jax.hessian(lagrangian.value))(points), compute_uv=False)
-    if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+    if singular_everywhere(jax.vmap(jax.hessian(lagrangian.value))(points)):
         raise InputError(_SINGULAR)
+
+
+def singular_everywhere(matrices) -> bool:
+    """Whether matrices at some points, shape (points, n, n), are all singular; not where they are not all finite."""
+    singular = np.linalg.svd(matrices, compute_uv=False)
+    return bool(np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all())
 
 
 @eqx.filter_custom_jvp

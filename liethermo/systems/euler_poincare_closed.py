@@ -12,11 +12,13 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation import Dissipation, Law
-from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..dissipation import Law, SkewFriction
+from ..energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
 from ..engine.interpret import at_points
-from ..errors import FunctionError, InputError
+from ..errors import InputError
 from .base import System
+from .euler_poincare import singular_everywhere
+from .evolution import entropy_component
 
 
 class EulerPoincareClosedSystem(System):
@@ -60,17 +62,15 @@ class EulerPoincareClosedSystem(System):
         self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
         check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         if friction is not None:
-            _check_covector(friction, n)
+            check_shape(friction, ((n,), ()), (n,), "the friction", "(xi, S)")
         structure = OnAlgebra(algebra, lagrangian)
         if not is_traced(lagrangian):
             hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
-            singular = np.linalg.svd(hessians, compute_uv=False)
-            if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+            if singular_everywhere(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
-        entropy = Quadratic(jnp.zeros(n + 1), jnp.zeros(n + 1).at[n].set(1.0))
         energy = recognised(ReducedEnergy(lagrangian), n + 1)
         forces = None if friction is None else AlgebraFriction(friction)
-        self._build(structure, n + 1, energy, entropy, forces, momentum_maps, validate)
+        self._build(structure, n + 1, energy, entropy_component(n + 1), forces, momentum_maps, validate)
 
     def momentum(self, xi, S) -> jax.Array:
         """``l_xi`` at one point, shape (dim,)."""
@@ -134,7 +134,7 @@ class OnAlgebra(mf.PoissonStructure):
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
 
-class AlgebraFriction(Dissipation):
+class AlgebraFriction(SkewFriction):
     """The force f and the heat that it makes, for discrete gradients too."""
 
     friction: Callable
@@ -142,14 +142,6 @@ class AlgebraFriction(Dissipation):
     @property
     def entropy_law(self) -> Law | None:
         return "nondecreasing"
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
-
-    @property
-    def symmetric(self) -> bool:
-        return False
 
     def force(self, system, x, dH, dS, dL):
         _, W, by_S = system.poisson.rates(x)
@@ -165,15 +157,3 @@ def _temperature(system: EulerPoincareClosedSystem, x):
 
 def _hessian(structure: OnAlgebra, x):
     return structure.rates(x)[1]
-
-
-def _check_covector(friction: Callable, n: int) -> None:
-    vector, number = jax.ShapeDtypeStruct((n,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
-    try:
-        shape = jax.eval_shape(lambda xi, S: jnp.asarray(friction(xi, S)), vector, number).shape
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(
-            f"the friction could not be evaluated at (xi, S): {type(error).__name__}: {error}"
-        ) from error
-    if shape != (n,):
-        raise FunctionError(f"the friction has shape ({n},), not {shape}")

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, Law
+from ..dissipation import Law, SkewFriction
 from ..energy import Energy, Quadratic, as_energy, check_scalar, recognised
 from ..errors import InputError
 from ..mechanics import is_mechanical
 from .base import System
 
 
-class LiouvilleFriction(Dissipation):
+class LiouvilleFriction(SkewFriction):
     """The thermodynamic part of an evolution field, ``{., H}_Delta`` of the single-generator form [SML 6, 30].
 
     On T*Q x R it is ``p' = -p H_S, S' = p . H_p``: friction proportional to the temperature H_S, and the heat it makes.
@@ -30,14 +30,6 @@ class LiouvilleFriction(Dissipation):
     @property
     def entropy_law(self) -> Law | None:
         return "nondecreasing" if self.nondecreasing else None
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
-
-    @property
-    def symmetric(self) -> bool:
-        return False
 
     def force(self, system, x, dH, dS, dL):
         return system.contact.liouville_sharp(x, dH)
@@ -150,9 +142,9 @@ def degrees_of_freedom(dim: int) -> int:
     return dim // 2
 
 
-def entropy_component(dim: int) -> Energy:
-    """The last component of the state."""
-    return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[-1].set(1.0))
+def entropy_component(dim: int, at=-1) -> Energy:
+    """The last component of a state, or the sum of those ``at`` some places."""
+    return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[at].set(1.0))
 
 
 def tangency(system: OnContactManifold, x) -> dict[str, jax.Array]:

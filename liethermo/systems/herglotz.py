@@ -17,7 +17,7 @@ from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, reco
 from ..engine.interpret import at_points
 from ..errors import InputError
 from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
-from .euler_poincare import inverse_gradient
+from .euler_poincare import inverse_gradient, singular_everywhere
 from .evolution import (
     ContactSystem,
     EvolutionSystem,
@@ -242,8 +242,7 @@ def _need_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
     points = np.random.default_rng(0).standard_normal((4, contact.dim))
-    singular = np.linalg.svd(at_points(_hessian, contact, points), compute_uv=False)
-    if np.isfinite(singular).all() and (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+    if singular_everywhere(at_points(_hessian, contact, points)):
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
             "does not determine the velocity"

@@ -14,17 +14,18 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation import Dissipation, Law, semidefinite
-from ..energy import Energy, Quadratic, is_traced
+from ..dissipation import Law, SkewFriction, semidefinite
+from ..energy import Energy, Quadratic, check_shape, is_traced
 from ..engine.interpret import at_points
-from ..errors import FunctionError, InputError
+from ..errors import InputError
+from .evolution import entropy_component
 from .herglotz import OnVelocities
 
 LEDGER = 3
 """Components of the ledger of a system that is not isolated: work and heat received, and the time."""
 
 
-class Forces(Dissipation):
+class Forces(SkewFriction):
     """Friction, external force and heat power, as they act on (q, v, S) [GBY 2.4].
 
     ``d/dt L_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the
@@ -40,14 +41,6 @@ class Forces(Dissipation):
         if self.heat_power is not None:
             return None
         return "conserved" if self.friction is None else "nondecreasing"
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
-
-    @property
-    def symmetric(self) -> bool:
-        return False
 
     def force(self, system, x, dH, dS, dL):
         n = system.degrees_of_freedom
@@ -135,7 +128,7 @@ class SimpleClosedSystem(OnVelocities):
         if self.receives:
             received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
             energy = energy.on(range(size)) + received
-        entropy = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size - 1].set(1.0))
+        entropy = entropy_component(total, size - 1)
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else Forces(*given)
         self._build(
@@ -318,15 +311,7 @@ def _force(friction, n: int, what: str) -> Callable | None:
 def _field(function, n: int, shape: tuple[int, ...], what: str) -> Callable:
     """As a function of (q, v, S, t), whose shape has been checked."""
     found = timed(function) if callable(function) else _Constant(jnp.asarray(function, dtype=jnp.float64))
-    vector, number = jax.ShapeDtypeStruct((n,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
-    try:
-        result = jax.eval_shape(lambda *a: jnp.asarray(found(*a)), vector, vector, number, number).shape
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(
-            f"{what} could not be evaluated at (q, v, S), q and v of shape ({n},): {type(error).__name__}: {error}"
-        ) from error
-    if result != shape:
-        raise FunctionError(f"{what} has shape {shape}, not {result}")
+    check_shape(found, ((n,), (n,), (), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")
     return found
 
 
