@@ -10,7 +10,7 @@ import numpy as np
 from .errors import InputError
 
 if TYPE_CHECKING:
-    from .solution import Solution
+    from .solution import Laws, Solution
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -102,22 +102,24 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     scale = abs(first) or 1.0
     drift = max(highest - first, first - lowest) / scale
     if laws.energy == "conserved":
-        rows.append(_verdict("energy drift", drift, tolerances.energy))
+        rows.append(_verdict("energy drift", drift, tolerances.energy, _note(laws, "energy")))
     elif laws.energy is None:
         rows.append(AuditRow("energy drift", drift, None, None, "no law promised"))
     else:
         increments = [*np.diff(solution.energy), _or(stats.largest_energy_increment, -np.inf)]
         risen = float(max(increments)) / scale
-        rows.append(_verdict("largest energy increment", risen, tolerances.energy))
+        rows.append(_verdict("largest energy increment", risen, tolerances.energy, _note(laws, "energy")))
 
     least = np.nan
     if solution.entropy is not None:
         least = float(min([*np.diff(solution.entropy), _or(stats.least_entropy_increment, np.inf)]))
         allowed = tolerances.entropy * float(np.abs(solution.entropy).max())
         if laws.entropy == "nondecreasing":
-            rows.append(AuditRow("least entropy increment", least, -allowed, bool(least >= -allowed)))
+            held = bool(least >= -allowed)
+            rows.append(AuditRow("least entropy increment", least, -allowed, held, _note(laws, "entropy")))
         elif laws.entropy == "conserved":
-            rows.append(_verdict("entropy drift", _drift(solution.entropy), tolerances.casimirs))
+            change = _drift(solution.entropy)
+            rows.append(_verdict("entropy drift", change, tolerances.casimirs, _note(laws, "entropy")))
         else:
             rows.append(AuditRow("least entropy increment", least, None, None, "no law promised"))
 
@@ -145,8 +147,12 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     return Audit(drift, least, casimir_drift, stats.worst_residual, tuple(rows))
 
 
-def _verdict(law: str, value: float, tolerance: float) -> AuditRow:
-    return AuditRow(law, float(value), tolerance, bool(value <= tolerance))
+def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:
+    return AuditRow(law, float(value), tolerance, bool(value <= tolerance), note)
+
+
+def _note(laws: Laws, law: str) -> str:
+    return "not kept exactly by this method" if law in laws.inexact else ""
 
 
 def _drift(series: np.ndarray) -> float:

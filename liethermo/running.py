@@ -374,7 +374,11 @@ def prepared(system: System, method) -> tuple[dict, Laws]:
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
-    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger))
+    inexact = () if "energy" in method.preserves else ("energy",)
+    quadratic = system.entropy is not None and system.entropy.is_quadratic
+    if not method.preserves & {"entropy_law", "entropy_law_quadratic" if quadratic else "entropy_law"}:
+        inexact += ("entropy",)
+    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact)
 
 
 def _value(function, x):

@@ -92,13 +92,15 @@ class Stats:
 class Laws:
     """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
 
-    ``ledger`` names those of the recorded functions that say what comes from outside.
+    ``ledger`` names those of the recorded functions that say what comes from outside, and ``inexact`` which of the two
+    laws ("energy", "entropy") the method makes no claim to keep: an audit judges them all the same, and says so.
     """
 
     energy: str | None = "conserved"
     entropy: str | None = None
     conserved: tuple[str, ...] = ()
     ledger: tuple[str, ...] = ()
+    inexact: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -236,7 +238,7 @@ def load(path: str | os.PathLike) -> Solution:
         names = [str(name) for name in dataset["invariant_name"].values]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in ("conserved", "ledger")}
+        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in ("conserved", "ledger", "inexact")}
         return Solution(
             t=t,
             x=x,

@@ -146,6 +146,10 @@ def _no_killing(g: mf.LieAlgebra) -> str | None:
     return "the Killing form vanishes on brackets (Cartan's criterion)" if g.is_solvable() else None
 
 
+def _line(g: mf.LieAlgebra) -> str | None:
+    return "a line has no covector beside dH: K is the rounding error of zero" if g.dim < 2 else None
+
+
 def _abelian(g: mf.LieAlgebra) -> str | None:
     return "nothing brackets to anything in an abelian algebra" if g.is_abelian() else None
 
@@ -154,15 +158,19 @@ DISSIPATIONS = [
     Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _no_killing),
     Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian),
     Case("projected", lambda g, H, rng: lt.ProjectedMetric(rate=0.1)),
-    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim))),
-    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3)),
+    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim)), _line),
+    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3), _line),
     Case(
         "projected_preserve",
         lambda g, H, rng: lt.ProjectedMetric(preserve=(lt.Quadratic(_spd(rng, g.dim)),), normalized=True, rate=0.3),
         lambda g: "one dimension leaves no room beside H and another function" if g.dim < 3 else None,
     ),
-    Case("friction_operator", _friction_operator, lambda g: "a line has no covector beside dH" if g.dim < 2 else None),
-    Case("kulkarni_nomizu", lambda g, H, rng: lt.FourBracket.kulkarni_nomizu(0.1 * _spd(rng, g.dim), _spd(rng, g.dim))),
+    Case("friction_operator", _friction_operator, _line),
+    Case(
+        "kulkarni_nomizu",
+        lambda g, H, rng: lt.FourBracket.kulkarni_nomizu(0.1 * _spd(rng, g.dim), _spd(rng, g.dim)),
+        _line,
+    ),
     Case("four_bracket", _curvature_tensor),
     Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian),
     Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian),

@@ -186,7 +186,10 @@ def test_the_entropy_of_a_step():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint("mean_value"), lt.MetriplecticGauss(2)], ids=str)
 def test_other_methods(method):
-    system, x0 = random_system(3), random_state(3)
+    system = random_system(3)
+    x0 = lt.integrate(system, random_state(3), (0.0, 0.5), 0.5, lt.Reference(rtol=1e-12)).x[-1]
+    assert np.abs(system.vector_field(x0)).max() < 2.0 < 40.0 < np.abs(system.vector_field(random_state(3))).max()
+    # the heat that rushes into the coldest body at first is too quick for these steps
     exact = lt.integrate(system, x0, (0.0, 2.0), 2.0, lt.Reference(rtol=1e-12)).x[-1]
     errors = []
     for n in (40, 80, 160):

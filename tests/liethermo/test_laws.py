@@ -30,6 +30,8 @@ STEPS, STEP = 40, 0.05
 def run(system, x0, method=None, steps=STEPS, h=STEP):
     if system.algebra.name in TRANSCENDENTAL:  # their entropies are singular nearby: stay close to the initial state
         h = h / 10
+    x0 = np.asarray(x0, dtype=float)
+    h = min(h, 0.3 * np.linalg.norm(x0) / np.linalg.norm(system.vector_field(x0)))  # the step is no judge of stiffness
     return lt.integrate(system, x0, (0.0, steps * h), h, method or lt.MetriplecticMidpoint())
 
 
@@ -100,9 +102,10 @@ def test_every_method_without_dissipation(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS, ids=str)
 @pytest.mark.parametrize(("g", "case"), combinations(ALGEBRAS))
-def test_everything(g, case, method):
+def test_every_algebra_with_every_dissipation(g, case):
+    """Methods by turns, as in a Latin square: each meets every algebra and every dissipation."""
+    method = METHODS[(ALGEBRAS.index(g) + DISSIPATIONS.index(case)) % len(METHODS)]
     system = build(g, case)
     assert_laws(system, run(system, state_of(g, 4), method), method)
 
@@ -162,6 +165,9 @@ def test_the_reference_method_fails_the_audit():
     assert not audit.passed
     assert audit.energy_drift > 1e-8
     assert "A LAW FAILS" in str(audit)
+    assert solution.laws.inexact == ("energy", "entropy")
+    assert str(audit).count("not kept exactly by this method") == 2
+    assert run(system, [0.001, 1.0, 0.001]).laws.inexact == ()
 
 
 class FromTheWrongGradient(lt.MetriplecticMidpoint):
