@@ -7,6 +7,7 @@ import datetime
 import functools
 import time
 import warnings
+from collections.abc import Callable
 from importlib import metadata
 from typing import Any
 
@@ -147,7 +148,9 @@ class Run:
             self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-        outcome = run_stepwise(self.system, self.method, self._driver, state, (start, end), step, stops, event, keep)
+        outcome = run_stepwise(
+            self.system, self.method, self._stepping(), state, (start, end), step, stops, event, keep
+        )
         if last is not None:
             self._append(*last)
         self.event_time = outcome.event_time
@@ -191,11 +194,39 @@ class Run:
                     return compiled.begin(self.system, self.method, x)
                 self.engine = "array"
             except UnsupportedPrimitive as error:
-                if not self.fallback:
-                    raise
-                warn_of_fallback(error, stacklevel=6)
-                self.engine = "array"
+                self._fall_back(error)
         return array.begin(self.system, self.method, x)
+
+    def _fall_back(self, error: UnsupportedPrimitive) -> None:
+        """Let the array engine go on, where no engine was asked for."""
+        if not self.fallback:
+            raise error
+        warn_of_fallback(error, stacklevel=7)
+        self.engine = "array"
+
+    def _attempt(self, call: Callable, state):
+        """What ``call(engine, state)`` gives; by the array engine where only Newton's method cannot be compiled.
+
+        Its program is made when a step first needs it.
+        """
+        try:
+            return call(self._driver, state)
+        except UnsupportedPrimitive as error:
+            self._fall_back(error)
+            like = array.begin(self.system, self.method, jnp.asarray(state.x))
+            state = jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, like)
+            return call(self._driver, state)
+
+    def _stepping(self) -> Callable:
+        """One step, as an engine's ``stepping`` gives it."""
+        made: dict[Any, Callable] = {}  # by engine
+
+        def one(driver, state, h):
+            if driver not in made:
+                made[driver] = driver.stepping(self.system, self.method)
+            return made[driver](state, h)
+
+        return lambda state, h: self._attempt(lambda driver, state: one(driver, state, h), state)
 
     def _affordable(self) -> bool:
         """Whether to compile: where it was asked for, where it is quick, or where a long run repays it."""
@@ -205,8 +236,8 @@ class Run:
 
     def _advance(self, state, h, saves, every, capacity):
         before = int(state.step)
-        state, (x, energy, entropy, reached) = self._driver.advance(
-            self.system, self.method, state, h, saves, every, capacity
+        state, (x, energy, entropy, reached) = self._attempt(
+            lambda driver, state: driver.advance(self.system, self.method, state, h, saves, every, capacity), state
         )
         kept = int(np.asarray(reached).sum())
         states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
@@ -374,10 +405,9 @@ def prepared(system: System, method) -> tuple[dict, Laws]:
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
-    inexact = () if "energy" in method.preserves else ("energy",)
     quadratic = system.entropy is not None and system.entropy.is_quadratic
-    if not method.preserves & {"entropy_law", "entropy_law_quadratic" if quadratic else "entropy_law"}:
-        inexact += ("entropy",)
+    exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
+    inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact)
 
 

@@ -216,7 +216,7 @@ class Outcome:
 def run(
     system: System,
     method,
-    engine,
+    advance: Callable,
     state,
     span: tuple[float, float],
     step: float | Adaptive,
@@ -228,8 +228,8 @@ def run(
 
     Parameters
     ----------
-    engine : module
-        One of the engines.
+    advance : function from (state, h) to the state after a step
+        As an engine's ``stepping`` gives it.
     state : State
         As its ``begin`` gives it.
     stops : array
@@ -238,7 +238,6 @@ def run(
         Told of every step taken, between the times t and its end.
     """
     t, end = span
-    advance = engine.stepping(system, method)
     control = Control(step, method.order, _first_step(state, end - t))
     value = event(np.asarray(state.x)) if event else 0.0
     outcome, stop = Outcome(state), 0
@@ -375,7 +374,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     span = (0.0, 1e6 * max(size, 1e-300) / speed)
     with contextlib.suppress(_EnoughError):
         state = array.begin(system, method, x)
-        run(system, method, array, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+        run(system, method, array.stepping(system, method), state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
         raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < 0.9 * GROWTH * a), len(taken) - 1)

@@ -260,8 +260,9 @@ class Stepper:
         """The module with Newton's method, run by Python as it stands: a thousand times as slow, and there at once."""
         with self._lock:
             if self._slow is None:
-                self._slow = ModuleType("spelled_out")
-                exec(compile(self._text(True, spelled_out=True), "<step>", "exec"), self._slow.__dict__)
+                module = ModuleType("spelled_out")
+                exec(compile(self._text(True, spelled_out=True), "<step>", "exec"), module.__dict__)
+                self._slow = module
             return self._slow
 
     def _try_out(self, module: ModuleType) -> None:

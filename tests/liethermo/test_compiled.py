@@ -152,6 +152,47 @@ def test_what_cannot_be_compiled(monkeypatch):
     assert solution.provenance["engine"] == "array"
 
 
+@jax.custom_jvp
+def slope_of_fourth_power(mu):
+    return mu**3
+
+
+@slope_of_fourth_power.defjvp
+def _slope_rule(primals, tangents):
+    ((mu,), (d,)) = primals, tangents
+    return mu**3, 3.0 * mu**2 * d + 0.0 * jnp.sum(jnp.sort(mu))
+
+
+@jax.custom_jvp
+def fourth_power(mu):
+    return 0.25 * jnp.sum(mu**4)
+
+
+fourth_power.defjvp(
+    lambda primals, tangents: (fourth_power(*primals), jnp.dot(slope_of_fourth_power(*primals), *tangents))
+)
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_newtons_method_that_cannot_be_compiled(adaptive):
+    """Its program is made when a step first needs it: with the second derivative of the energy."""
+    stiff = lt.LiePoissonSystem(mf.so(3), fourth_power, lt.Quadratic(np.ones(3)), lt.KillingDissipation(2.0))
+    # the first steps are easy, the rest are not
+    step = {"step": 1.0, "save_at": [3.0, 6.0]} if adaptive else {"step": 1.0}
+    with pytest.warns(UserWarning, match=r"JAX primitive.*array engine"):
+        solution = lt.integrate(stiff, [1.5, 1.0, 0.2], (0.0, 6.0), **step)
+    assert solution.provenance["engine"] == "array"
+    assert solution.stats.newton_iterations > 0
+    plain = lt.LiePoissonSystem(
+        mf.so(3), lambda mu: 0.25 * jnp.sum(mu**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation(2.0)
+    )
+    same = lt.integrate(plain, [1.5, 1.0, 0.2], (0.0, 6.0), **step, engine="array")
+    assert np.abs(solution.x - same.x).max() <= 1e-12
+    for _ in range(2):  # a second attempt fails as clearly as the first
+        with pytest.raises(lt.LiethermoError, match="JAX primitive"):
+            lt.integrate(stiff, [1.5, 1.0, 0.2], (0.0, 6.0), **step, engine="compiled")
+
+
 def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     chosen = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen() == "compiled"

@@ -419,7 +419,6 @@ def test_graphml_needs_networkx(tmp_path, monkeypatch):
 
 
 def test_a_graphml_file(tmp_path):
-    pytest.importorskip("networkx", reason="an optional dependency")
     graph = lt.read_graph(written(tmp_path, GRAPHML.replace("MORE", ""), "g.graphml"))
     assert graph.names == ("wall", "air")
     assert graph.matrix.toarray().tolist() == [[0.0, 2.5], [2.5, 0.0]]
