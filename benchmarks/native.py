@@ -21,16 +21,15 @@ OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
 
 STATUSES = ("completed", "not_converged", "non_finite")
 
-RUN = np.dtype(
-    [(name, "f8", 3) for name in ("x", "low", "k", "before")]
-    + [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
-    + [
-        (name, "f8")
-        for name in ("least_entropy_increment", "largest_energy_increment", "residual", "worst_residual", "integral")
-    ]
-    + [(name, "i8") for name in ("status", "steps", "iterations", "most_iterations")]
-)
-"""``Run`` of c/midpoint.h."""
+
+def run_type(components: int) -> np.dtype:
+    """``Run`` of c/midpoint.h."""
+    vectors = [(name, "f8", components) for name in ("x", "low", "k", "before")]
+    energies = ["energy", "entropy", "first_energy", "largest_energy", "smallest_energy"]
+    increments = ["least_entropy_increment", "largest_energy_increment"]
+    numbers = [(name, "f8") for name in (*energies, *increments, "residual", "worst_residual", "integral")]
+    return np.dtype(vectors + numbers + [(name, "i8") for name in ("status", "steps", "iterations", "most_iterations")])
+
 
 SUMMARY = np.dtype(
     [("x", "f8", 3)]
@@ -67,7 +66,7 @@ def program(source: str, *options: str) -> ctypes.CDLL:
 
 
 class Body:
-    """The step loop of one body.
+    """The step loop of one body, or of another system with a file of its own.
 
     Parameters
     ----------
@@ -83,10 +82,11 @@ class Body:
         self._library, self._parameters = program(source, *options), np.array(parameters, dtype=float)
 
     def integrate(self, x0, step: float, steps: int, every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """``steps`` steps from x0; every so-manieth state, by default the last, and a record of type :data:`RUN`."""
+        """``steps`` steps from x0; every so-manieth state, by default the last, and a record of :func:`run_type`."""
         every = steps if every is None else every
-        saves, run, x0 = steps // every, np.zeros(1, RUN), np.ascontiguousarray(x0, dtype=float)
-        out = np.empty((saves, 3))
+        x0 = np.ascontiguousarray(x0, dtype=float)
+        saves, run = steps // every, np.zeros(1, run_type(len(x0)))
+        out = np.empty((saves, len(x0)))
         self._library.integrate(
             _pointer(self._parameters),
             _pointer(x0),

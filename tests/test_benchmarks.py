@@ -13,7 +13,7 @@ from benchmarks import child, laws, native, page, reference
 from benchmarks.__main__ import main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
-from benchmarks.measurements import memory, variational
+from benchmarks.measurements import memory, spin, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
@@ -98,6 +98,15 @@ def test_c_runs_the_same_scheme(source, parameters, system):
 )
 def test_c_runs_the_same_variational_scheme(number):
     assert variational.difference(number) <= 1e-12
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_c_moves_the_same_spin(monkeypatch):
+    assert spin.difference() <= 1e-12
+    monkeypatch.setattr(spin, "program", lambda: Body("spin.c", [spin.AXIS, *spin.FIELD, 1.001 * spin.RATE]))
+    with pytest.raises(RuntimeError, match="differ by"):
+        spin.difference()
 
 
 @needs_compiler

@@ -7,7 +7,9 @@
        Start, start(p, x)                    what the slopes need of the state and what does not change in a step,
        slopes(p, s, x, low, h, k, out)       the right-hand side of  k = slopes(k),
        values(p, x, &energy, &entropy),
-       energy_gradient(p, x, out).
+       energy_gradient(p, x, out),
+
+   and, with OWN_MOVE, on a manifold, move(p, x, low, h, k, new, new_low).
 
    A step solves k = slopes(k) by fixed-point iteration from 2 k - before, down to the rounding plateau, and adds h k
    with compensated summation; what rounding has done to the energy is steered back. The iteration is that of
@@ -88,6 +90,21 @@ static inline void steer(const Problem *p, const double x[N], double energy, dou
         low[i] -= shift * gradient[i];
 }
 
+#ifndef OWN_MOVE
+/* x + low is the state; Neumaier's two-sum catches the rounding of the sum. */
+static inline void move(const Problem *p, const double x[N], const double low[N], double h, const double k[N],
+                        double new[N], double new_low[N])
+{
+    (void)p;
+    EACH(i) {
+        const double increment = h * k[i] + low[i];
+        new[i] = x[i] + increment;
+        const double back = new[i] - x[i];
+        new_low[i] = (x[i] - (new[i] - back)) + (increment - back);
+    }
+}
+#endif
+
 static inline int take_step(const Problem *p, double h, Run *run)
 {
     double k[N], new[N], new_low[N], update, energy, entropy, total = 0.0;
@@ -100,13 +117,9 @@ static inline int take_step(const Problem *p, double h, Run *run)
     if (status != RUNNING)
         return status;
 
-    EACH(i) { /* x + low is the state; Neumaier's two-sum catches the rounding of the sum */
-        const double increment = h * k[i] + run->low[i];
-        new[i] = run->x[i] + increment;
-        const double back = new[i] - run->x[i];
-        new_low[i] = (run->x[i] - (new[i] - back)) + (increment - back);
+    move(p, run->x, run->low, h, k, new, new_low);
+    EACH(i)
         total += new[i];
-    }
     values(p, new, &energy, &entropy);
     if (!isfinite(total + energy + entropy))
         return NON_FINITE;

@@ -4,6 +4,7 @@ NAMES = (
     "single_body",
     "general",
     "variational",
+    "spin",
     "ensemble",
     "work_precision",
     "dimension",

@@ -130,10 +130,13 @@ class ComposedSystem(System):
         return gradient[..., self._places.S]
 
     def fourier_factors(self, x) -> jax.Array:
-        """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``."""
+        """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
+
+        All of it, zeros too: for few bodies. The dynamics works with the edges alone.
+        """
         cold = 1.0 / self.temperatures(x)
         factors = jnp.zeros((*cold.shape, cold.shape[-1]))
-        for part in getattr(self.dissipation, "parts", (self.dissipation,)):
+        for part in () if self.dissipation is None else self.dissipation.terms:
             if isinstance(part, HeatConduction):
                 i, j = np.array(part.first, dtype=int), np.array(part.second, dtype=int)
                 factor = part.conductance * (cold[..., i] - cold[..., j])
