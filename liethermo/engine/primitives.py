@@ -109,6 +109,12 @@ INTERPRETED: dict[str, Callable[..., Any]] = FUNCTIONS | {
 }
 """The same on NumPy arrays."""
 
+TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
+"""Operations on numbers that give a truth value."""
+
+OF_TESTS = {"and", "or", "xor", "not"}
+"""Those on truth values."""
+
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
 

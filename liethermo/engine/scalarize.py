@@ -20,9 +20,11 @@ from jax.extend.core import ClosedJaxpr, Literal
 from ..errors import InputError, LiethermoError
 from .primitives import (
     INTERPRETED,
+    OF_TESTS,
     OPERATIONS,
     PARAMETERS,
     RULES,
+    TESTS,
     Builder,
     Instruction,
     LimitExceededError,
@@ -126,7 +128,8 @@ class Program:
     def split(self, late: Sequence[int]) -> tuple[Program, Program]:
         """What can be computed without some of the inputs, and the rest.
 
-        The second program has one more input array, at the end: the output of the first.
+        The second program has one more input array, at the end: the output of the first. Arrays hold numbers, so truth
+        values are handed over as 1.0 and 0.0.
 
         Parameters
         ----------
@@ -144,10 +147,14 @@ class Program:
         wanted = {a for instruction in rest for a in instruction.args} | {
             a for entries in self.outputs for a in entries
         }
-        handed = tuple(instruction.target for instruction in early if instruction.target in wanted)
+        handed = [instruction.target for instruction in early if instruction.target in wanted]
+        truths = {a: f"{a}_as_number" for a in handed if a in truth_values(early)}
+        early += [Instruction(number, "float", (a,)) for a, number in truths.items()]
+        rest = [Instruction(a, "ne", (number, 0.0)) for a, number in truths.items()] + rest
+        handed = [truths.get(a, a) for a in handed]
         instructions, renamed = _live(early, handed)
         first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
-        return first, Program((*self.inputs, handed), tuple(rest), self.outputs, self.shapes)
+        return first, Program((*self.inputs, tuple(handed)), tuple(rest), self.outputs, self.shapes)
 
     def body(self, sources: Sequence[str], targets: Sequence[str], prefix: str = "") -> list[str]:
         """The program as lines of Python, to be placed in a function that numba compiles.
@@ -360,6 +367,16 @@ CONTROL = {
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def truth_values(instructions: Sequence[Instruction]) -> set[str]:
+    """The targets that are true or false."""
+    found: set[str] = set()
+    for target, op, args in instructions:
+        chosen = args[1:] if op == "select" else ()
+        if op in TESTS or op in OF_TESTS or any(a in found or isinstance(a, bool) for a in chosen):
+            found.add(target)
+    return found
 
 
 def _live(

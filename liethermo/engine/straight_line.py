@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .primitives import Scalar
+from .primitives import OF_TESTS, TESTS, Scalar
 from .scalarize import Program
 
 NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
@@ -32,8 +32,6 @@ LOGICAL = {ast.BitAnd: "and_", ast.BitOr: "or_", ast.BitXor: "xor"}
 COMPARED = {ast.Eq: "==", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">="}
 
 OF_NUMBERS = {*FUNCTIONS, "add", "sub", "mul", "div", "neg", "pow", "rem", "max", "min", "sign"}
-TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
-OF_TESTS = {"and", "or", "xor", "not"}
 
 
 def is_plain(program: Program) -> bool:

@@ -26,6 +26,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engine.primitives import FUNCTIONS, OPERATIONS, RULES, Instruction
 from liethermo.engine.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize
+from liethermo.engine.straight_line import is_plain
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
 from tests.cases import DISSIPATIONS, EPS, build, state_of
 
@@ -576,6 +577,27 @@ def test_refusal_names_the_primitive_and_the_line(f, primitive, reason):
     assert error.where.startswith("test_scalarize.py:")
     assert repr(primitive) in str(error)
     assert error.where in str(error)
+
+
+def test_a_split_program_hands_over_numbers():
+    """Truth values too: what is in an array between the parts is a double."""
+
+    def f(fixed, a):
+        positive, first = fixed > 0.0, fixed[0] == 0.3
+        return jnp.where(positive & (a > fixed), a, -a) + jnp.exp(fixed), first | (a[0] > 1.0)
+
+    fixed, a = np.array([0.3, -0.8, 1.9]), np.array([1.1, -1.1, 0.4])
+    whole = scalarize(jax.make_jaxpr(f)(fixed, a))
+    first, rest = whole.split([1])
+    (handed,) = first.evaluate(fixed, a)
+    assert handed.dtype == np.float64
+    assert is_plain(first)
+    assert "exp" in first.operations
+    assert "exp" not in rest.operations
+    for found, expected in zip(rest.evaluate(fixed, a, handed), f(fixed, a), strict=True):
+        assert np.array_equal(found, expected)
+    numbers = scalarize(jax.make_jaxpr(lambda fixed, a: f(fixed, a)[0])(fixed, a)).split([1])
+    assert all(map(is_plain, numbers))  # so that they are not left to numba
 
 
 def test_too_large_a_program_is_refused():
