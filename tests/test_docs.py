@@ -32,10 +32,14 @@ def scratch(tmp_path, monkeypatch):
     plt.close("all")
 
 
+COSTLY = ("on_manifolds", "friction_heat_work")
+"""Pages that compile much: in the slow tier."""
+
+
 def _pages():
     for page in PAGES:
         if BLOCK.search(page.read_text()):
-            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem == "on_manifolds" else ())
+            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem in COSTLY else ())
 
 
 @pytest.mark.filterwarnings("ignore::manifolds.NoPolynomialCasimirWarning")  # a page shows it
