@@ -25,8 +25,7 @@ EPS = float(np.finfo(np.float64).eps)
 
 RUNNING, NOT_CONVERGED, NON_FINITE = 0, 1, 2
 
-FIXED_POINT_LIMIT = 60
-NEWTON_LIMIT = 25
+FIXED_POINT_LIMIT = NEWTON_LIMIT = 60
 NEWTON_REUSE = 4
 """Iterations with one factorisation before the Jacobian is taken afresh."""
 
