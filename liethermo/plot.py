@@ -431,7 +431,9 @@ def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
 def _verdict(audit: Audit) -> str:
     failing = [row for row in audit.rows if row.passed is False]
     if failing:
-        return "A law fails: " + "; ".join(row.note or f"{row.law} {row.value:.2g}" for row in failing)
+        return "A law fails: " + "; ".join(
+            f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in failing
+        )
     shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
     return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in shown)
 

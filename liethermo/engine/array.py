@@ -29,6 +29,10 @@ FIXED_POINT_LIMIT = NEWTON_LIMIT = 60
 NEWTON_REUSE = 4
 """Iterations with one factorisation before the Jacobian is taken afresh."""
 
+HALVINGS = 8
+"""Times that a Newton step is halved until the equations are solved better than before, in the second attempt. Whole
+steps come first: where halved ones get stuck in a valley of the misfit, whole ones leap out of it."""
+
 SLOW = 0.6
 """Contraction rate above which fixed-point iteration is given up for Newton's."""
 
@@ -113,33 +117,66 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
     if guess.size > DENSE_LIMIT:
         return first
 
+    def misfit(k):
+        return slopes(k) - k
+
     def better_start():
         """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
-        nothing = jnp.zeros_like(guess)
-        misfit = jax.lax.map(lambda k: jnp.linalg.norm(slopes(k) - k), jnp.stack([guess, nothing]))
-        return jnp.where(misfit[0] <= misfit[1], guess, nothing)
+        starts = jnp.stack([guess, jnp.zeros_like(guess)])
+        found = jax.lax.map(misfit, starts)
+        predicted = jnp.linalg.norm(found[0]) <= jnp.linalg.norm(found[1])
+        return jnp.where(predicted, starts[0], starts[1]), jnp.where(predicted, found[0], found[1])
 
-    def newton_goes_on(s: Iteration):
-        return ~done & ~s.settled(scale(s.k)) & (s.made < NEWTON_LIMIT) & jnp.isfinite(jnp.sum(s.k))
+    def lost(s: Iteration, damped):
+        return (s.made >= jnp.where(damped, 2, 1) * NEWTON_LIMIT) | ~jnp.isfinite(jnp.sum(s.k))
 
-    def newton(s: Iteration):
-        flat = lambda k: (slopes(k.reshape(guess.shape)) - k.reshape(guess.shape)).ravel()  # noqa: E731
-        inverse = _inverse(jacobian(s.k))
+    def newton_goes_on(s: Iteration, damped):
+        return ~done & ~s.settled(scale(s.k)) & ~lost(s, damped)
+
+    def improved(k, step, size, plateau, damped):
+        """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
+
+        def worse(carry):
+            factor, found = carry
+            halve = damped & (factor > 0.5**HALVINGS) & (factor * jnp.max(jnp.abs(step)) > plateau)
+            return (factor > 1.0) | (~(jnp.linalg.norm(found) < size) & halve)
+
+        def halved(carry):
+            factor = 0.5 * carry[0]
+            return factor, misfit(k - factor * step)
+
+        factor, found = jax.lax.while_loop(worse, halved, (jnp.asarray(2.0), step))
+        return k - factor * step, found, factor == 1.0
+
+    def newton(carry):
+        s, found, damped = carry
+        again = lost(s, damped)
+        restart = Iteration.begin(start)._replace(made=s.made), start_misfit
+        s, found = jax.tree_util.tree_map(lambda a, b: jnp.where(again, a, b), restart, (s, found))
+        damped, inverse, before = damped | again, _inverse(jacobian(s.k)), s.made
 
         def reuse(carry):
-            inner, _ = carry
-            step = (inverse @ flat(inner.k.ravel())).reshape(guess.shape)
-            return inner.after(inner.k - step), inner.made + 1 - s.made
+            inner, found, _ = carry
+            step = (inverse @ found.ravel()).reshape(guess.shape)
+            k, found, whole = improved(inner.k, step, jnp.linalg.norm(found), PLATEAU * scale(inner.k), damped)
+            inner = inner.after(k)
+            return inner, found, jnp.where(whole, inner.made - before, NEWTON_REUSE)
 
         def goes_on(carry):
-            inner, used = carry
+            inner, _, used = carry
             fresh = (used == 0) | ((used < NEWTON_REUSE) & (inner.rate < 0.3))
-            return fresh & newton_goes_on(inner)
+            return fresh & newton_goes_on(inner, damped)
 
-        return jax.lax.while_loop(goes_on, reuse, (s, jnp.zeros_like(s.made)))[0]
+        s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
+        return s, found, damped
 
-    start = jax.lax.cond(done, lambda: guess, better_start)
-    second = jax.lax.while_loop(newton_goes_on, newton, Iteration.begin(start))
+    start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), better_start)
+
+    def to_do(carry):
+        s, _, damped = carry
+        return ~done & ~s.settled(scale(s.k)) & ~(lost(s, damped) & damped)
+
+    second = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))[0]
     k = jnp.where(done, first.k, second.k)
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.residual, second.update)

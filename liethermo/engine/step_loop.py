@@ -14,6 +14,7 @@ import numpy as np
 from .array import (
     FIXED_POINT_LIMIT,
     FLOOR,
+    HALVINGS,
     NEWTON_LIMIT,
     NEWTON_REUSE,
     NON_FINITE,
@@ -153,8 +154,17 @@ def misfit(p, w, l):
 
 
 @njit
-def solve_by_newton(p, w, l, matrix, order, b, v):
-    """Simplified Newton for one lane."""
+def largest(w, l):
+    """``max |GUESS|`` of a lane."""
+    size = 0.0
+    for i in range(l, M * LANES, LANES):
+        size = max(size, abs(w[GUESS + i]))
+    return size
+
+
+@njit
+def newton(p, w, l, matrix, order, b, v, damped):
+    """Simplified Newton for one lane, with halved steps or without: status, last update, iterations."""
     # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may wander.
     prepare(p, w, l, l + 1)
     predicted = misfit(p, w, l)
@@ -162,33 +172,47 @@ def solve_by_newton(p, w, l, matrix, order, b, v):
         w[GUESS + i] = 0.0
     if predicted <= misfit(p, w, l):
         prepare(p, w, l, l + 1)
+    found = misfit(p, w, l)
     status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
     while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:
             jacobian(p, w, l, matrix, v)
             if not factorise(matrix, order):
-                status, update = NON_FINITE, np.nan
-                break
+                return NON_FINITE, np.nan, made
             used = 0
-        iterate(p, w, l, l + 1)
+        scale = w[SIZE + l] / w[H + l] + largest(w, l)
+        previous, update = update, 0.0
         for i in range(M):
             b[i] = w[NEW + i * LANES + l] - w[GUESS + i * LANES + l]
         substitute(matrix, order, b)
-        previous, update, size, total = update, 0.0, 0.0, 0.0
         for i in range(M):
             w[GUESS + i * LANES + l] -= b[i]
             update = max(update, abs(b[i]))
-            size = max(size, abs(w[GUESS + i * LANES + l]))
-            total += b[i]
-        made, used = made + 1, used + 1
+        before, found, factor = found, misfit(p, w, l), 1.0
+        while damped and not found < before and factor > 0.5**HALVINGS and update > PLATEAU * scale:
+            factor, update = 0.5 * factor, 0.5 * update
+            for i in range(M):
+                w[GUESS + i * LANES + l] += factor * b[i]
+            found = misfit(p, w, l)
+        made, used = made + 1, used + 1 if factor == 1.0 else NEWTON_REUSE
         rate = update / previous if made > 1 and previous > 0.0 else 0.0
         stalled = 0 if update < SHRINKING * best else stalled + 1
         best = min(best, update)
-        scale = w[SIZE + l] / w[H + l] + size
-        if not np.isfinite(total):
+        scale = w[SIZE + l] / w[H + l] + largest(w, l)
+        if not np.isfinite(found + scale):
             status, update = NON_FINITE, np.nan
         elif update <= FLOOR * scale or (stalled >= 2 and update <= PLATEAU * scale):
             status = 0
+    return status, update, made
+
+
+@njit
+def solve_by_newton(p, w, l, matrix, order, b, v):
+    """Newton's method for one lane: with whole steps, and where that fails with halved ones."""
+    status, update, made = newton(p, w, l, matrix, order, b, v, False)
+    if status != 0:
+        status, update, more = newton(p, w, l, matrix, order, b, v, True)
+        made += more
     w[STATUS + l] = status
     w[PHASE + l] = SOLVED if status == 0 else IDLE
     w[CHANGE + l] = update

@@ -173,7 +173,7 @@ fourth_power.defjvp(
 )
 
 
-@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("adaptive", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_newtons_method_that_cannot_be_compiled(adaptive):
     """Its program is made when a step first needs it: with the second derivative of the energy."""
     stiff = lt.LiePoissonSystem(mf.so(3), fourth_power, lt.Quadratic(np.ones(3)), lt.KillingDissipation(2.0))

@@ -204,6 +204,7 @@ def heavy_top(friction=True):
     return lt.LiePoissonSystem(SE3, kinetic + weight, lambda m: S(m) + 0.1 * S(m) ** 3, dissipation), kept, S
 
 
+@pytest.mark.slow
 def test_heavy_top_with_friction():
     """Energy and |p|^2 to rounding, and l.p grows."""
     system, kept, S = heavy_top()

@@ -304,6 +304,16 @@ def test_heat_grid():
     assert_both_laws(stiff)
 
 
+@pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
+def test_stiff_steps_of_a_few_bodies(engine):
+    """Whole Newton steps leave the domain of these; halved ones do not."""
+    grid, x0 = lt.models.heat_grid((3, 3)), np.random.default_rng(0).uniform(-0.5, 0.5, 9)
+    solution = lt.integrate(grid, x0, (0.0, 900.0), 300.0, engine=engine)
+    assert_both_laws(solution)
+    same = lt.integrate(grid, x0, (0.0, 900.0), 300.0, engine="sparse")
+    assert np.abs(solution.x - same.x).max() <= 1e-12
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(316, 317), (46, 46, 48)], ids=["plane", "space"])
 @pytest.mark.parametrize("h", [1.0, 100.0])

@@ -97,6 +97,7 @@ def test_the_structure_identity(kind, name):
     assert np.abs(heat).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_another_flow_does_not_have_the_structure():
     """That of the same scheme with a step that is a tenth longer."""
     z, scheme, system = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2]), SCHEMES["scheme 3"], OPEN["mechanical"]
