@@ -7,7 +7,6 @@
    general.c the difference of H is predicted from the gradient at three Gauss nodes; but along a geodesic only its
    derivative is needed at the outer ones. */
 
-#define STEERED INFINITY
 #include <math.h>
 #include <string.h>
 
@@ -41,12 +40,21 @@ static inline double energy_of(const Problem *p, const double x[N])
     return exp(x[3]) - p->axis * square * (0.5 + 0.25 * square) - dot3(p->field, x);
 }
 
-static inline void energy_gradient(const Problem *p, const double x[N], double out[N])
+static inline void derivatives(const Problem *p, const double x[N], double out[N])
 {
     SPIN(i)
         out[i] = -p->field[i];
     out[2] -= p->axis * x[2] * (1.0 + x[2] * x[2]);
     out[3] = exp(x[3]);
+}
+
+/* The derivatives less what leads off the sphere. */
+static inline void energy_gradient(const Problem *p, const double x[N], double out[N])
+{
+    derivatives(p, x, out);
+    const double off = dot3(x, out);
+    SPIN(i)
+        out[i] -= off * x[i];
 }
 
 /* cos(angle) and sin(angle) / angle; the first terms of its series are exact below 1e-4. */
@@ -101,7 +109,7 @@ static inline double directional(const Problem *p, const double z[N], const doub
 {
     double point[N], velocity[N], slope[N];
     geodesic(z, d, angle, t, point, velocity);
-    energy_gradient(p, point, slope);
+    derivatives(p, point, slope);
     return dot(slope, velocity);
 }
 
@@ -133,9 +141,6 @@ static inline void slopes(const Problem *p, const Start *s, const double x[N], c
     const double angle = middle(x, h, k, half, z, d), whole = 2.0 * angle;
 
     energy_gradient(p, z, slope);
-    const double off = dot3(z, slope);
-    SPIN(i)
-        slope[i] -= off * z[i];
     const double along = dot(slope, d);
     const double second =
         directional(p, z, d, whole, NODE - 0.5) + directional(p, z, d, whole, 0.5 - NODE) - 2.0 * along;
@@ -165,10 +170,13 @@ static inline void slopes(const Problem *p, const Start *s, const double x[N], c
 static inline void move(const Problem *p, const double x[N], const double low[N], double h, const double k[N],
                         double new[N], double new_low[N])
 {
-    double half[N], z[N], d[N];
-    (void)p, (void)low;
+    double half[N], z[N], d[N], v[N];
+    (void)p;
     const double angle = middle(x, h, k, half, z, d);
-    geodesic(z, d, 2.0 * angle, 0.5, new, NULL);
+    carry(x, half, angle, low, v); /* what steers the energy */
+    EACH(i)
+        v[i] += 0.5 * d[i];
+    geodesic(z, v, sqrt(dot3(v, v)), 1.0, new, NULL);
     if (!(angle < M_PI_2)) /* the domain of exp~ */
         new[0] = NAN;
     memset(new_low, 0, N * sizeof(double));
