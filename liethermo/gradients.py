@@ -74,9 +74,9 @@ class Gonzalez(DiscreteGradient):
         left, middle, right = jax.vmap(lambda c: term.gradient(x + (low + c * d)))(_NODES_3)
         second = left + right - 2.0 * middle  # the prediction minus grad H(z).d is 5/18 second.d, free of cancellation
         predicted = jnp.dot(middle, d) + (5 / 18) * jnp.dot(second, d)
-        values = _values(term, jnp.stack([x, x + (low + d)]))
+        difference = _difference(term, x, d, low, middle)
         slope, size, length = (jnp.linalg.norm(v) for v in (middle, x, d))
-        defect = _gated_defect(values, predicted, slope * size, jnp.dot(second, d), slope * length)
+        defect = _gated_defect(*difference, predicted, slope * size, jnp.dot(second, d), slope * length)
         return middle + _divide((5 / 18) * jnp.dot(second, d) + defect, jnp.dot(d, d)) * d
 
 
@@ -96,9 +96,9 @@ class MeanValue(DiscreteGradient):
     def general(self, term: Energy, x, d, low) -> jax.Array:
         points, weights = _gauss(self.nodes)
         mean = weights @ jax.vmap(lambda c: term.gradient(x + (low + c * d)))(points)
-        values = _values(term, jnp.stack([x, x + (low + d)]))
+        difference = _difference(term, x, d, low, mean)
         rounding = jnp.linalg.norm(mean) * jnp.linalg.norm(x)
-        defect = _gated_defect(values, jnp.dot(mean, d), rounding, 0.0, 1.0)
+        defect = _gated_defect(*difference, jnp.dot(mean, d), rounding, 0.0, 1.0)
         return mean + _divide(defect, jnp.dot(d, d)) * d
 
 
@@ -139,8 +139,9 @@ class CoordinateIncrement(DiscreteGradient):
         along, slope = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
         second = along[:, 0] + along[:, 2] - 2.0 * along[:, 1]
         mean = along[:, 1] + (5 / 18) * second
-        edges = values[:-1], values[1:]
-        defect = _gated_defect(edges, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
+        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1])
+        found = values[1:] - values[:-1]
+        defect = _gated_defect(found, sizes, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
         return mean + _divide(defect, d)
 
 
@@ -285,14 +286,25 @@ def _values(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
-def _gated_defect(values, predicted, argument_effect, second_difference, slope_scale):
+def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array]:
+    """``H(x + low + d) - H(x + low)``, and the sum of the two in size; ``gradient`` is one in between.
+
+    From values where steps begin and end, so that their rounding cancels from step to step, and the gradient for what
+    these points leave out: else a step would take back what rounding, or a steering of the energy, has put into low.
+    """
+    new, new_low = compensated(x, low + d)
+    before, after = _values(term, jnp.stack([x, new]))
+    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after)
+
+
+def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale):
     """Defect of a predicted difference of two values of H, shut out where it is no more than rounding noise.
 
-    ``argument_effect`` is ``|grad H| |x|``: one rounding of the argument moves H by eps times that.
+    ``size`` is the sum of the two values, ``argument_effect`` is ``|grad H| |x|``: one rounding of the argument moves H
+    by eps times that.
     """
-    before, after = values
-    defect = (after - before) - predicted
-    noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * argument_effect
+    defect = difference - predicted
+    noise = DIFFERENCE_NOISE * size + 4 * EPS * argument_effect
     opened = jnp.maximum(_gate(defect, noise), _gate(second_difference, CURVATURE_SWITCH * slope_scale))
     return _let_through(defect, opened)
 

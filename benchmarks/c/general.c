@@ -96,11 +96,14 @@ static inline void discrete_gradient(const Problem *p, const Start *s, const dou
     at(x, low, 1.0, d, point);
     const double end = energy_of(p, point);
 
-    double second = 0.0;
-    EACH(i)
+    double second = 0.0, left_out = 0.0; /* what the values at x and at the end leave out */
+    EACH(i) {
+        const double back = point[i] - x[i], whole = low[i] + d[i];
+        left_out += middle[i] * ((x[i] - (point[i] - back)) + (whole - back) - low[i]);
         second += (left[i] + right[i] - 2.0 * middle[i]) * d[i];
+    }
     const double square = dot(d, d), slope = sqrt(dot(middle, middle));
-    double defect = (end - s->energy) - (dot(middle, d) + (5.0 / 18.0) * second);
+    double defect = (end - s->energy) + left_out - (dot(middle, d) + (5.0 / 18.0) * second);
     double opened = gate(second, CURVATURE_SWITCH * slope * sqrt(square));
     if (opened < 1.0) {
         const double noise = DIFFERENCE_NOISE * (fabs(s->energy) + fabs(end)) + 4.0 * EPS * slope * s->size;
