@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from .engine import array
 from .engine.interpret import evaluator
@@ -311,6 +310,8 @@ def _located(event: Event, advance: Callable, system, method, state, new, h: flo
     Looked for among steps from the same state, so that the event is as accurate as the method and the laws hold there;
     one that fails is replaced by the collocation polynomial of the whole step.
     """
+    from scipy.optimize import brentq  # here, as its import takes a tenth of a second, and few runs have events
+
     if after == 0.0:
         return h, new
     x, k = np.asarray(state.x), np.asarray(new.k)
