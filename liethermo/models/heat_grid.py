@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 import scipy.sparse
 
 from ..errors import InputError
@@ -42,6 +41,8 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
 
 def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:
     """The exact temperatures at a time, from those at t = 0, both in the shape of the grid: a sum of cosines."""
+    import scipy.fft  # here: every user of the library would wait for it
+
     T = np.asarray(temperatures, dtype=float)
     rates = np.zeros(T.shape)
     for axis, n in enumerate(T.shape):
