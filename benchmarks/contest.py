@@ -66,11 +66,21 @@ def difference(program: Body, system: lt.System) -> float:
     Raises
     ------
     RuntimeError
-        If it exceeds 1e-12: then they do not run the same scheme, and comparing their times means nothing.
+        As :func:`of_one_scheme`.
     """
     ours = by_library(system, COMPARED_STEPS, "compiled", 1)().x[1:]
     theirs, _ = program.integrate(X0, STEP, COMPARED_STEPS, 1)
-    found = float(np.abs(ours - theirs).max() / np.abs(ours).max())
-    if not found <= 1e-12:
-        raise RuntimeError(f"after {COMPARED_STEPS} steps C and the compiled engine differ by {found:.1e}")
-    return found
+    return of_one_scheme(float(np.abs(ours - theirs).max() / np.abs(ours).max()), COMPARED_STEPS)
+
+
+def of_one_scheme(difference: float, steps: int) -> float:
+    """The difference of two trajectories after so many steps.
+
+    Raises
+    ------
+    RuntimeError
+        If it exceeds 1e-12: then they are not of the same scheme, and comparing their times means nothing.
+    """
+    if not difference <= 1e-12:
+        raise RuntimeError(f"after {steps} steps C and the compiled engine differ by {difference:.1e}")
+    return difference

@@ -182,7 +182,6 @@ def ensemble(
     engine : {"auto", "array", "compiled"}
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
-
     attitude : array, shape (m, m) or (B, m, m), optional
         As for :func:`integrate`; one for all, or one each.
 

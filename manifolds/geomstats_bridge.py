@@ -249,7 +249,7 @@ class GeomstatsSpace(Space):
         return moved
 
 
-# -- what geomstats computes, on arrays of shape ``(count, *shape)`` --------------------------------------------------
+# -- what geomstats computes, on arrays of shape (count, *shape) --------------------------------------------------
 
 
 def _checked_log(space: GeomstatsSpace, x, y):

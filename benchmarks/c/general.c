@@ -9,6 +9,7 @@
 
 #include <math.h>
 
+#include "gonzalez.h"
 #include "rules.h"
 
 #define N 3
@@ -21,8 +22,6 @@ typedef struct {
 typedef struct {
     double energy, size;
 } Start;
-
-static const double TINY = 1e-290;
 
 static inline double dot(const double u[N], const double v[N]) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
 
@@ -69,19 +68,6 @@ static inline void discrete_gradient(const Problem *p, const Start *s, const dou
 }
 
 #else
-
-static const double NODE = 0.1127016653792583; /* (1 - sqrt(3/5)) / 2, the first of three Gauss nodes on (0, 1) */
-static const double EPS = 0x1p-52;
-static const double DIFFERENCE_NOISE = 8 * 0x1p-52;
-static const double CURVATURE_SWITCH = 1e-6;
-
-/* 0 where |size| <= threshold, 1 from twice that on, linear between. */
-static inline double gate(double size, double threshold)
-{
-    threshold = threshold > TINY ? threshold : TINY;
-    size = fabs(size);
-    return size >= 2.0 * threshold ? 1.0 : size <= threshold ? 0.0 : size / threshold - 1.0;
-}
 
 static inline void discrete_gradient(const Problem *p, const Start *s, const double x[N], const double low[N],
                                      const double d[N], double out[N])

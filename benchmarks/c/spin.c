@@ -10,6 +10,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "gonzalez.h"
 #include "rules.h"
 
 #define N 4
@@ -22,12 +23,6 @@ typedef struct {
 typedef struct {
     char none;
 } Start;
-
-static const double TINY = 1e-290;
-static const double NODE = 0.1127016653792583; /* (1 - sqrt(3/5)) / 2, the first of three Gauss nodes on (0, 1) */
-static const double EPS = 0x1p-52;
-static const double DIFFERENCE_NOISE = 8 * 0x1p-52;
-static const double CURVATURE_SWITCH = 1e-6;
 
 #define SPIN(i) _Pragma("GCC unroll 3") for (int i = 0; i < 3; i++)
 
@@ -95,14 +90,6 @@ static inline void carry(const double z[N], const double v[N], double angle, con
     SPIN(i)
         out[i] = u[i] - along * (0.5 * half_sinc * half_sinc * v[i] + sinc * z[i]);
     out[3] = u[3];
-}
-
-/* 0 where |size| <= threshold, 1 from twice that on, linear between. */
-static inline double gate(double size, double threshold)
-{
-    threshold = threshold > TINY ? threshold : TINY;
-    size = fabs(size);
-    return size >= 2.0 * threshold ? 1.0 : size <= threshold ? 0.0 : size / threshold - 1.0;
 }
 
 static inline double directional(const Problem *p, const double z[N], const double d[N], double angle, double t)

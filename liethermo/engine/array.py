@@ -120,18 +120,11 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
     def misfit(k):
         return slopes(k) - k
 
-    def better_start():
-        """The prediction, or a step of nothing where that solves the equations better: far out Newton may wander."""
-        starts = jnp.stack([guess, jnp.zeros_like(guess)])
-        found = jax.lax.map(misfit, starts)
-        predicted = jnp.linalg.norm(found[0]) <= jnp.linalg.norm(found[1])
-        return jnp.where(predicted, starts[0], starts[1]), jnp.where(predicted, found[0], found[1])
-
     def lost(s: Iteration, damped):
         return (s.made >= jnp.where(damped, 2, 1) * NEWTON_LIMIT) | ~jnp.isfinite(jnp.sum(s.k))
 
-    def newton_goes_on(s: Iteration, damped):
-        return ~done & ~s.settled(scale(s.k)) & ~lost(s, damped)
+    def unsolved(s: Iteration):
+        return ~done & ~s.settled(scale(s.k))
 
     def improved(k, step, size, plateau, damped):
         """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
@@ -165,22 +158,32 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
         def goes_on(carry):
             inner, _, used = carry
             fresh = (used == 0) | ((used < NEWTON_REUSE) & (inner.rate < 0.3))
-            return fresh & newton_goes_on(inner, damped)
+            return fresh & unsolved(inner) & ~lost(inner, damped)
 
         s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
         return s, found, damped
 
-    start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), better_start)
-
     def to_do(carry):
         s, _, damped = carry
-        return ~done & ~s.settled(scale(s.k)) & ~(lost(s, damped) & damped)
+        return unsolved(s) & ~(damped & lost(s, damped))
 
+    start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), lambda: better_start(misfit, guess))
     second = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))[0]
     k = jnp.where(done, first.k, second.k)
     converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.residual, second.update)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made)
+
+
+def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The guess, or a step of nothing where that solves the equations better, and the misfit there.
+
+    Far out Newton may wander.
+    """
+    starts = jnp.stack([guess, jnp.zeros_like(guess)])
+    found = jax.lax.map(misfit, starts)
+    predicted = jnp.linalg.norm(found[0]) <= jnp.linalg.norm(found[1])
+    return jnp.where(predicted, starts[0], starts[1]), jnp.where(predicted, found[0], found[1])
 
 
 @jax.custom_batching.custom_vmap

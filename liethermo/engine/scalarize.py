@@ -148,7 +148,8 @@ class Program:
             a for entries in self.outputs for a in entries
         }
         handed = [instruction.target for instruction in early if instruction.target in wanted]
-        truths = {a: f"{a}_as_number" for a in handed if a in truth_values(early)}
+        true_or_false = truth_values(early)
+        truths = {a: f"{a}_as_number" for a in handed if a in true_or_false}
         early += [Instruction(number, "float", (a,)) for a, number in truths.items()]
         rest = [Instruction(a, "ne", (number, 0.0)) for a, number in truths.items()] + rest
         handed = [truths.get(a, a) for a in handed]

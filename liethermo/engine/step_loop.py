@@ -170,9 +170,10 @@ def newton(p, w, l, matrix, order, b, v, damped):
     predicted = misfit(p, w, l)
     for i in range(l, M * LANES, LANES):
         w[GUESS + i] = 0.0
-    if predicted <= misfit(p, w, l):
-        prepare(p, w, l, l + 1)
     found = misfit(p, w, l)
+    if predicted <= found:
+        prepare(p, w, l, l + 1)
+        found = misfit(p, w, l)
     status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
     while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:

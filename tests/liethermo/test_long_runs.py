@@ -6,6 +6,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from benchmarks.measurements import spin
+from benchmarks.problems import general_body
 from liethermo.gradients import GRADIENTS
 
 MILLION = 1_000_000
@@ -44,28 +46,15 @@ def test_relaxing_to_rounding_and_staying_there(name):
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_the_energy_of_a_motion_that_goes_on(engine):
     """A general energy, hardly relaxing: each step rounds anew, and the errors must not add up (they came to 1e-11)."""
-    inertia = jnp.array([10.0, 5.0, 1.0])
-    system = lt.LiePoissonSystem(
-        mf.so(3),
-        lambda m: jnp.sum(m**2 / (2 * inertia)) + 0.025 * jnp.sum(m**4),
-        lambda m: jnp.log(1.0 + jnp.sum(m**2)),
-        lt.KillingDissipation(1.7e-4),
-    )
-    solution = lt.integrate(system, [0.001, 1.0, 0.001], (0.0, 10_000.0), 0.1, save_every=1000, engine=engine)
+    system, x0 = general_body(3.4e-4), [0.001, 1.0, 0.001]
+    solution = lt.integrate(system, x0, (0.0, 10_000.0), 0.1, save_every=1000, engine=engine)
     assert solution.audit(energy=8e-15).passed, str(solution.audit())
 
 
 @pytest.mark.parametrize("gradient", ["gonzalez", pytest.param("mean_value", marks=pytest.mark.slow)])
 def test_the_energy_in_long_steps(gradient):
     """Where the difference of H is used at every step, it must not take back what steers it (the drift was 1e-13)."""
-    inertia = jnp.array([10.0, 5.0, 1.0])
-    system = lt.LiePoissonSystem(
-        mf.so(3),
-        lambda m: jnp.sum(m**2 / (2 * inertia)) + 0.025 * jnp.sum(m**4),
-        lambda m: jnp.log(1.0 + jnp.sum(m**2)),
-        lt.KillingDissipation(3.3e-6),
-    )
-    method = lt.MetriplecticMidpoint(gradient)
+    system, method = general_body(6.6e-6), lt.MetriplecticMidpoint(gradient)
     solution = lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 3e5), 1.0, method, save_every=3000, engine="compiled")
     assert solution.audit(energy=8e-15).passed, str(solution.audit())
 
@@ -73,14 +62,5 @@ def test_the_energy_in_long_steps(gradient):
 @pytest.mark.slow
 def test_the_energy_on_a_sphere():
     """A spin and its bath, on its way for 1e5 steps in which the points are rounded anew (it came to 6e-13)."""
-    field = jnp.array([0.6, 0.0, 0.2])
-    system = lt.MetriplecticSystem(
-        poisson=mf.LiePoisson(mf.direct_sum(mf.so(3), mf.abelian(1))),
-        energy=lambda x: -1.5 * (x[2] ** 2 / 2 + x[2] ** 4 / 4) - x[:3] @ field + jnp.exp(x[3]),
-        entropy=lambda x: x[3],
-        dissipation=lt.ProjectedMetric(rate=2e-4),
-        space=mf.Sphere(2) * mf.Euclidean(1),
-    )
-    x0 = [np.sin(1.45), 0.0, np.cos(1.45), 0.0]
-    solution = lt.integrate(system, x0, (0.0, 1e4), 0.1, save_every=1000, engine="compiled")
+    solution = lt.integrate(spin.system(2e-4), spin.X0, (0.0, 1e4), 0.1, save_every=1000, engine="compiled")
     assert solution.audit(energy=2e-14).passed, str(solution.audit())
