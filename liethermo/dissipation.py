@@ -9,8 +9,8 @@ Remark 4.7 ask for, once for every class.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ import scipy.sparse
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from .energy import Energy, as_energy
+from .energy import Energy, as_energy, recognised
 from .errors import IndefiniteError, InputError
 from .indices import union
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .systems import System
 
 Law = Literal["conserved", "nondecreasing", "nonincreasing"]
+T = TypeVar("T")
 
 
 class Dissipation(eqx.Module):
@@ -37,7 +38,7 @@ class Dissipation(eqx.Module):
     Attributes
     ----------
     preserve : tuple of Energy
-        Functions besides the energy that it keeps constant.
+        Functions besides the energy that it keeps constant; of a sum those of all parts, one part after another.
     """
 
     @property
@@ -62,6 +63,11 @@ class Dissipation(eqx.Module):
         """
         del system
         return None
+
+    @property
+    def keeps_casimirs(self) -> bool:
+        """Whether the force keeps every Casimir, whatever gradients it is handed: it lies in the range of Pi(x)."""
+        return False
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
@@ -135,10 +141,12 @@ class Several(Dissipation):
         return union(part.couplings(system) for part in self.parts)
 
     @property
+    def keeps_casimirs(self) -> bool:
+        return all(part.keeps_casimirs for part in self.parts)
+
+    @property
     def preserve(self) -> tuple[Energy, ...]:
-        """Only what every part is told to keep is kept by the sum."""
-        first, *others = (part.preserve for part in self.parts)
-        return tuple(L for L in first if all(any(L is M for M in other) for other in others))
+        return tuple(L for part in self.parts for L in part.preserve)
 
     @property
     def needs_entropy(self) -> bool:
@@ -148,11 +156,16 @@ class Several(Dissipation):
         return Several(tuple(part.prepared(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):
-        kept = {id(L): gradient for L, gradient in zip(self.preserve, dL, strict=True)}
-        return sum(
-            part.force(system, x, dH, dS, tuple(kept.get(id(L), L.gradient(x)) for L in part.preserve))
-            for part in self.parts
-        )
+        return sum(part.force(system, x, dH, dS, own) for part, own in portions(self, dL))
+
+
+def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
+    """Each summand with its portion of what belongs to the functions in ``dissipation.preserve``, in their order."""
+    start = 0
+    for part in dissipation.terms:
+        end = start + len(part.preserve)
+        yield part, tuple(preserved[start:end])
+        start = end
 
 
 class SkewFriction(Dissipation):
@@ -295,6 +308,11 @@ class ProjectedMetric(Dissipation):
     @property
     def preserve(self):
         return self.functions
+
+    def prepared(self, system):
+        if system.space is not None:
+            return self
+        return eqx.tree_at(lambda d: d.functions, self, tuple(recognised(L, system.dim) for L in self.functions))
 
     def force(self, system, x, dH, dS, dL):
         G = _at(self.cometric, x)
@@ -470,6 +488,10 @@ class DoubleBracket(Dissipation):
     @property
     def entropy_law(self):
         return "conserved"
+
+    @property
+    def keeps_casimirs(self):
+        return True
 
     @property
     def needs_entropy(self):

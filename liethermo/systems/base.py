@@ -69,11 +69,12 @@ class System(eqx.Module):
         check_scalar(self.energy, dim, "the energy")
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
+        for name, J in self.momentum_maps.items():
+            check_scalar(J, dim, f"momentum map {name!r}")
         if space is None:  # in a chart no function is quadratic
             self.energy = recognised(self.energy, dim)
             self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
-        for name, J in self.momentum_maps.items():
-            check_scalar(J, dim, f"momentum map {name!r}")
+            self.momentum_maps = {name: recognised(J, dim) for name, J in self.momentum_maps.items()}
         if dissipation is not None and not isinstance(dissipation, Dissipation):
             raise InputError(
                 f"dissipation must be a Dissipation of this library or None, not {type(dissipation).__name__}"
@@ -134,12 +135,15 @@ class System(eqx.Module):
             self.state(x, batch=True)
         )
 
-    def friction_matrix(self, x) -> jax.Array:
-        """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``."""
-        x = self.state(x)
-        if self.dissipation is None:
+    def friction_matrix(self, x, dissipation: Dissipation | None = None) -> jax.Array:
+        """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
+
+        Of the dissipation of the system, or of another, such as one of its summands.
+        """
+        x, dissipation = self.state(x), self.dissipation if dissipation is None else dissipation
+        if dissipation is None:
             return jnp.zeros((self.dim, self.dim))
-        force, dH, dL = self.dissipation.force, self.energy.gradient(x), self._preserved_gradients(x)
+        force, dH, dL = dissipation.force, self.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
 
     # -- the manifold ---------------------------------------------------------------------------------------------
@@ -189,8 +193,40 @@ class System(eqx.Module):
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
-        """The functions that the dissipation is told to preserve besides the energy."""
+        """The functions that the dissipation, or one of its summands, is told to preserve besides the energy."""
         return () if self.dissipation is None else self.dissipation.preserve
+
+    def casimirs(self) -> dict[str, Energy]:
+        """Casimirs of the Poisson structure that are known, by name."""
+        return {}
+
+    @property
+    def has_all_casimirs(self) -> bool:
+        """Whether every Casimir is known to be a function of :meth:`casimirs`."""
+        return False
+
+    def functions(self) -> dict[str, Energy]:
+        """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name."""
+        return self.momentum_maps | self.preserved_by_name() | self.casimirs()
+
+    def preserved_by_name(self) -> dict[str, Energy]:
+        """:attr:`preserved`, each with a name."""
+        return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
+
+    def first_integrals(self) -> frozenset[str]:
+        """The names of those of :meth:`functions` that the system conserves.
+
+        Momentum maps are claimed to be. A Casimir is conserved if the dissipation keeps it, and what the dissipation is
+        told to preserve if the motion and the other summands keep it: where no construction says so, it is found out at
+        random points, or left out while the system is being traced.
+        """
+        claimed, casimirs = set(self.momentum_maps), self.casimirs()
+        if self.dissipation is None or self.dissipation.keeps_casimirs:
+            claimed |= set(casimirs)
+        others = {name: f for name, f in self.functions().items() if name not in claimed}
+        with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+            kept = [False] * len(others) if _has_tracers(self) else self.conserves(tuple(others.values()))
+        return frozenset(claimed | {name for name, constant in zip(others, kept, strict=True) if constant})
 
     @property
     def energy_law(self) -> Law | None:
@@ -205,15 +241,9 @@ class System(eqx.Module):
         return "conserved" if self.dissipation is None else self.dissipation.entropy_law
 
     def invariants(self) -> dict[str, tuple[Energy, bool]]:
-        """Further functions worth recording along a run, by name, each with whether the system conserves it.
-
-        Momentum maps are claimed to be conserved. What the dissipation preserves is a constant only if the motion keeps
-        it too, and a Casimir only if the dissipation does: that is found out at random points.
-        """
-        found = {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)} | self._casimirs()
-        constant = self.conserves(tuple(found.values()))
-        claimed = {name: (J, True) for name, J in self.momentum_maps.items()}
-        return claimed | {name: (f, kept) for (name, f), kept in zip(found.items(), constant, strict=True)}
+        """Functions worth recording along a run, by name, each with whether the system conserves it."""
+        kept = self.first_integrals()
+        return {name: (function, name in kept) for name, function in self.functions().items()}
 
     def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
         """Whether each function is constant along the vector field, at random points inside its domain."""
@@ -230,10 +260,6 @@ class System(eqx.Module):
     @property
     def ledger(self) -> dict[str, Energy]:
         """What the system receives from outside, recorded along a run, by name."""
-        return {}
-
-    def _casimirs(self) -> dict[str, Energy]:
-        """Casimirs of the Poisson structure worth recording."""
         return {}
 
     # -- checks ---------------------------------------------------------------------------------------------------

@@ -57,9 +57,8 @@ class ChartSystem(System):
         if system.dissipation is None:
             self.dissipation = None
             return
-        known = {id(L): self.pulled(L) for part in system.dissipation.terms for L in part.preserve}
         parts = tuple(
-            _Force(part, tuple(known[id(L)] for L in part.preserve), system, coordinates, place)
+            _Force(part, tuple(map(self.pulled, part.preserve)), system, coordinates, place)
             for part in system.dissipation.terms
         )
         self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
@@ -130,6 +129,14 @@ class _Force(Dissipation):
     @property
     def entropy_law(self):
         return self.part.entropy_law
+
+    @property
+    def keeps_casimirs(self):
+        return self.part.keeps_casimirs
+
+    @property
+    def symmetric(self):
+        return self.part.symmetric
 
     @property
     def preserve(self):

@@ -191,8 +191,10 @@ def _matrix_residuals(system: System, around: System | None, x, dH, dS):
         found["symmetric"] = relative(size(K - K.T), size(K))
         found["kernel"] = relative(size(K @ dH), size(K) * size(dH))
         found["friction"] = K
-        for L in system.preserved:
-            dL = L.gradient(x)
-            residual = relative(size(K @ dL), size(K) * size(dL))
-            found["preserved"] = jnp.maximum(found.get("preserved", 0.0), residual)
+        for part in dissipation.terms:  # each keeps its own
+            own = system.friction_matrix(x, part) if part.preserve else K
+            for L in part.preserve:
+                dL = L.gradient(x)
+                residual = relative(size(own @ dL), size(own) * size(dL))
+                found["preserved"] = jnp.maximum(found.get("preserved", 0.0), residual)
     return found, size(tensor) * size(dH)

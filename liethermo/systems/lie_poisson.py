@@ -7,6 +7,7 @@ import math
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -77,8 +78,12 @@ class LiePoissonSystem(System):
         ad = self.algebra.ad(dH)
         return ad.T @ (x + self.dissipation.momentum(dH, ad @ dS))
 
-    def _casimirs(self) -> dict[str, Energy]:
+    def casimirs(self) -> dict[str, Energy]:
         return _recorded_casimirs(self.algebra)
+
+    @property
+    def has_all_casimirs(self) -> bool:
+        return _spans_all_casimirs(self.algebra)
 
 
 def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
@@ -111,8 +116,21 @@ def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
         with warnings.catch_warnings():  # an algebra without polynomial Casimirs has simply none to record
             warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
             casimirs = algebra.casimirs(degree)
-        for i, casimir in enumerate(casimirs):
-            text = str(casimir)
-            name = text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}"
-            found[name] = as_energy(casimir, "a Casimir")
+        with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
+            for i, casimir in enumerate(casimirs):
+                text = str(casimir)
+                name = text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}"
+                found[name] = as_energy(casimir, "a Casimir")
     return found
+
+
+@functools.cache
+def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
+    """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
+    found, x = _recorded_casimirs(algebra).values(), np.random.default_rng(0).standard_normal(algebra.dim)
+    if not found or len(found) < algebra.casimir_count():
+        return False
+    with jax.ensure_compile_time_eval():
+        gradients = np.array([C.gradient(jnp.asarray(x)) for C in found])
+    lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(gradients / lengths, tol=1e-9)) == algebra.casimir_count()
