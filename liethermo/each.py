@@ -91,16 +91,20 @@ class Each(Energy):
         return self._spread(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def one(start, low, step, points, slopes, further, *a):
-            mine = path._replace(start=start, low=low, step=step, points=points, slopes=slopes, further=further)
+        def one(start, low, step, points, slopes, further, symmetries, *a):
+            mine = path._replace(
+                start=start, low=low, step=step, points=points, slopes=slopes, further=further, symmetries=symmetries
+            )
             return self._at(a).stage_gradients(scheme, mine)
 
         n = path.start.shape[0]
         ends = map(self._gathered, (path.start, jnp.zeros_like(path.start) + path.low, path.step))
         stages = map(self._gathered, (path.points, path.slopes))
         further = None if path.further is None else tuple(map(self._gathered, path.further))
-        axes = (0, 0, 0, 1, 1, None if further is None else 1, *(0 for _ in self.parameters))
-        found = jax.vmap(one, in_axes=axes, out_axes=1)(*ends, *stages, further, *self.parameters)
+        symmetries = None if path.symmetries is None else self._gathered(path.symmetries)
+        optional = (None if further is None else 1, None if symmetries is None else 2)
+        axes = (0, 0, 0, 1, 1, *optional, *(0 for _ in self.parameters))
+        found = jax.vmap(one, in_axes=axes, out_axes=1)(*ends, *stages, further, symmetries, *self.parameters)
         return jax.vmap(lambda g: self._spread(g, n))(found)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:

@@ -21,7 +21,7 @@ from .engine import array, compiled
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .family import Family, common_size
-from .integrators import MetriplecticMidpoint, OneStepMethod
+from .integrators import DEFAULT_METHOD, OneStepMethod
 from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
 from .solution import Laws
 from .systems import AttitudeSystem, System
@@ -191,9 +191,9 @@ def ensemble(
         If an argument cannot be used; the parameters with the smallest and largest values are tried one by one.
     """
     started = time.perf_counter()
-    method = MetriplecticMidpoint() if method is None else method
+    method = DEFAULT_METHOD if method is None else method
     if not isinstance(method, OneStepMethod):
-        raise InputError(f"the method must be an integrator such as lt.MetriplecticMidpoint(), not {method!r}")
+        raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     family = Family.of(system, parameters)

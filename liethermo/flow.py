@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from manifolds import matrix_functions
 
 from .engine import array
-from .integrators import MetriplecticMidpoint, OneStepMethod
+from .integrators import DEFAULT_METHOD, OneStepMethod
 from .systems import System
 from .timetable import Timetable
 
@@ -36,7 +36,7 @@ def flow(
     step : float
         Steps of one size; the last is shortened to arrive.
     method : OneStepMethod
-        ``MetriplecticMidpoint()`` by default.
+        ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int, optional
         Return every so-manieth state, the first and the last too.
 
@@ -50,7 +50,7 @@ def flow(
     InputError
         If an argument cannot be used.
     """
-    method = (MetriplecticMidpoint() if method is None else method).on(system)
+    method = (DEFAULT_METHOD if method is None else method).on(system)
     table = Timetable(t_span, step, save_every)
     x = system.state(x0)
     k = method.start(system, x)

@@ -25,6 +25,7 @@ import numpy as np
 
 from .energy import Energy
 from .errors import InputError
+from .frames import frame
 
 if TYPE_CHECKING:
     from .integrators.tableaus import Finer
@@ -171,11 +172,15 @@ HARMLESS = 1e-10
 """Largest share of the gradient that a correction made of rounding noise may have."""
 
 
-def stage_gradients(energy: Energy, x, low, h, k, A, b, finer: Finer | None = None) -> jax.Array:
+def stage_gradients(
+    energy: Energy, x, low, h, k, A, b, finer: Finer | None = None, symmetries: jax.Array | None = None
+) -> jax.Array:
     """Discrete gradients at the stages of a collocation method, shape (s, n) [EQUATIONS §4, "Metriplectic Gauss"].
 
-    ``grad H(u_i) + alpha k_i`` at ``u_i = x + h sum_j A_ij k_j``, with the one alpha for which
-    ``h sum_i b_i g_i . k_i = H(x') - H(x)``. It is O(h^{2s}) for Gauss nodes, and 0 for quadratic terms.
+    ``grad H(u_i) + alpha d_i`` at ``u_i = x + h sum_j A_ij k_j``, with the one alpha for which
+    ``h sum_i b_i g_i . k_i = H(x') - H(x)``. It is O(h^{2s}) for Gauss nodes, and 0 for quadratic terms. The direction
+    d_i is k_i, less its components in the directions of symmetries of H: the discrete gradient has none of these, as
+    grad H has none [Gonzalez 1996, "equivariant"].
 
     Parameters
     ----------
@@ -187,10 +192,12 @@ def stage_gradients(energy: Energy, x, low, h, k, A, b, finer: Finer | None = No
         A better quadrature along the collocation polynomial, for methods of few stages. An energy with a part that
         varies on lengths far below those seen in its gradient drifts without it, at steps where the defect is shut out:
         two nodes missed 5e-15 of H in each of a hundred steps.
+    symmetries : array, shape (s, r, n), optional
+        Vectors at the stages along which H does not change.
     """
     u = x + (low + h * (A @ k))
     further = None if finer is None else (x + (low + h * (finer.A @ k)), finer.slopes @ k)
-    path = Path(x, low, h * (b @ k), u, k, further, h, b, finer)
+    path = Path(x, low, h * (b @ k), u, k, further, symmetries, h, b, finer)
     parts = [term.stage_gradients(_stage_gradients, path) for term in energy.terms]
     return sum(parts[1:], parts[0])
 
@@ -206,6 +213,8 @@ class Path(NamedTuple):
         At the stages.
     further : two arrays, shape (r, m), or None
         Points and slopes at the nodes of ``finer``.
+    symmetries : array, shape (s, r, m), or None
+        Vectors at the stages that corrections are to be orthogonal to.
     """
 
     start: jax.Array
@@ -214,6 +223,7 @@ class Path(NamedTuple):
     points: jax.Array
     slopes: jax.Array
     further: tuple[jax.Array, jax.Array] | None
+    symmetries: jax.Array | None
     h: jax.Array
     b: np.ndarray
     finer: Finer | None
@@ -223,6 +233,9 @@ class Path(NamedTuple):
 
         def seen(x, d):
             return jax.jvp(coordinates, (x,), (d,))
+
+        def turned(x, directions):
+            return jax.vmap(lambda d: seen(x, d)[1])(directions)
 
         def back(covectors):
             return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
@@ -236,6 +249,7 @@ class Path(NamedTuple):
             points=points,
             slopes=slopes,
             further=None if self.further is None else jax.vmap(seen)(*self.further),
+            symmetries=None if self.symmetries is None else jax.vmap(turned)(self.points, self.symmetries),
         )
         return path, back
 
@@ -244,30 +258,70 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     """Of one term; ``along`` says which components of the slopes to correct along, by default all."""
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
-    x, low, d, k, h, b = path.start, path.low, path.step, path.slopes, path.h, path.b
-    new, new_low = compensated(x, low + d)
-    further = () if path.further is None else (path.further[0],)
-    # one map for all points, as one is what a compiler has to work on
-    found = jax.vmap(term.gradient)(jnp.concatenate([path.points, *further, jnp.stack([x, new])]))
-    gradients, between, ends = found[: len(k)], found[len(k) : -2], found[-2:]
-    mean, smooth = b @ gradients, jnp.zeros(())
-    spread = jnp.max(jnp.linalg.norm(gradients - mean, axis=1))
+    x, low, k, h, b = path.start, path.low, path.slopes, path.h, path.b
+    change = Change.of(term, x, low, path.step, [path.points, *(() if path.further is None else path.further[:1])])
+    gradients, between = change.gradients[: len(k)], change.gradients[len(k) :]
+    smooth, spread = jnp.zeros(()), jnp.zeros(())
     if path.finer is not None and path.further is not None:
         rates = jnp.sum(between * path.further[1], axis=1)
         smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
-        spread = jnp.maximum(spread, jnp.max(jnp.linalg.norm(between - mean, axis=1)))
-    before, after = _values(term, jnp.stack([x, new]))
-    # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
-    difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
-    defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
-    direction = k if along is None else along * k
+        spread = jnp.max(jnp.linalg.norm(between - b @ gradients, axis=1))
+    moving, symmetries = k, path.symmetries
+    if along is not None:
+        moving, symmetries = along * k, None if symmetries is None else along * symmetries
+    direction = moving
+    if symmetries is not None:
+        direction = jax.vmap(lambda d, vectors: frame(list(vectors)).off(d))(moving, symmetries)
+    return corrected(change, gradients, k, (moving, direction), h, b, smooth, spread)
+
+
+class Change(NamedTuple):
+    """What a function changes by in a step, from its values; and its gradients at some points.
+
+    Attributes
+    ----------
+    difference : array, shape ()
+    noise : array, shape ()
+        Its rounding error.
+    gradients : array, shape (points, n)
+    """
+
+    difference: jax.Array
+    noise: jax.Array
+    gradients: jax.Array
+
+    @classmethod
+    def of(cls, term: Energy, x, low, d, points: list[jax.Array]) -> Change:
+        """Of the step from x + low to x + low + d."""
+        new, new_low = compensated(x, low + d)
+        # one map for all points, as one is what a compiler has to work on
+        found = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
+        gradients, ends = found[:-2], found[-2:]
+        before, after = _values(term, jnp.stack([x, new]))
+        # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
+        difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
+        slope = jnp.max(jnp.linalg.norm(ends, axis=1))
+        noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
+        return cls(difference, noise, gradients)
+
+
+def corrected(change: Change, gradients, k, directions, h, b, smooth=0.0, spread=0.0) -> jax.Array:
+    """``gradients + alpha d``, shape (s, n), with ``h sum_i b_i (.)_i . k_i`` the change of the function.
+
+    ``directions`` are those of k that a correction may have, and d, what symmetries leave of them: ``d . k = |d|^2``.
+    Near a relative equilibrium that is little, and noise must not be divided by it. ``smooth`` is what a better
+    quadrature adds to that of the gradients, ``spread`` how far gradients between the stages are from the mean of those
+    at them.
+    """
+    moving, direction = directions
+    mean = b @ gradients
+    slope, spread = jnp.linalg.norm(mean), jnp.maximum(spread, jnp.max(jnp.linalg.norm(gradients - mean, axis=1)))
+    defect = change.difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     square = jnp.dot(b, jnp.sum(direction * direction, axis=1))
-    slope = jnp.linalg.norm(mean)
-    noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
-    harmless = 1.0 - _gate(_divide(defect, h * jnp.sqrt(square)), HARMLESS * slope)
-    opened = jnp.maximum(_gate(defect, noise), harmless * _gate(spread, SPREAD * slope))
-    alpha = _divide(smooth + _let_through(defect, opened), h * square)
-    return gradients + alpha * direction
+    share = _divide(jnp.sqrt(square), jnp.sqrt(jnp.dot(b, jnp.sum(moving * moving, axis=1))))
+    harmless = 1.0 - _gate(_divide(defect, h * jnp.sqrt(square)), HARMLESS * slope * share)
+    opened = jnp.maximum(_gate(defect, change.noise), harmless * _gate(spread, SPREAD * slope))
+    return gradients + _divide(smooth + _let_through(defect, opened), h * square) * direction
 
 
 def compensated(x, d) -> tuple[jax.Array, jax.Array]:

@@ -404,7 +404,8 @@ def prepared(system: System, method) -> tuple[dict, Laws]:
 
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
-    conserved = tuple(name for name, (J, kept) in invariants.items() if kept and _keeps(method, J))
+    keeps = method.keeps if isinstance(method, OneStepMethod) else lambda system, name: False
+    conserved = tuple(name for name, (_, kept) in invariants.items() if kept and keeps(system, name))
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
@@ -413,11 +414,6 @@ def laws_of(system: System, method, invariants) -> Laws:
 
 def _value(function, x):
     return function.value(x)
-
-
-def _keeps(method, function) -> bool:
-    """Whether the method keeps a function exactly that the system conserves."""
-    return function.is_quadratic and "quadratic_invariants" in method.preserves
 
 
 def _stats(state: array.State) -> Stats:

@@ -33,7 +33,7 @@ from typing_extensions import TypedDict
 
 from . import models
 from .errors import AxiomError, FileError, InputError, SpecError
-from .integrators import METHODS
+from .integrators import DEFAULT_METHOD, METHODS
 from .systems import System
 
 FIGURES = ("momentum_sphere", "laws")
@@ -96,7 +96,7 @@ class Run(_Section):
 
 class _Method(BaseModel):
     model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
-    name: Annotated[str, _one_of(METHODS)] = "MetriplecticMidpoint"
+    name: Annotated[str, _one_of(METHODS)] | None = None  # options without a name are those of the midpoint scheme
 
 
 class Outputs(_Section):
@@ -245,11 +245,14 @@ def _imported(target: str, folder: Path) -> Callable[..., System]:
 
 
 def _integrator(method: _Method, problems: list[str]):
-    options = _arguments("method", METHODS[method.name], method.model_extra or {}, problems)
+    if method.name is None and not method.model_extra:
+        return DEFAULT_METHOD
+    kind = METHODS[method.name or "MetriplecticMidpoint"]
+    options = _arguments("method", kind, method.model_extra or {}, problems)
     if options is None:
         return None
     try:
-        return METHODS[method.name](**options)
+        return kind(**options)
     except (TypeError, ValueError) as error:
         listed = set(re.findall(r"\w+", str(error))).difference(map(str, options.values()))  # what the message allows
         hints = [_suggestion(value, listed) for value in options.values() if isinstance(value, str)]

@@ -18,7 +18,7 @@ import numpy as np
 from .engine import array
 from .engine.interpret import evaluator
 from .errors import FunctionError, InputError
-from .integrators import MetriplecticMidpoint, OneStepMethod
+from .integrators import DEFAULT_METHOD, OneStepMethod
 from .integrators.tableaus import integrated
 from .systems import System
 
@@ -353,14 +353,14 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     x0 : array, shape (n,)
     rtol : float
     method : OneStepMethod
-        ``MetriplecticMidpoint()`` by default.
+        ``MetriplecticGauss(1)`` by default, of order 2.
 
     Raises
     ------
     InputError
         Where nothing moves at x0, so that any step will do.
     """
-    method = (MetriplecticMidpoint() if method is None else method).on(system)
+    method = (DEFAULT_METHOD if method is None else method).on(system)
     x = np.asarray(system.state(x0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from .errors import ConvergenceError, InputError, NonFiniteError
-from .integrators import MetriplecticMidpoint, OneStepMethod, Reference
+from .integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from .progress import Progress
 from .running import NO_GROUP, Run, as_run, check_choice, prepared
 from .solution import Solution
@@ -44,7 +44,7 @@ def integrate(
     step : float or Adaptive
         Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
-        ``MetriplecticMidpoint()`` by default.
+        ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int
         Keep every so-manieth state, and the last; the laws are followed at every step all the same.
     save_at : array of times, optional
@@ -84,9 +84,9 @@ def integrate(
     ConvergenceError, NonFiniteError
         If a step fails and ``on_failure`` is "raise".
     """
-    method = MetriplecticMidpoint() if method is None else method
+    method = DEFAULT_METHOD if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
-        raise InputError(f"the method must be an integrator such as lt.MetriplecticMidpoint(), not {method!r}")
+        raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
     if not isinstance(system, System):
         raise InputError(
             f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"

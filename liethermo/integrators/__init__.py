@@ -12,12 +12,16 @@ from .variational import VariationalIntegrator
 from .variational_gauss import VariationalGauss
 from .variational_lie import LieVariational
 
+DEFAULT_METHOD = MetriplecticGauss(1)
+"""Of order 2; where energy and entropy are quadratic it is the midpoint scheme."""
+
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
     "Reference": Reference
 }
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""
 
 __all__ = [
+    "DEFAULT_METHOD",
     "METHODS",
     "DiscreteHerglotz",
     "DiscreteSystem",

@@ -32,8 +32,9 @@ class OneStepMethod(eqx.Module):
     order : int
     preserves : frozenset of str
         Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"``
-        (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"quadratic_invariants"`` and
-        ``"linear_invariants"`` (of the system).
+        (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"casimirs"`` (those known to be
+        conserved), ``"quadratic_invariants"`` (all quadratic first integrals) and ``"quadratic_casimirs"`` (those that
+        the dissipation keeps by construction; where H is quadratic, all quadratic first integrals).
     stages : int
     """
 
@@ -88,6 +89,13 @@ class OneStepMethod(eqx.Module):
 
     def check(self, system: System) -> None:
         """Raise InputError where the method cannot be used on a system; called when a run starts."""
+
+    def keeps(self, system: System, name: str) -> bool:
+        """Whether it keeps, to rounding, the function of the system with this name, which the system conserves."""
+        if "quadratic_casimirs" not in self.preserves or not system.functions()[name].is_quadratic:
+            return False
+        by_force = system.dissipation is None or system.dissipation.keeps_casimirs
+        return system.energy.is_quadratic or (by_force and name in system.casimirs())
 
     def explain(self, system: System, x, k, h) -> str:
         """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""

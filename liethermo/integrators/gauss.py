@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,30 +12,43 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Dissipation
-from ..energy import Energy, as_energy, check_scalar, on_points
+from ..dissipation import Dissipation, portions
+from ..energy import Energy, as_energy, check_scalar, on_points, recognised
 from ..engine.interpret import at_points
 from ..errors import InputError
+from ..frames import frame
 from ..gradients import stage_gradients
 from ..systems import ChartSystem, System
 from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register
 from .charts import in_charts
+from .composed_entropy import composed_gradients
 from .tableaus import finer, gauss
 
 
 class MetriplecticGauss(GaussMethod):
-    """``k_i = Pi_d gH_i + K_d gS_i`` at the Gauss nodes ``u_i = x + h sum_j A_ij k_j``, ``x' = x + h sum_i b_i k_i``.
+    """``k_i = Pi(u_i) gH_i + K_d gS_i`` at Gauss nodes ``u_i = x + h sum_j A_ij k_j``; ``x' = x + h sum_i b_i k_i``.
 
-    The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha k_i``, such that
-    ``h sum b_i gH_i . k_i = H(x') - H(x)``; likewise gS and those of ``preserve``. ``Pi_d = Q Pi(u_i) Q``, Q the
-    projector off gS_i and the preserved gC_i; K_d is the dissipation rebuilt with gH_i and gC_i in its kernel. Hence
+    The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
+    ``h sum_i b_i gH_i . k_i = H(x') - H(x)``. Likewise gS, and gC of every first integral C that is held: the Casimirs
+    and momentum maps that the system is known to conserve, and those of ``preserve``. K_d is the dissipation rebuilt
+    with gH_i and the gC_i in its kernel. Hence
 
         H(x') = H(x),    S(x') - S(x) = h sum b_i gS_i . K_d gS_i >= 0,    C(x') = C(x),
 
-    for every smooth H, S and C and every step. Order 2s: alpha is O(h^{2s}) [Hairer, Lubich & Wanner, II.1]. Quadratic
-    Casimirs and linear invariants are kept by collocation itself. One implicit equation of s times the size of the
-    state; an iteration costs s gradients of H and S; of each that is not quadratic two values and a gradient at the end
-    of the step besides, and s + 1 gradients between the nodes where s is 1 or 2.
+    for every smooth H, S and C and every step. Order 2s: alpha is O(h^{2s}) [Hairer, Lubich & Wanner, II.1].
+
+    The motion ``Pi gH`` has to keep S and C too. How it does depends on what they are:
+
+    - A quadratic Casimir: collocation keeps it. So the motion keeps an entropy that is a function of such; see
+      :func:`composed_gradients`.
+    - A quadratic momentum map J: d_i is k_i less its component along the symmetry ``Pi grad J``, so that gH_i is
+      invariant as grad H is [Gonzalez 1996].
+    - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
+    - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
+
+    One implicit equation of s times the size of the state. An iteration costs s gradients of H and S; for each that is
+    not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
+    s is 1 or 2.
 
     On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
     same laws. See :class:`InCharts`.
@@ -45,96 +59,151 @@ class MetriplecticGauss(GaussMethod):
         1 to 8; the order is twice that. One stage is the midpoint scheme with the Gonzalez gradient, the entropy law
         made exact too.
     preserve : sequence of functions or energies
-        Further functions to hold exactly. The system has to conserve them (checked when a run starts).
+        Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
     retraction : str or manifolds.Retraction, optional
         On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
+    held : tuple of str
+        Names of the functions of the system to hold. A run fills it in with all that the system conserves.
     """
 
     functions: tuple[Energy, ...]
     retraction: str | mf.Retraction | None = eqx.field(static=True)
+    held: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, stages: int = 2, preserve: Sequence = (), retraction: str | mf.Retraction | None = None):
+    def __init__(
+        self,
+        stages: int = 2,
+        preserve: Sequence = (),
+        retraction: str | mf.Retraction | None = None,
+        held: tuple[str, ...] = (),
+    ):
         self.number = checked_stages(stages)
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
         self.retraction = retraction
+        self.held = held
 
     def on(self, system: System) -> OneStepMethod:
-        method = self._with(lambda C: on_points(C, system.space))
+        functions, casimirs = system.functions(), system.casimirs()
+        held = [name for name in system.first_integrals() if name in casimirs or functions[name].is_quadratic]
+        method = self._with(lambda C: _seen_on(system, C), tuple(sorted(held)))
         return in_charts(method, system, self.retraction, "exp")
 
-    def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled)
+    def keeps(self, system: System, name: str) -> bool:
+        return name in self.held
 
-    def _with(self, change: Callable) -> MetriplecticGauss:
-        """The method with its preserved functions changed."""
-        if not self.functions:
-            return self
-        return eqx.tree_at(lambda m: m.functions, self, tuple(map(change, self.functions)))
+    def pulled(self, local: ChartSystem) -> OneStepMethod:
+        return self._with(local.pulled, self.held)
+
+    def _with(self, change: Callable, held: tuple[str, ...]) -> MetriplecticGauss:
+        """The method with its preserved functions changed, holding these of the system."""
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
 
     @property
     def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law", "quadratic_invariants", "linear_invariants"})
+        return frozenset({"energy", "entropy_law", "casimirs", "quadratic_invariants"})
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system conserves what is to be preserved, and room is left for it to move."""
-        for C in self.functions:
-            check_scalar(C, system.dim, "a preserved function")
         for C, kept in zip(self.functions, system.conserves(self.functions), strict=True):
             if not kept:
                 raise InputError(
                     f"the system does not conserve the preserved function {_name(C)}: holding it would change the "
                     "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"
                 )
-        held = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
-        points = system.samples(8)
-        ranks = np.linalg.matrix_rank(np.nan_to_num(at_points(_gradients, tuple(held), points)), tol=1e-9)
-        if self.functions and ranks.max() >= system.dim:
+        if not self.functions:
+            return
+        functions = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
+        gradients = np.nan_to_num(at_points(_gradients, tuple(functions), system.samples(8)))
+        if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
                 f"move in {system.dim} dimensions"
             )
 
+    # -- the stage equations ------------------------------------------------------------------------------------------
+
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         A, b, _ = gauss(self.number)
-
-        def gradients(energy):
-            return stage_gradients(energy, x, low, h, k, A, b, finer(self.number))
-
         u = x + (low + h * (A @ k))
-        dH = gradients(system.energy)
-        dS = jnp.zeros_like(k) if system.entropy is None else gradients(system.entropy)
-        dL, dC = (tuple(map(gradients, functions)) for functions in (system.preserved, self.functions))
-        return jax.vmap(lambda *stage: self._slope(system, *stage))(u, dH, dS, dL, dC)
 
-    def _slope(self, system: System, u, dH, dS, dL, dC) -> jax.Array:
-        """``Pi_d dH + K_d dS`` at one stage."""
-        system = system.here(u)
-        entropy = None if system.entropy is None or system.entropy.is_quadratic else system.entropy
-        if entropy is None and not dC:  # Pi dS = 0 as it stands
-            return system.field(u, dH, dS, dL)
-        held = list(zip(dC, (C.gradient(u) for C in self.functions), strict=True))
-        off = _projector(held if entropy is None else [(dS, entropy.gradient(u)), *held])
-        motion = off(system.poisson.sharp(u, off(dH)))
-        for part in () if system.dissipation is None else system.dissipation.terms:
-            motion = motion + self._force(part, system, u, dH, dS, dL, held)
-        return motion
+        def at_stages(C: Energy) -> Gradients:
+            plain = jax.vmap(C.gradient)(u)
+            if C.is_quadratic:
+                return Gradients(plain, plain)
+            return Gradients(stage_gradients(C, x, low, h, k, A, b, finer(self.number)), plain)
 
-    @staticmethod
-    def _force(part: Dissipation, system: System, u, dH, dS, dL, held) -> jax.Array:
-        own = tuple(dL[i] for C in part.preserve for i, L in enumerate(system.preserved) if L is C)
-        if part.energy_law != "conserved":  # it lowers the energy and has to keep the entropy
-            entropy = [] if system.entropy is None else [(dS, system.entropy.gradient(u))]
-            off = _projector([*entropy, *held])
-            return off(part.force(system, u, off(dH), dS, own))
-        if not held:
-            return part.force(system, u, dH, dS, own)
-        off = _projector([(dH, system.energy.gradient(u)), *held])
-        return off(part.force(system, u, dH, off(dS), own))
+        S, parts, dH = system.entropy, _made_of(system), self.velocities(system, x, low, h, k)
+        known = {name: at_stages(C) for name, C in (self._kept(system) | parts | system.preserved_by_name()).items()}
+        if S is None:
+            dS = jnp.zeros_like(k)
+        elif ENTROPY in parts:
+            dS = known[ENTROPY].discrete
+        else:
+            discrete = jnp.stack([known[name].discrete for name in parts])
+            dS = composed_gradients(S, list(parts.values()), discrete, x, low, h, k, A, b)
+        return jax.vmap(lambda *stage: self._slope(system, *stage))(u, dH, dS, known)
 
     def velocities(self, system: System, x, low, h, k) -> jax.Array:
         A, b, _ = gauss(self.number)
-        return stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number))
+        symmetries = self._symmetries(system, x + (low + h * (A @ k)))
+        return stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number), symmetries)
+
+    def _slope(self, system: System, u, dH, dS, known: dict[str, Gradients]) -> jax.Array:
+        """``Pi_d dH + K_d dS`` at one stage."""
+        system = system.here(u)
+        motion = self._motion(system, u, dH, known)
+        names = tuple(system.preserved_by_name())
+        for part, own in () if system.dissipation is None else portions(system.dissipation, names):
+            motion = motion + self._force(part, own, system, u, dH, dS, known)
+        return motion
+
+    def _motion(self, system: System, u, dH, known: dict[str, Gradients]) -> jax.Array:
+        """``Pi dH``, less what would change S and what is held."""
+        functions = self._kept(system) | _made_of(system)
+        if all(C.is_quadratic for C in functions.values()):
+            return system.poisson.sharp(u, dH)
+        gradients = [known[name] for name in functions]
+        if functions.keys() <= {ENTROPY, *system.casimirs()}:
+            off = _projector(gradients)
+            return off(system.poisson.sharp(u, off(dH)))
+        return _projector([Gradients(dH, system.energy.gradient(u)), *gradients])(system.poisson.sharp(u, dH))
+
+    def _force(self, part: Dissipation, own: tuple[str, ...], system: System, u, dH, dS, known) -> jax.Array:
+        """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions."""
+        dL, lowers = tuple(known[name].discrete for name in own), part.energy_law != "conserved"
+        functions = self._kept(system) | (_made_of(system) if lowers else {})
+        exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
+        casimirs = {ENTROPY, *system.casimirs()} if part.keeps_casimirs else set()
+
+        def safe(name: str, C: Energy) -> bool:  # kept by construction
+            return name in own or (C.is_quadratic and (exact or name in casimirs))
+
+        if not part.symmetric or all(safe(*function) for function in functions.items()):
+            return part.force(system, u, dH, dS, dL)
+        gradients = [known[name] for name in functions]
+        if lowers:
+            off = _projector(gradients)
+            return off(part.force(system, u, off(dH), dS, dL))
+        off = _projector([Gradients(dH, system.energy.gradient(u)), *gradients])
+        return off(part.force(system, u, dH, off(dS), dL))
+
+    def _kept(self, system: System) -> dict[str, Energy]:
+        """What is held, by name."""
+        functions = system.functions()
+        given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
+        return {name: functions[name] for name in self.held} | given
+
+    def _symmetries(self, system: System, u) -> jax.Array | None:
+        """The directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
+        if system.energy.is_quadratic:
+            return None
+        casimirs = system.casimirs()
+        maps = [J for name, J in self._kept(system).items() if J.is_quadratic and name not in casimirs]
+        if not maps:
+            return None
+        sharp = system.poisson.sharp
+        return jax.vmap(lambda point: jnp.stack([sharp(point, J.gradient(point)) for J in maps]))(u)
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)
@@ -144,41 +213,43 @@ class MetriplecticGauss(GaussMethod):
         return f"MetriplecticGauss(stages={self.number}{kept})"
 
 
+class Gradients(NamedTuple):
+    """Of a function at the stages, shape (s, n), or at one: discrete ones, and those that they tend to."""
+
+    discrete: jax.Array
+    plain: jax.Array
+
+
+ENTROPY = "the entropy"
+
+
+def _made_of(system: System) -> dict[str, Energy]:
+    """What the entropy is a function of, by name: Casimirs where all are known and that helps, itself otherwise."""
+    if system.entropy is None:
+        return {}
+    if system.entropy.is_quadratic or not system.has_all_casimirs:
+        return {ENTROPY: system.entropy}
+    return system.casimirs()
+
+
+def _projector(gradients: list[Gradients]) -> Callable:
+    """The orthogonal projector off discrete gradients."""
+    return frame([g.discrete for g in gradients], like=[g.plain for g in gradients]).off
+
+
+def _seen_on(system: System, C: Energy) -> Energy:
+    """A preserved function as one of the state vectors of a system."""
+    C = on_points(C, system.space)
+    check_scalar(C, system.dim, "a preserved function")
+    return recognised(C, system.dim) if system.space is None else C
+
+
 def _gradients(functions: tuple[Energy, ...], x):
     return jnp.stack([f.gradient(x) for f in functions])
 
 
 def _name(function: Energy) -> str:
     return getattr(getattr(function, "function", None), "__name__", str(function))
-
-
-def _projector(gradients):
-    """The orthogonal projector off the span of discrete gradients, each given with the gradient at the stage itself.
-
-    One that vanishes or depends on those before it is left out, and the gradients at the stage tell which: the discrete
-    ones of C and exp(C) differ by a multiple of the slope, and to project off both would stop the motion.
-    """
-
-    def without(frame, v):
-        for _ in range(2):  # the second pass removes what rounding left of the first
-            for e in frame:
-                v = v - jnp.dot(e, v) * e
-        return v
-
-    frame: list[jax.Array] = []
-    plain_frame: list[jax.Array] = []
-    for gradient, plain in gradients:
-        rest, plain_rest = without(frame, gradient), without(plain_frame, plain)
-        square, plain_square = jnp.dot(rest, rest), jnp.dot(plain_rest, plain_rest)
-        independent = (plain_square > 1e-24 * jnp.dot(plain, plain)) & (plain_square > 0.0) & (square > 0.0)
-        frame.append(_unit(rest, square, independent))
-        plain_frame.append(_unit(plain_rest, plain_square, independent))
-    return lambda v: without(frame, v)
-
-
-def _unit(v, square, usable):
-    """``v / |v|``, or 0 where that cannot be used."""
-    return v * jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

@@ -18,8 +18,8 @@ class MetriplecticMidpoint(OneStepMethod):
 
     K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly: for every H,
     step and dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
-    (``MetriplecticGauss`` removes that restriction). Quadratic Casimirs of a Lie-Poisson bracket, and all linear
-    invariants, are kept exactly; others drift at O(h^2).
+    (``MetriplecticGauss`` removes that restriction). Quadratic Casimirs are kept exactly where the dissipation keeps
+    them by construction; where H is quadratic all quadratic first integrals are. Others drift at O(h^2).
 
     Order 2, except 1 with ``"coordinate_increment"`` as printed in the paper, which is not symmetric. One implicit
     equation of the size of the state per step; a general energy costs two values and three gradients an iteration with
@@ -56,7 +56,8 @@ class MetriplecticMidpoint(OneStepMethod):
 
     @property
     def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law_quadratic", "quadratic_invariants", "linear_invariants"})
+        kept = {"energy", "entropy_law_quadratic"}
+        return frozenset(kept | {"quadratic_casimirs"} if self.order == 2 else kept)
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         d = h * k[0]

@@ -55,6 +55,9 @@ class WithAttitude(OneStepMethod):
     def preserves(self) -> frozenset[str]:
         return self.method.preserves
 
+    def keeps(self, system, name: str) -> bool:
+        return self.method.keeps(system.body, name)
+
     def check(self, system) -> None:
         self.method.check(system.body)
 

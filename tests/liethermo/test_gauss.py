@@ -149,14 +149,12 @@ def test_rest_stays_at_rest():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="stages leave the level set by O(h^3), where friction acts: S must grow, which near its minimum it only can "
-    "by a step of the square root of that, and the stage equations have no solution near the free motion",
-)
 def test_no_entropy_gradient_no_friction():
-    """S = (C - c)^2, started on C = c: the motion is that of the free body."""
+    """S = (C - c)^2, started on C = c: the motion is that of the free body.
+
+    The stages leave the level by O(h^3). With grad S taken there friction would act, S would have to grow, and the
+    stage equations would have no solution near the free motion.
+    """
     x0s = np.random.default_rng(2).standard_normal((16, 3))
     p = special(16)
     p["root"][:] = np.diag([1.0, 1.5, 2.0])
@@ -228,7 +226,7 @@ def test_free_heavy_top():
 
 @pytest.mark.slow
 def test_a_cubic_casimir():
-    """su(3) has one: collocation lets it go, ``preserve`` holds it."""
+    """su(3) has one: the midpoint scheme lets it go, the Gauss methods hold it without being asked."""
     g, x0 = mf.su(3), random_systems.states(mf.su(3), 1)[0]
     cubic = g.casimirs(3)[0]
     system = lt.LiePoissonSystem(g, lambda m: jnp.sum(m**2 * jnp.arange(1.0, 9.0)) / 8 + 0.1 * jnp.sin(m[0] * m[4]))
@@ -237,8 +235,9 @@ def test_a_cubic_casimir():
         values = np.array([float(cubic(x)) for x in run(system, x0, 50, 0.3, method).x])
         return np.abs(values - values[0]).max()
 
+    assert drift(lt.MetriplecticGauss(1)) <= 1e-14
     assert drift(lt.MetriplecticGauss(1, preserve=cubic)) <= 1e-14
-    assert drift(lt.MetriplecticGauss(1)) > 1e-6
+    assert drift(lt.MetriplecticMidpoint()) > 1e-6
 
 
 def body(entropy=lambda m: jnp.log(1.0 + jnp.dot(m, m)), rate=0.3):
@@ -285,7 +284,7 @@ def test_stages_are_one_to_eight(stages):
 def test_what_it_says_of_itself():
     method = lt.MetriplecticGauss(3, preserve=lambda m: m[0])
     assert (method.order, method.stages) == (6, 3)
-    assert {"energy", "entropy_law", "quadratic_invariants", "linear_invariants"} == method.preserves
+    assert {"energy", "entropy_law", "casimirs", "quadratic_invariants"} == method.preserves
     assert str(method) == "MetriplecticGauss(stages=3, preserve=1 functions)"
 
 
@@ -309,10 +308,10 @@ class Collocation(lt.MetriplecticGauss):
 
 
 class WithoutProjector(lt.MetriplecticGauss):
-    """Control: without the projector Q, so that the motion changes the entropy."""
+    """Control: without the projector, so that the motion changes the entropy."""
 
-    def _slope(self, system, u, dH, dS, dL, dC):
-        return system.field(u, dH, dS, dL)
+    def _motion(self, system, u, dH, known):
+        return system.poisson.sharp(u, dH)
 
 
 @pytest.mark.slow

@@ -1,0 +1,83 @@
+"""Orthonormal frames of a few gradients, some of which may vanish or depend on the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+DEPENDENT = 1e-24
+"""Square of what is left of a vector, relative to its own, below which it depends on those before it."""
+
+
+class Frame(NamedTuple):
+    """Orthonormal vectors that span what given ones span; zero in the place of one that depends on those before it.
+
+    Attributes
+    ----------
+    units : list of array, shape (n,)
+    combinations : list of array, shape (m,)
+        Unit j is ``sum_l combinations[j][l] vectors[l]``.
+    """
+
+    units: list[jax.Array]
+    combinations: list[jax.Array]
+
+    def off(self, v) -> jax.Array:
+        """v less its components in the span."""
+        return self._split(v)[0]
+
+    def coefficients(self, v) -> jax.Array:
+        """Those w for which ``sum_l w_l vectors[l]`` is the component of v in the span, shape (m,)."""
+        return _total(jnp.dot(e, v) * c for e, c in zip(self.units, self.combinations, strict=True))
+
+    def with_products(self, products) -> jax.Array:
+        """The vector in the span whose inner products with the given ones are these, shape (n,)."""
+        return _total(jnp.dot(c, products) * e for e, c in zip(self.units, self.combinations, strict=True))
+
+    def _split(self, v) -> tuple[jax.Array, list[jax.Array]]:
+        taken: list[jax.Array] = [jnp.zeros(())] * len(self.units)
+        for _ in range(2):  # the second pass removes what rounding left of the first
+            for j, e in enumerate(self.units):
+                along = jnp.dot(e, v)
+                v, taken[j] = v - along * e, taken[j] + along
+        return v, taken
+
+
+def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None) -> Frame:
+    """The frame of some vectors by Gram and Schmidt.
+
+    ``like`` are vectors whose dependence decides in the place of the given ones. Discrete gradients of C and exp(C)
+    differ by a multiple of the slope alone, and to project off both would stop the motion: the gradients tell.
+    """
+    found, plain = Frame([], []), Frame([], [])
+    for j, vector in enumerate(vectors):
+        rest, taken = found._split(vector)
+        square = jnp.dot(rest, rest)
+        independent = square > DEPENDENT * jnp.dot(vector, vector)
+        if like is not None:
+            plain_rest = plain.off(like[j])
+            plain_square = jnp.dot(plain_rest, plain_rest)
+            independent = (square > 0.0) & (plain_square > DEPENDENT * jnp.dot(like[j], like[j]))
+            plain.units.append(plain_rest * _inverse_root(plain_square, independent))
+            plain.combinations.append(jnp.zeros(0))
+        scale = _inverse_root(square, independent)
+        combination = jnp.asarray(np.eye(len(vectors))[j])
+        for along, earlier in zip(taken, found.combinations, strict=True):
+            combination = combination - along * earlier
+        found.units.append(rest * scale)
+        found.combinations.append(combination * scale)
+    return found
+
+
+def _inverse_root(square, usable):
+    """``1 / |v|`` from ``|v|^2``, or 0 where that cannot be used; safe to differentiate."""
+    return jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)
+
+
+def _total(parts) -> jax.Array:
+    first, *others = parts
+    return sum(others, first)

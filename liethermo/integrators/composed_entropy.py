@@ -1,0 +1,49 @@
+"""Discrete gradients of an entropy that is a function of known Casimirs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+
+from ..energy import Energy
+from ..frames import Frame, frame
+from ..gradients import Change, corrected
+
+NEWTON = 3
+"""Steps of Newton's method to a level of the Casimirs: the distance is O(h), so what is left is O(h^8)."""
+
+
+def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, low, h, k, A, b) -> jax.Array:
+    """Discrete gradients of ``S = f(C_1, …, C_m)`` at the stages of a collocation method, shape (s, n).
+
+    Each is ``sum_j (f_j(c_i) + alpha r_ij) gC_ij``: a combination of the discrete gradients of the Casimirs at the
+    stage, whose rates are ``r_ij = gC_ij . k_i`` and whose values ``c_i = C(x) + h sum_l A_il r_l`` are collocated as
+    unknowns of their own. The one alpha makes ``h sum_i b_i gS_i . k_i = S(x') - S(x)``. What moves without changing
+    the Casimirs does not meet S, then, and where f has a critical point gS vanishes with f': a stage u_i itself, which
+    is off the level of the Casimirs by O(h^{s+1}), would let friction act there.
+
+    f need not be known: its derivatives at c are the components of grad S in the grad C_j, at a point near x with
+    C = c.
+
+    Parameters
+    ----------
+    gradients : array, shape (m, s, n)
+        The discrete ones of the Casimirs.
+    """
+    rates = jnp.einsum("jin,in->ij", gradients, k)
+
+    def at(y) -> Frame:
+        return frame([C.gradient(y) for C in casimirs])
+
+    def derivatives(change):
+        y = x
+        for _ in range(NEWTON):
+            missed = change - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
+            y = y + at(y).with_products(missed)
+        return at(y).coefficients(S.gradient(y))
+
+    weights = jax.vmap(derivatives)(h * (A @ rates))
+    change = Change.of(S, x, low, h * (b @ k), [])
+    return jnp.einsum("ij,jin->in", corrected(change, weights, rates, (rates, rates), h, b), gradients)
