@@ -1,0 +1,78 @@
+"""A system that is taken apart and put together again is the same system, to the last bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engine.interpret import at_points
+from tests.cases import DISSIPATIONS, build, slow
+from tests.liethermo.closed_systems import ISOLATED
+from tests.liethermo.test_convergence import SYSTEMS
+
+
+def rebuilt(tree):
+    """The same tree from its leaves, copied, so that no object is the one it was."""
+    leaves, structure = jax.tree_util.tree_flatten(tree)
+    return jax.tree_util.tree_unflatten(structure, [jnp.array(a) if isinstance(a, jax.Array) else a for a in leaves])
+
+
+def each_system():
+    yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
+    yield from SYSTEMS.items()
+    yield from ((f"simple closed, {name}", lambda system=system: system) for name, system in ISOLATED.items())
+    for name in lt.models.__all__:
+        yield f"model {name}", getattr(lt.models, name)
+
+
+def _field(system, x):
+    return system.vector_field(x)
+
+
+@pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in each_system()])
+def test_fields_and_laws(make):
+    system = make()
+    again = rebuilt(system)
+    assert again is not system
+    fields = [at_points(_field, s, system.samples(3)) for s in (system, again)]
+    assert np.array_equal(*fields, equal_nan=True)
+    assert (system.energy_law, system.entropy_law) == (again.energy_law, again.entropy_law)
+    assert system.first_integrals() == again.first_integrals()
+    assert list(system.functions()) == list(again.functions())
+
+
+@pytest.mark.parametrize("name", ["sum of frictions", slow("spin with a bath"), slow("warm top")])
+def test_trajectories(name):
+    system = SYSTEMS[name]()
+    x0 = system.samples(1, scale=0.5)[0]
+    runs = [
+        lt.integrate(s, x0, (0.0, 0.5), 0.05, lt.MetriplecticGauss(2), engine="array")
+        for s in (system, rebuilt(system))
+    ]
+    assert np.array_equal(runs[0].x, runs[1].x)
+    assert runs[0].laws == runs[1].laws
+
+
+def test_a_sum_keeps_what_every_part_is_told_to_preserve():
+    """Also where both parts are told so, and after the sum is taken apart."""
+    system = rebuilt(SYSTEMS["sum of frictions"]())
+    length = lambda x: jnp.dot(x[3:], x[3:])  # noqa: E731
+    assert system.conserves((lt.Function(length),)) == [True]
+    assert {"preserved 1", "preserved 2", "mu4**2 + mu5**2 + mu6**2"} == system.first_integrals()
+
+
+def test_a_sum_with_one_part_that_preserves_is_consistent():
+    """The slopes of a step of no length are the vector field, where an entropy is not quadratic."""
+
+    def energy(m):
+        return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4
+
+    L = lambda m: m[0] + 0.3 * m[1] ** 2  # noqa: E731
+    friction = lt.ProjectedMetric(preserve=(L,), normalized=True, rate=0.3) + lt.ProjectedMetric(rate=0.2)
+    system = rebuilt(lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction))
+    method, x = lt.MetriplecticGauss(1).on(system), jnp.array([0.8, 0.5, 0.9])
+    field = system.vector_field(x)
+    slopes = method.slopes(system, x, jnp.zeros(3), 1e-6, field[None])[0]
+    assert np.abs(slopes - field).max() <= 1e-5 * np.abs(field).max()
