@@ -62,9 +62,8 @@ def casimir_count(g: LieAlgebra) -> int:
     ranks = []
     for draw in range(3):
         if exact is None:
-            tensor = g.structure_constants @ random.standard_normal(g.dim)
-            scale = float(np.abs(g.structure_constants).max())
-            ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), scale, g.name))
+            tensor = g._balanced[0] @ random.standard_normal(g.dim)
+            ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), 1.0, g.name))
         else:
             p = prime(draw)
             tensor = (exact.numerator * random.integers(1, p, g.dim) % p).sum(axis=2)
@@ -129,6 +128,8 @@ def _new_casimirs(g: LieAlgebra, degree: int) -> tuple[Polynomial, ...]:
     scaled, squares = _rational_form(g)
     if g.rational_constants is None and scaled.rational_constants is not None:
         return tuple(_rescaled(F, squares) for F in _new_casimirs(scaled, degree))
+    if g.rational_constants is None and (scaled := _balanced_form(g)) != g:
+        return tuple(_weighted(F, g._balanced[1]) for F in _new_casimirs(scaled, degree))
     invariants = _invariants(g, degree)
     lower = [F for d in range(1, degree) for F in _new_casimirs(g, d)]
     products = [dict(F.terms) for F in _products(lower, degree)]
@@ -276,6 +277,18 @@ def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
         return unchanged
 
 
+@lru_cache(maxsize=256)
+def _balanced_form(g: LieAlgebra) -> LieAlgebra:
+    """The algebra in the basis ``factors[a] e_a`` with balanced constants; g itself where it has them already."""
+    constants, factors = g._balanced
+    if np.abs(np.log(factors)).max() < 1e-12:
+        return g
+    try:
+        return LieAlgebra.from_structure_constants(constants, g.name)
+    except JacobiError:  # an axiom that holds to rounding of the largest constants only
+        return g
+
+
 def _odd_primes(n: int) -> set[int]:
     """The primes of odd exponent in n."""
     odd: set[int] = set()
@@ -297,3 +310,10 @@ def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
         weights.append(Fraction(c) * abs(Fraction(c)) * scale)
     roots = [math.copysign(math.sqrt(abs(w / weights[0])), w) for w in weights]
     return Polynomial(F.exponents, roots)
+
+
+def _weighted(F: Polynomial, factors: np.ndarray) -> Polynomial:
+    """F, given in the basis ``factors[a] e_a``, in the basis e_a, with leading coefficient 1."""
+    logarithms = F.exponents @ np.log(factors)
+    weights = np.exp(logarithms - logarithms[0]) / float(F.coefficients[0])
+    return Polynomial(F.exponents, (np.array(F.coefficients, dtype=float) * weights).tolist())

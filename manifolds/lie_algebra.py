@@ -8,6 +8,7 @@ Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cached_property
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from ._arrays import is_traced, real_components, square_matrices
+from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, jacobi_sums, rational_array
 from .errors import (
     AntisymmetryError,
@@ -37,6 +39,10 @@ class LieAlgebra:
 
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
     (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
+
+    What is said about the structure (``is_semisimple``, ``derived_series``, …) holds for the algebra and not for its
+    basis: it is decided on constants that a scaling of the basis elements has made of similar size, where what is below
+    1e-10 counts as rounding.
 
     Attributes
     ----------
@@ -106,6 +112,10 @@ class LieAlgebra:
         if not np.isfinite(matrices).all():
             raise ComponentError("the matrix basis has entries that are not finite")
         dim = len(matrices)
+        sizes = np.linalg.norm(matrices, axis=(1, 2))
+        if not sizes.all():
+            raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
+        matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
         columns = _real_columns(matrices)
         singular = scipy.linalg.svdvals(columns)
         if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
@@ -117,21 +127,23 @@ class LieAlgebra:
             )
         products = np.einsum("aij,bjk->abik", matrices, matrices)
         commutators = _real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
+        commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
         coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
         residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
-        tolerance = 1e-10 * max(1.0, float(np.abs(commutators).max()))
+        tolerance = 1e-10
         if residuals.max() > tolerance:
             a, b = divmod(int(residuals.argmax()), dim)
             raise ClosureError(
-                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g}, "
-                f"tolerance {tolerance:.1g}); add the missing commutators to the basis",
+                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g} "
+                f"for matrices of norm 1, tolerance {tolerance:.1g}); add the missing commutators to the basis",
                 residual=float(residuals.max()),
                 tolerance=tolerance,
                 indices=(a, b),
             )
         constants = coordinates.T.reshape(dim, dim, dim)
         constants = (constants - constants.swapaxes(0, 1)) / 2
-        return cls(_without_rounding(constants, columns, commutators), name=name, basis=matrices)
+        scales = sizes[:, None, None] * sizes[:, None] / sizes
+        return cls(_without_rounding(constants, scales, columns, commutators), name=name, basis=given)
 
     # -- the operations -----------------------------------------------------------------------------------------
 
@@ -170,6 +182,12 @@ class LieAlgebra:
         """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
         return self._killing_form
 
+    def killing_signature(self) -> tuple[int, int, int]:
+        """Numbers of positive, negative and zero eigenvalues of the Killing form, the same in every basis."""
+        eigenvalues = np.linalg.eigvalsh(_killing_form(self._balanced[0]))
+        positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
+        return positive, negative, self.dim - positive - negative
+
     def hat(self, x) -> jax.Array:
         """The matrix ``sum_a x_a e_a``, shape (..., m, m)."""
         return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._known_basis())
@@ -189,7 +207,7 @@ class LieAlgebra:
         components = jnp.einsum("ai,...i->...a", self._left_inverse, flat)
         if not is_traced(flat):
             residual = float(jnp.max(jnp.abs(components @ _real_columns(basis).T - flat), initial=0.0))
-            tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(flat), initial=0.0)))
+            tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(flat), initial=0.0)))
             if not residual <= tolerance:
                 raise LieAlgebraError(
                     f"the matrix is not in {self.name}: it is {residual:.3g} away from its span "
@@ -207,12 +225,11 @@ class LieAlgebra:
 
     def is_semisimple(self) -> bool:
         """Whether the Killing form is nondegenerate (Cartan's criterion)."""
-        eigenvalues = np.abs(self._killing_eigenvalues)
-        return bool(eigenvalues.min() > 1e-10 * max(eigenvalues.max(), 1e-300))
+        return self.killing_signature()[2] == 0
 
     def is_compact_type(self) -> bool:
         """Whether the Killing form is negative definite: the algebra of a compact semisimple group."""
-        return self.is_semisimple() and bool(self._killing_eigenvalues.max() < 0)
+        return self.killing_signature() == (0, self.dim, 0)
 
     def is_solvable(self) -> bool:
         """Whether the derived series ends at zero."""
@@ -224,8 +241,8 @@ class LieAlgebra:
 
     def is_unimodular(self) -> bool:
         """Whether ``tr ad_x = 0`` for every x."""
-        traces = np.einsum("abb->a", self.structure_constants)
-        return bool(np.abs(traces).max() <= AXIOM_TOLERANCE * max(1.0, np.abs(self.structure_constants).max()))
+        traces = np.einsum("abb->a", self._balanced[0])
+        return bool(np.abs(traces).max() <= STRUCTURE_TOLERANCE)
 
     def derived_series(self) -> list[int]:
         """Dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
@@ -304,11 +321,12 @@ class LieAlgebra:
 
     @cached_property
     def _killing_form(self) -> np.ndarray:
-        return _frozen(np.einsum("acd,bdc->ab", self.structure_constants, self.structure_constants, optimize=True))
+        return _frozen(_killing_form(self.structure_constants))
 
     @cached_property
-    def _killing_eigenvalues(self) -> np.ndarray:
-        return np.linalg.eigvalsh(self._killing_form)
+    def _balanced(self) -> tuple[np.ndarray, np.ndarray]:
+        """The constants in a basis scaled by factors, the largest of size 1, and the factors."""
+        return balanced(self.structure_constants)
 
     @cached_property
     def _cartan_involution(self) -> np.ndarray:
@@ -316,14 +334,17 @@ class LieAlgebra:
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
         if self.is_compact_type():
             return _frozen(np.eye(self.dim))
-        return _frozen(_cartan_involution(self.structure_constants, self.name))
+        constants, factors = self._balanced
+        theta = _cartan_involution(constants, self.name) * factors[:, None] / factors
+        snapped = np.asarray(np.round(theta))
+        return _frozen(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
 
     def _series(self, factors: Callable) -> list[int]:
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
             left, right = factors(ideal)
-            products = np.einsum("ia,jb,abc->ijc", left, right, self.structure_constants, optimize=True)
-            ideal = _row_space(products.reshape(-1, self.dim), scale=float(np.abs(self.structure_constants).max()))
+            products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced[0], optimize=True)
+            ideal = _row_space(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims
             dims.append(len(ideal))
@@ -384,7 +405,8 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> Li
     products = np.einsum("aij,bjk->abik", rho, rho)
     defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
     residuals = np.abs(defect).max(axis=(2, 3))
-    tolerance = AXIOM_TOLERANCE * max(1.0, float(np.abs(products).max()))
+    images = float(np.abs(g.structure_constants).max() * np.abs(rho).max())
+    tolerance = AXIOM_TOLERANCE * max(float(np.abs(products).max()), images)
     if residuals.max() > tolerance:
         a, b = np.unravel_index(residuals.argmax(), residuals.shape)
         raise RepresentationError(
@@ -403,7 +425,8 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> Li
     affine[: g.dim, :m, :m] = rho
     affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
     basis: np.ndarray | None = affine
-    if len(_row_space(rho.reshape(g.dim, -1))) < g.dim:
+    sizes = np.linalg.norm(rho, axis=(1, 2))
+    if not sizes.all() or len(_row_space(rho.reshape(g.dim, -1) / sizes[:, None])) < g.dim:
         basis = None
         if g.basis is not None:
             upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
@@ -462,19 +485,23 @@ def _check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None)
         )
 
 
-def _without_rounding(constants: np.ndarray, columns: np.ndarray, commutators: np.ndarray) -> np.ndarray:
-    """The constants snapped to nearby fractions, if the commutators then hold at least as well."""
-    snapped = np.array([_nearest_fraction(c) for c in constants.ravel()]).reshape(constants.shape)
-    defect = np.abs(columns @ snapped.reshape(len(constants) ** 2, -1).T - commutators).max()
-    scale = max(1.0, float(np.abs(commutators).max()))
-    return snapped if defect <= 4 * np.finfo(float).eps * scale else constants
+def _without_rounding(
+    constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
+) -> np.ndarray:
+    """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.
+
+    The constants are those of matrices of norm 1, the ``columns``.
+    """
+    scaled = constants * scales
+    nearest = [_nearest_fraction(c, scale) for c, scale in zip(scaled.ravel(), scales.ravel(), strict=True)]
+    snapped = np.array(nearest).reshape(constants.shape)
+    defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
+    return snapped if defect <= 4 * np.finfo(float).eps else scaled
 
 
-def _nearest_fraction(value: float) -> float:
-    from fractions import Fraction
-
+def _nearest_fraction(value: float, scale: float) -> float:
     nearest = float(Fraction(float(value)).limit_denominator(64))
-    return nearest if abs(nearest - value) < 1e-12 * max(1.0, abs(value)) else float(value)
+    return nearest if abs(nearest - value) < 1e-12 * max(scale, abs(value)) else float(value)
 
 
 def _real_columns(matrices: np.ndarray) -> np.ndarray:
@@ -483,11 +510,14 @@ def _real_columns(matrices: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1).T
 
 
-def _row_space(rows: np.ndarray, scale: float | None = None) -> np.ndarray:
-    """An orthonormal basis of the span of the rows; singular values below 1e-10 of ``scale`` count as zero."""
+def _killing_form(constants: np.ndarray) -> np.ndarray:
+    return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
+
+
+def _row_space(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the span of rows of size 1; what is smaller than STRUCTURE_TOLERANCE is rounding."""
     _, singular, basis = np.linalg.svd(rows, full_matrices=False)
-    scale = float(singular.max(initial=0.0)) if scale is None else scale
-    return basis[singular > 1e-10 * max(scale, 1e-300)]
+    return basis[singular > STRUCTURE_TOLERANCE]
 
 
 def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
@@ -538,8 +568,7 @@ def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
             residual=float(residual),
             tolerance=tolerance,
         )
-    snapped = np.asarray(np.round(theta))
-    return snapped if np.abs(snapped - theta).max() < 1e-10 else theta
+    return theta
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -224,6 +224,21 @@ def test_constants_that_are_not_rational():
     assert h.casimirs(4) == []
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_casimirs_in_a_basis_of_any_scale(scale):
+    """Units of every size, no constant a fraction: the Casimirs of se(3), in the units given."""
+    g, random = mf.se(3), np.random.default_rng(3)
+    units = scale * 10.0 ** random.uniform(-3, 3, g.dim)
+    constants = np.einsum("a,b,abc,c->abc", units, units, g.structure_constants, 1 / units)
+    h = mf.LieAlgebra.from_structure_constants(constants, name="in units")
+    assert h.rational_constants is None
+    assert h.casimir_count() == 2
+    mu = random.standard_normal(g.dim)
+    for F, G in zip(g.casimirs(2), h.casimirs(2), strict=True):
+        first = np.prod(units ** G.exponents[0])
+        assert G(units * mu) == pytest.approx(first * float(F(mu)), rel=1e-12)
+
+
 @pytest.mark.parametrize("g", [mf.se(3), mf.so(4), mf.sl(3), mf.bianchi("VI", h=-0.5)], ids=lambda g: g.name)
 def test_square_roots_are_scaled_away(g):
     random = np.random.default_rng(2)
@@ -240,11 +255,16 @@ def test_square_roots_are_scaled_away(g):
 
 
 def test_a_rank_without_a_clear_gap_is_an_error():
-    small = mf.LieAlgebra.from_structure_constants(1e-9 * np.pi * mf.so(3).structure_constants, name="small")
-    g = mf.direct_sum(mf.so(3), small)
+    """Two elements that act on a plane almost alike. No scaling tells them apart, as it does two so(3) below."""
+    constants = np.zeros((4, 4, 4))
+    constants[0, 2, 2] = constants[0, 3, 3] = constants[1, 2, 2] = 1.0
+    constants[1, 3, 3] = 1.0 + 1e-9 * np.pi
+    g = mf.LieAlgebra.from_structure_constants(constants - constants.swapaxes(0, 1), name="nearly")
     with pytest.raises(mf.LieAlgebraError, match=r"not clear.*rescale the basis") as caught:
         g.casimir_count()
     assert 1e-10 < caught.value.residual < 1e-7
+    small = mf.LieAlgebra.from_structure_constants(1e-9 * np.pi * mf.so(3).structure_constants, name="small")
+    assert mf.direct_sum(mf.so(3), small).casimir_count() == 2
 
 
 # -- when there is none -------------------------------------------------------------------------------------------
