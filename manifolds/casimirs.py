@@ -28,6 +28,7 @@ from ._null_space import (
     row_echelon,
 )
 from .errors import JacobiError, LieAlgebraError, ParameterError
+from .invariants import TracePolynomial, fundamental_invariants
 from .lie_algebra import LieAlgebra
 from .polynomial import Polynomial
 
@@ -71,7 +72,7 @@ def casimir_count(g: LieAlgebra) -> int:
     return g.dim - max(ranks)
 
 
-def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
+def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial | TracePolynomial]:
     """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
 
     The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
@@ -86,17 +87,19 @@ def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
 
     Returns
     -------
-    list of Polynomial
+    list of Polynomial or TracePolynomial
         Coprime integer coefficients with a positive leading one, exact, where the structure constants are rational;
         otherwise floats with leading coefficient 1, correct to the last digit where a scaling of the basis makes the
-        constants rational (su(n)).
+        constants rational (su(n)). Where there are more than 20000 monomials of this degree, or more than 2000 coupled
+        ones, and the algebra is semisimple or reductive: traces of powers of matrices, and Pfaffians, proved to be all
+        by the number and the degrees of the generators (see :mod:`manifolds.invariants`).
 
     Raises
     ------
     ParameterError
         If the degree is not a positive integer.
     LieAlgebraError
-        If there are more than 20000 monomials of this degree, or more than 2000 coupled ones; or if the constants
+        If there are too many monomials and no set of traces is complete; or if the constants
         cannot be made rational and the singular values show no clear gap.
 
     Warns
@@ -107,9 +110,16 @@ def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
     """
     if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
         raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
-    found = list(_new_casimirs(g, int(degree)))
-    number = casimir_count(g)
-    if number and not g.is_semisimple() and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
+    found: list[Polynomial | TracePolynomial]
+    try:
+        found = list(_new_casimirs(g, int(degree)))
+    except _TooLargeError:
+        generators = fundamental_invariants(g)
+        if generators is None:
+            raise
+        found = [F for F in generators if F.degree == degree]
+    number = 0 if found or g.is_semisimple() else casimir_count(g)
+    if number and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
         warnings.warn(
             f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
             f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
@@ -177,9 +187,14 @@ def _invariants(g: LieAlgebra, degree: int) -> list[Polynomial]:
 
 def _check_size(size: int, limit: int, what: str) -> None:
     if size > limit:
-        raise LieAlgebraError(
-            f"{what}, more than the {limit} that the search for Casimirs allows: ask for a lower degree"
+        raise _TooLargeError(
+            f"{what}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
+            "are known to generate them all: ask for a lower degree, or build a reductive algebra from matrices"
         )
+
+
+class _TooLargeError(LieAlgebraError):
+    """More monomials than the linear algebra is asked to take."""
 
 
 def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, sp.csc_array]:

@@ -122,8 +122,8 @@ def rotation_log(algebra: LieAlgebra, g) -> jax.Array:
     """Logarithm in SO(n), defined also where one plane is turned by pi: there with the sign of ``leading_sign``.
 
     With J the quarter turn of that plane, g times its half turn has a principal logarithm, which commutes with J:
-    ``log g = log(g exp(-pi J)) + pi J``. Where more than one plane is turned by pi, J may be any element of a continuum,
-    and the result is NaN.
+    ``log g = log(g exp(-pi J)) + pi J``. Where more than one plane is turned by pi, J may be any element of a
+    continuum, and the result is NaN.
     """
     values, vectors = eigh(symmetrized(g))
     first = _least(values)
