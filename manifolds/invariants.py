@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._arrays import real_components
+from ._names import checked_names
 from ._null_space import numerical_null_space
 from .errors import LieAlgebraError, ShapeError
 from .lie_algebra import LieAlgebra
@@ -72,6 +73,7 @@ class TracePolynomial:
     degree: int
     weight: np.ndarray
     label: str
+    names: tuple[str, ...] | None
 
     def __init__(self, matrices, degree: int, weight=None, label: str | None = None):
         X = np.array(matrices, dtype=np.float64)
@@ -83,13 +85,20 @@ class TracePolynomial:
         X.setflags(write=False)
         W.setflags(write=False)
         label = label or f"tr(X**{degree})"
-        for name, value in (("matrices", X), ("degree", int(degree)), ("weight", W), ("label", label)):
+        attributes = {"matrices": X, "degree": int(degree), "weight": W, "label": label, "names": None}
+        for name, value in attributes.items():
             object.__setattr__(self, name, value)
 
     @property
     def dim(self) -> int:
         """Number of components of mu."""
         return self.matrices.shape[0]
+
+    def with_names(self, *names: str) -> TracePolynomial:
+        """The same trace; names show where it is :meth:`expanded`."""
+        named = TracePolynomial(self.matrices, self.degree, self.weight, self.label)
+        object.__setattr__(named, "names", checked_names(names, self.dim))
+        return named
 
     def __call__(self, mu) -> jax.Array:
         """The value at ``mu``, shape (..., dim) -> (...)."""
@@ -123,7 +132,8 @@ class TracePolynomial:
         values = np.einsum("nii->n", coefficients)
         kept = np.abs(values) > 1e-13 * np.abs(values).max()
         exponents = (factors[kept][:, :, None] == np.arange(self.dim)).sum(axis=1)
-        return Polynomial(exponents, values[kept].tolist())
+        written = Polynomial(exponents, values[kept].tolist())
+        return written if self.names is None else written.with_names(*self.names)
 
     def _gradient(self, mu: np.ndarray) -> np.ndarray:
         """Where W commutes with X; zero where it is rounding."""
@@ -190,9 +200,9 @@ def _independent_invariants(g: LieAlgebra, sources: list[_Source]) -> tuple[Trac
             gradients = [_gradient_at(F, mu) for mu in points]
             if not all(_is_invariant(g, row, mu) for row, mu in zip(gradients, points, strict=True)):
                 return None  # an algebra whose constants are too inaccurate
-            directions = [_new_direction(span, row) for span, row in zip(spans, gradients, strict=True)]
-            if all(direction is not None for direction in directions):
-                spans = [np.vstack([span, row]) for span, row in zip(spans, directions, strict=True)]
+            wider = [_wider(span, row) for span, row in zip(spans, gradients, strict=True)]
+            if all(len(new) > len(old) for new, old in zip(wider, spans, strict=True)):
+                spans = wider
                 found.append(F)
         if len(found) >= count:
             break
@@ -210,12 +220,12 @@ def _is_invariant(g: LieAlgebra, gradient: np.ndarray, mu: np.ndarray) -> bool:
     return bool(np.linalg.norm(motion) <= 1e-10 * size)
 
 
-def _new_direction(span: np.ndarray, row: np.ndarray) -> np.ndarray | None:
-    """The unit vector along the part of the row orthogonal to the orthonormal rows, if it is a part that counts."""
+def _wider(span: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """The orthonormal rows, and the direction of the part of ``row`` orthogonal to them if it is a part that counts."""
     rest = row - span.T @ (span @ row)
     rest -= span.T @ (span @ rest)
     size = np.linalg.norm(rest)
-    return rest / size if size > INDEPENDENT * np.linalg.norm(row) else None
+    return np.vstack([span, rest / size]) if size > INDEPENDENT * np.linalg.norm(row) else span
 
 
 class _Source(NamedTuple):

@@ -8,6 +8,7 @@ Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from fractions import Fraction
 from functools import cached_property
 
@@ -19,6 +20,7 @@ import scipy.linalg
 from ._arrays import is_traced, real_components, square_matrices
 from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, jacobi_sums, rational_array
+from ._names import checked_names
 from .errors import (
     AntisymmetryError,
     ClosureError,
@@ -54,9 +56,12 @@ class LieAlgebra:
         The same constants as exact fractions, where they are recognised as such and are not too large.
     basis : ndarray, shape (dim, m, m), or None
         The matrices ``e_a``, where known.
+    basis_names : tuple of str, or None
+        What the basis elements are called, and the components of mu in Casimirs and pictures with them; see
+        :meth:`with_basis_names`.
     """
 
-    def __init__(self, structure_constants, *, name: str = "g", basis=None):
+    def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = _checked_constants(structure_constants)
         exact = rational_array(constants)
         machine_size = exact is not None and exact.numerator.dtype != object
@@ -65,18 +70,20 @@ class LieAlgebra:
         self.dim: int = self.structure_constants.shape[0]
         self.name = name
         self.basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
+        self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
         _check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
 
     # -- construction -------------------------------------------------------------------------------------------
 
     @classmethod
-    def from_structure_constants(cls, structure_constants, name: str = "g") -> LieAlgebra:
+    def from_structure_constants(cls, structure_constants, name: str = "g", basis_names=None) -> LieAlgebra:
         """The algebra with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
 
         Parameters
         ----------
         structure_constants : array of int, Fraction or float, shape (dim, dim, dim)
         name : str
+        basis_names : sequence of dim str, optional
 
         Raises
         ------
@@ -86,16 +93,17 @@ class LieAlgebra:
             If an axiom fails; the message names the basis elements and the residual. The check is exact when every
             constant is an integer or a fraction, and to 1e-12 relative otherwise.
         """
-        return cls(structure_constants, name=name)
+        return cls(structure_constants, name=name, basis_names=basis_names)
 
     @classmethod
-    def from_matrices(cls, basis, name: str = "g") -> LieAlgebra:
+    def from_matrices(cls, basis, name: str = "g", basis_names=None) -> LieAlgebra:
         """The algebra spanned over the reals by ``basis``, with the commutator.
 
         Parameters
         ----------
         basis : array, real or complex, shape (dim, m, m)
         name : str
+        basis_names : sequence of dim str, optional
 
         Raises
         ------
@@ -143,7 +151,29 @@ class LieAlgebra:
         constants = coordinates.T.reshape(dim, dim, dim)
         constants = (constants - constants.swapaxes(0, 1)) / 2
         scales = sizes[:, None, None] * sizes[:, None] / sizes
-        return cls(_without_rounding(constants, scales, columns, commutators), name=name, basis=given)
+        constants = _without_rounding(constants, scales, columns, commutators)
+        return cls(constants, name=name, basis=given, basis_names=basis_names)
+
+    def with_basis_names(self, *names: str) -> LieAlgebra:
+        """The same algebra with names for its basis elements, equal to the one without.
+
+        Its Casimirs print with these names in place of ``mu1``, ``mu2``, …, pictures label their axes so, and sums of
+        algebras that all have names keep them.
+
+        Raises
+        ------
+        ParameterError
+            If there are not ``dim`` different names, each an identifier such as ``Jx``.
+
+        Examples
+        --------
+        >>> g = manifolds.se(2).with_basis_names("L", "Px", "Py")
+        >>> print(*g.casimirs(2))
+        Px**2 + Py**2
+        """
+        named = copy(self)
+        named.basis_names = checked_names(names, self.dim)
+        return named
 
     # -- the operations -----------------------------------------------------------------------------------------
 
@@ -281,12 +311,14 @@ class LieAlgebra:
     def casimirs(self, degree: int):
         """All homogeneous polynomial Casimirs of this degree, modulo products of those of lower degree.
 
-        Returns a list of :class:`manifolds.casimirs.Polynomial`, callable on ``mu`` and printing as
-        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational.
+        Returns a list of :class:`manifolds.Polynomial`, callable on ``mu`` and printing as
+        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational. Where there
+        are too many monomials and the algebra is semisimple or reductive, :class:`manifolds.TracePolynomial`.
         """
         from .casimirs import casimirs
 
-        return casimirs(self, degree)
+        found = casimirs(self, degree)
+        return found if self.basis_names is None else [F.with_names(*self.basis_names) for F in found]
 
     # -- Python ---------------------------------------------------------------------------------------------------
 
@@ -374,34 +406,67 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
                 for e in own
             ]
         )
-    return LieAlgebra(constants, name=" + ".join(g.name for g in algebras), basis=basis)
+    return LieAlgebra(
+        constants, name=" + ".join(g.name for g in algebras), basis=basis, basis_names=_joined_names(*algebras)
+    )
 
 
-def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> LieAlgebra:
-    """Semidirect sum of g with the vector space V it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u)``.
+def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
+    """Semidirect sum of g with what it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
 
     Parameters
     ----------
     g : LieAlgebra
     representation : array, shape (g.dim, m, m), or callable
-        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``.
+        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal its
+        derivations: the columns of ``rho(e_a)`` are the images of the basis elements.
+    name : str, optional
+    ideal : LieAlgebra, of dimension m, optional
+        The algebra that u and v are in; by default the abelian one of a vector space.
 
     Returns
     -------
     LieAlgebra
-        Dimension ``g.dim + m``: the elements of g first, then those of V. Its matrices are the affine ones
-        ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful.
+        Dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
+        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful. With an ideal
+        they are the adjoint ones where its centre is zero, and unknown otherwise.
 
     Raises
     ------
     RepresentationError
-        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, which is named.
+        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, or ``rho(e_a) [u, v]`` is not
+        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; they are named.
     """
+    if ideal is not None and not isinstance(ideal, LieAlgebra):
+        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
     if callable(representation):
         representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
     rho = np.asarray(representation, dtype=np.float64)
-    if rho.ndim != 3 or rho.shape[0] != g.dim or rho.shape[1] != rho.shape[2]:
-        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, m, m), not {rho.shape}")
+    m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
+    if rho.shape != (g.dim, m, m):
+        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
+    _check_representation(g, rho)
+    dim = g.dim + m
+    constants = np.zeros((dim, dim, dim))
+    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
+    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
+    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
+    if ideal is None:
+        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
+    _check_derivations(g, rho, ideal)
+    constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
+    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=_joined_names(g, ideal))
+    adjoint = total._balanced[0].reshape(dim, -1)
+    faithful = adjoint.any() and len(_row_space(adjoint)) == dim
+    return LieAlgebra(
+        constants,
+        name=total.name,
+        basis=total.structure_constants.swapaxes(1, 2) if faithful else None,
+        basis_names=total.basis_names,
+    )
+
+
+def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
     products = np.einsum("aij,bjk->abik", rho, rho)
     defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
     residuals = np.abs(defect).max(axis=(2, 3))
@@ -416,25 +481,46 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> Li
             tolerance=tolerance,
             indices=(int(a), int(b)),
         )
+
+
+def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> None:
+    C = ideal.structure_constants
+    defect = np.einsum("ijk,alk->aijl", C, rho)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
+    defect -= np.einsum("aki,kjl->aijl", rho, C) + np.einsum("akj,ikl->aijl", rho, C)
+    residuals = np.abs(defect).max(axis=3)
+    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(rho).max())
+    if residuals.max() > tolerance:
+        a, i, j = (int(index) for index in np.unravel_index(residuals.argmax(), residuals.shape))
+        raise RepresentationError(
+            f"rho(e{a + 1}) of {g.name} is not a derivation D of {ideal.name}: D [u{i + 1}, u{j + 1}] differs from "
+            f"[D u{i + 1}, u{j + 1}] + [u{i + 1}, D u{j + 1}] by {residuals.max():.3g} (tolerance {tolerance:.1g})",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(a, i, j),
+        )
+
+
+def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
     m, dim = rho.shape[1], g.dim + rho.shape[1]
-    constants = np.zeros((dim, dim, dim))
-    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
-    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
-    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
     affine = np.zeros((dim, m + 1, m + 1))
     affine[: g.dim, :m, :m] = rho
     affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
-    basis: np.ndarray | None = affine
     sizes = np.linalg.norm(rho, axis=(1, 2))
-    if not sizes.all() or len(_row_space(rho.reshape(g.dim, -1) / sizes[:, None])) < g.dim:
-        basis = None
-        if g.basis is not None:
-            upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
-            basis = np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
-    return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=basis)
+    if sizes.all() and len(_row_space(rho.reshape(g.dim, -1) / sizes[:, None])) == g.dim:
+        return affine
+    if g.basis is None:
+        return None
+    upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
+    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
+    """The names of all basis elements, where all have some and no two the same."""
+    names = [name for g in algebras for name in g.basis_names or ()]
+    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
 
 
 def _checked_constants(values) -> np.ndarray:

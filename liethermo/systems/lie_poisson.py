@@ -78,7 +78,7 @@ class LiePoissonSystem(System):
         return ad.T @ (x + self.dissipation.momentum(dH, ad @ dS))
 
     def _casimirs(self) -> dict[str, Energy]:
-        return _recorded_casimirs(self.algebra)
+        return _recorded_casimirs(self.algebra, self.algebra.basis_names)
 
 
 def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
@@ -102,7 +102,8 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
 
 
 @functools.cache
-def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
+def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
+    del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
     found: dict[str, Energy] = {}
     count = algebra.casimir_count()
     for degree in range(1, algebra.dim + 1):

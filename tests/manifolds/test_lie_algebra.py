@@ -304,6 +304,73 @@ def test_sums():
         mf.semidirect_sum(mf.so(3), np.zeros((2, 2, 2)))
 
 
+def test_semidirect_sums_by_derivations():
+    """An algebra acts on another: the oscillator algebra is R acting on heisenberg(1) by a rotation of q and p."""
+    rotation = np.zeros((1, 3, 3))
+    rotation[0, 1, 0], rotation[0, 0, 1] = 1.0, -1.0
+    line, heisenberg = mf.abelian(1), mf.heisenberg(1)
+    g = mf.semidirect_sum(line, rotation, ideal=heisenberg)
+    assert (g.name, g.dim, g.derived_series(), g.casimir_count()) == ("abelian(1) x heisenberg(1)", 4, [4, 3, 1, 0], 2)
+    assert np.array_equal(g.bracket([1, 0, 0, 0], [0, 1, 0, 0]), [0, 0, 1, 0])
+    assert np.array_equal(g.bracket([0, 1, 0, 0], [0, 0, 1, 0]), [0, 0, 0, 1])
+    assert str(g.casimirs(2)[0]) == "2*mu1*mu4 + mu2**2 + mu3**2"
+    assert g.basis is None  # a centre: the adjoint matrices are not faithful
+    # sl(2) acts on heisenberg(1) too: on the plane of q and p, and z is left alone
+    plane = np.zeros((3, 3, 3))
+    plane[:, :2, :2] = mf.sl(2).basis
+    jacobi = mf.semidirect_sum(mf.sl(2), plane, "jacobi", ideal=heisenberg)
+    assert (jacobi.name, jacobi.dim, jacobi.is_unimodular(), jacobi.casimir_count()) == ("jacobi", 6, True, 2)
+    # an algebra acts on itself by its adjoint matrices; g x g is then so(3) + so(3) in another basis
+    so3 = mf.so(3)
+    twice = mf.semidirect_sum(so3, so3.ad, ideal=so3)
+    assert structure(twice) == structure(mf.so(4))
+    x, y = vectors(twice, 3, 2)
+    assert close(twice.vee(twice.hat(x) @ twice.hat(y) - twice.hat(y) @ twice.hat(x)), twice.bracket(x, y), 100.0)
+    # on an abelian ideal it is the sum with a vector space
+    assert np.array_equal(
+        mf.semidirect_sum(so3, so3.basis, ideal=mf.abelian(3)).structure_constants, mf.se(3).structure_constants
+    )
+    scaling = np.diag([1.0, 1.0, 1.0])[None]  # z must scale by 2
+    with pytest.raises(
+        mf.RepresentationError, match=r"rho\(e1\) .* not a derivation D of heisenberg\(1\): D \[u1, u2\]"
+    ):
+        mf.semidirect_sum(line, scaling, ideal=heisenberg)
+    with pytest.raises(mf.RepresentationError, match="not a representation"):
+        mf.semidirect_sum(so3, 2 * so3.ad(np.eye(3)), ideal=so3)
+    with pytest.raises(mf.ShapeError, match=r"shape \(1, 3, 3\)"):
+        mf.semidirect_sum(line, np.zeros((1, 2, 2)), ideal=heisenberg)
+    with pytest.raises(mf.ComponentError, match="ideal"):
+        mf.semidirect_sum(line, rotation, ideal=heisenberg.structure_constants)
+
+
+def test_names_of_basis_elements():
+    g = mf.se(2).with_basis_names("L", "Px", "Py")
+    assert g == mf.se(2)
+    assert hash(g) == hash(mf.se(2))
+    [F] = g.casimirs(2)
+    assert str(F) == "Px**2 + Py**2"
+    assert mf.se(2).casimirs(2)[0] == F
+    assert str(mf.se(2).casimirs(2)[0]) == "mu2**2 + mu3**2"  # although both are remembered
+    assert str(2 * F * F - 1) == "2*Px**4 + 4*Px**2*Py**2 + 2*Py**4 - 1"
+    assert [str(dF) for dF in F.gradient()] == ["0", "2*Px", "2*Py"]
+    by_constants = mf.LieAlgebra.from_structure_constants(g.structure_constants, basis_names=g.basis_names)
+    by_matrices = mf.LieAlgebra.from_matrices(g.basis, basis_names=["L", "Px", "Py"])
+    assert by_constants.basis_names == by_matrices.basis_names == ("L", "Px", "Py")
+    spin = mf.so(3).with_basis_names("Sx", "Sy", "Sz")
+    both = mf.direct_sum(g, spin)
+    assert both.basis_names == ("L", "Px", "Py", "Sx", "Sy", "Sz")
+    assert mf.direct_sum(spin, spin).basis_names is None
+    assert mf.direct_sum(spin, mf.so(3)).basis_names is None
+    assert mf.semidirect_sum(spin, spin.ad, ideal=mf.so(3).with_basis_names("a", "b", "c")).basis_names[3:] == tuple(
+        "abc"
+    )
+    sextic = mf.g2().with_basis_names(*"abcdefghijklmn").casimirs(6)[0]
+    assert sextic.names == tuple("abcdefghijklmn")
+    for names in (("a", "b"), ("a", "b", "b"), ("a", "b", "1"), ("a", "b", 3), "abc"):
+        with pytest.raises(mf.ParameterError, match="3 basis elements need 3 different names"):
+            mf.LieAlgebra.from_matrices(g.basis, basis_names=names)
+
+
 # -- what is refused ----------------------------------------------------------------------------------------------
 
 
