@@ -64,7 +64,8 @@ def momentum_sphere(
     system : System, optional
         What was integrated. Without it, as for a solution read from a file, the energy surface is the quadric through
         all states if there is exactly one, and the entropy surfaces are spheres if the algebra is so(3) or su(2),
-        where every Casimir is a function of ``|mu|``; what remains unknown is left out.
+        where every Casimir is a function of ``|mu|``; what remains unknown is left out. The axes are labelled by the
+        names of its algebra's basis elements, if they have some.
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.
     ax : Axes3D, optional
@@ -104,7 +105,9 @@ def momentum_sphere(
     _draw_path(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
-    ax.set(xlabel=f"${name}_1$", ylabel=f"${name}_2$", zlabel=f"${name}_3$")
+    names = getattr(getattr(system, "algebra", None), "basis_names", None)
+    x, y, z = names or (f"${name}_{i}$" for i in (1, 2, 3))
+    ax.set(xlabel=x, ylabel=y, zlabel=z)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.set_pane_color("white")
         axis._axinfo["grid"].update(color="0.9", linewidth=0.5)

@@ -13,6 +13,7 @@ from .catalogue import (  # noqa: E402
     abelian,
     aff,
     bianchi,
+    g2,
     galilei,
     gl,
     heisenberg,
@@ -48,6 +49,7 @@ from .errors import (  # noqa: E402
     SpaceError,
 )
 from .geomstats_bridge import GeomstatsSpace, from_geomstats  # noqa: E402
+from .invariants import TracePolynomial  # noqa: E402
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
 from .lie_group import (  # noqa: E402
     GL,
@@ -155,6 +157,7 @@ __all__ = [
     "Sphere",
     "SplitContact",
     "Stiefel",
+    "TracePolynomial",
     "abelian",
     "aff",
     "bianchi",
@@ -163,6 +166,7 @@ __all__ = [
     "dispersion",
     "frechet_mean",
     "from_geomstats",
+    "g2",
     "galilei",
     "gl",
     "heisenberg",

@@ -28,6 +28,7 @@ from ._null_space import (
     row_echelon,
 )
 from .errors import JacobiError, LieAlgebraError, ParameterError
+from .invariants import TracePolynomial, fundamental_invariants
 from .lie_algebra import LieAlgebra
 from .polynomial import Polynomial
 
@@ -62,9 +63,8 @@ def casimir_count(g: LieAlgebra) -> int:
     ranks = []
     for draw in range(3):
         if exact is None:
-            tensor = g.structure_constants @ random.standard_normal(g.dim)
-            scale = float(np.abs(g.structure_constants).max())
-            ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), scale, g.name))
+            tensor = g._balanced[0] @ random.standard_normal(g.dim)
+            ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), 1.0, g.name))
         else:
             p = prime(draw)
             tensor = (exact.numerator * random.integers(1, p, g.dim) % p).sum(axis=2)
@@ -72,7 +72,7 @@ def casimir_count(g: LieAlgebra) -> int:
     return g.dim - max(ranks)
 
 
-def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
+def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial | TracePolynomial]:
     """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
 
     The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
@@ -87,17 +87,19 @@ def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
 
     Returns
     -------
-    list of Polynomial
+    list of Polynomial or TracePolynomial
         Coprime integer coefficients with a positive leading one, exact, where the structure constants are rational;
         otherwise floats with leading coefficient 1, correct to the last digit where a scaling of the basis makes the
-        constants rational (su(n)).
+        constants rational (su(n)). Where there are more than 20000 monomials of this degree, or more than 2000 coupled
+        ones, and the algebra is semisimple or reductive: traces of powers of matrices, and Pfaffians, proved to be all
+        by the number and the degrees of the generators (see :mod:`manifolds.invariants`).
 
     Raises
     ------
     ParameterError
         If the degree is not a positive integer.
     LieAlgebraError
-        If there are more than 20000 monomials of this degree, or more than 2000 coupled ones; or if the constants
+        If there are too many monomials and no set of traces is complete; or if the constants
         cannot be made rational and the singular values show no clear gap.
 
     Warns
@@ -108,9 +110,16 @@ def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial]:
     """
     if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
         raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
-    found = list(_new_casimirs(g, int(degree)))
-    number = casimir_count(g)
-    if number and not g.is_semisimple() and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
+    found: list[Polynomial | TracePolynomial]
+    try:
+        found = list(_new_casimirs(g, int(degree)))
+    except _TooLargeError:
+        generators = fundamental_invariants(g)
+        if generators is None:
+            raise
+        found = [F for F in generators if F.degree == degree]
+    number = 0 if found or g.is_semisimple() else casimir_count(g)
+    if number and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
         warnings.warn(
             f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
             f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
@@ -129,6 +138,8 @@ def _new_casimirs(g: LieAlgebra, degree: int) -> tuple[Polynomial, ...]:
     scaled, squares = _rational_form(g)
     if g.rational_constants is None and scaled.rational_constants is not None:
         return tuple(_rescaled(F, squares) for F in _new_casimirs(scaled, degree))
+    if g.rational_constants is None and (scaled := _balanced_form(g)) != g:
+        return tuple(_weighted(F, g._balanced[1]) for F in _new_casimirs(scaled, degree))
     invariants = _invariants(g, degree)
     lower = [F for d in range(1, degree) for F in _new_casimirs(g, d)]
     products = [dict(F.terms) for F in _products(lower, degree)]
@@ -176,9 +187,14 @@ def _invariants(g: LieAlgebra, degree: int) -> list[Polynomial]:
 
 def _check_size(size: int, limit: int, what: str) -> None:
     if size > limit:
-        raise LieAlgebraError(
-            f"{what}, more than the {limit} that the search for Casimirs allows: ask for a lower degree"
+        raise _TooLargeError(
+            f"{what}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
+            "are known to generate them all: ask for a lower degree, or build a reductive algebra from matrices"
         )
+
+
+class _TooLargeError(LieAlgebraError):
+    """More monomials than the linear algebra is asked to take."""
 
 
 def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, sp.csc_array]:
@@ -276,6 +292,18 @@ def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
         return unchanged
 
 
+@lru_cache(maxsize=256)
+def _balanced_form(g: LieAlgebra) -> LieAlgebra:
+    """The algebra in the basis ``factors[a] e_a`` with balanced constants; g itself where it has them already."""
+    constants, factors = g._balanced
+    if np.abs(np.log(factors)).max() < 1e-12:
+        return g
+    try:
+        return LieAlgebra.from_structure_constants(constants, g.name)
+    except JacobiError:  # an axiom that holds to rounding of the largest constants only
+        return g
+
+
 def _odd_primes(n: int) -> set[int]:
     """The primes of odd exponent in n."""
     odd: set[int] = set()
@@ -297,3 +325,10 @@ def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
         weights.append(Fraction(c) * abs(Fraction(c)) * scale)
     roots = [math.copysign(math.sqrt(abs(w / weights[0])), w) for w in weights]
     return Polynomial(F.exponents, roots)
+
+
+def _weighted(F: Polynomial, factors: np.ndarray) -> Polynomial:
+    """F, given in the basis ``factors[a] e_a``, in the basis e_a, with leading coefficient 1."""
+    logarithms = F.exponents @ np.log(factors)
+    weights = np.exp(logarithms - logarithms[0]) / float(F.coefficients[0])
+    return Polynomial(F.exponents, (np.array(F.coefficients, dtype=float) * weights).tolist())

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ._null_space import rational_null_space
 from .errors import ParameterError
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum
 
@@ -102,6 +103,35 @@ def sp(n: int) -> LieAlgebra:
     blocks += [np.block([[zero, s], [zero, zero]]) for s in symmetric]
     blocks += [np.block([[zero, zero], [s, zero]]) for s in symmetric]
     return _named(blocks, f"sp({n})")
+
+
+@register(())
+def g2() -> LieAlgebra:
+    """The compact exceptional algebra of dimension 14: the matrices of so(7) that keep a three-form of octonions.
+
+    The form is ``e123 + e145 + e167 + e246 - e257 - e347 - e356``; each matrix is the sum or difference of two of the
+    basis of so(7), E_ij - E_ji. Its Casimirs have the degrees 2 and 6.
+    """
+    form = np.zeros((7, 7, 7), dtype=np.int64)
+    for i, j, k, sign in _OCTONIONS:
+        for p, q, r in ((i, j, k), (j, k, i), (k, i, j)):
+            form[p, q, r], form[q, p, r] = sign, -sign
+    rotations = np.asarray(so(7).basis, dtype=np.int64)
+    moved = np.einsum("api,ijk->apjk", rotations, form)
+    moved = moved + moved.transpose(0, 2, 3, 1) + moved.transpose(0, 3, 1, 2)
+    kept = np.array(rational_null_space(moved.reshape(len(rotations), -1).T))
+    return _named(np.einsum("na,aij->nij", kept, rotations), "g2")
+
+
+_OCTONIONS = (
+    (0, 1, 2, 1),
+    (0, 3, 4, 1),
+    (0, 5, 6, 1),
+    (1, 3, 5, 1),
+    (1, 4, 6, -1),
+    (2, 3, 6, -1),
+    (2, 4, 5, -1),
+)
 
 
 @register((1,), (2,))

@@ -18,7 +18,10 @@ from .lie_algebra import LieAlgebra
 from .matrix_functions import determinant, inverse, largest, orthonormalized
 
 HALF_TURN_MARGIN = 1e-8
-"""A logarithm is taken of eigenvalues at angles up to pi minus this; beyond, its sign is decided by noise."""
+"""At angles above pi minus this, noise decides the sign of an axis: see :func:`leading_sign`.
+
+In groups where the half turn has no axis, logarithms are taken of eigenvalues at angles below only.
+"""
 
 
 def stumpff(order: int, z) -> jax.Array:
@@ -64,10 +67,11 @@ def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """The angle, by way of its sine and cosine."""
-    sine, cosine = algebra.vee((g - g.swapaxes(-1, -2)) / 2), jnp.trace(g, axis1=-2, axis2=-1)[..., None] / 2
-    defined = jnp.arctan2(jnp.abs(sine), cosine) <= math.pi - HALF_TURN_MARGIN
-    return jnp.where(defined, arc(sine**2, cosine) * sine, jnp.nan)
+    """The angle, by way of its sine and cosine, from -pi + HALF_TURN_MARGIN to pi + HALF_TURN_MARGIN."""
+    sine, cosine = ((g - g.swapaxes(-1, -2)) / 2)[..., 0, 1:2], (g[..., :1, 0] + g[..., 1:2, 1]) / 2
+    angle = jnp.arctan2(sine, cosine)
+    angle = jnp.where(angle < HALF_TURN_MARGIN - math.pi, angle + 2 * math.pi, angle)
+    return jnp.where(cosine < 0, angle, arc(sine**2, cosine) * sine)
 
 
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -77,8 +81,23 @@ def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Rotation vector by way of the quaternion, accurate at every angle below pi - HALF_TURN_MARGIN."""
-    return _rotation_vector(*_quaternion(g), math.pi - HALF_TURN_MARGIN)
+    """Rotation vector by way of the quaternion, accurate at every angle; at the half turn by :func:`leading_sign`."""
+    w, v = _quaternion(g)
+    sign = jnp.where(_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
+    return 2 * arc(_square(v), sign * w) * sign * v
+
+
+def leading_sign(x) -> jax.Array:
+    """Sign of the first component that is not zero (1e-8 of the length, which is not zero), shape (..., 1).
+
+    The axis of a half turn is taken to have the sign 1: of the two logarithms one is so chosen, and rounding chooses no
+    other. Within HALF_TURN_MARGIN of the half turn its angle may then be larger than pi by as much.
+    """
+    sign, least = jnp.ones((*x.shape[:-1], 1)), HALF_TURN_MARGIN * jnp.sqrt(_square(x))
+    for i in reversed(range(x.shape[-1])):
+        component = x[..., i : i + 1]
+        sign = jnp.where(component > least, 1.0, jnp.where(component < -least, -1.0, sign))
+    return sign
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -101,16 +120,19 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     return affine(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
 
 
-def se3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Rotation vector of the rotation, and ``(I - W/2 + d W^2) t`` with ``d = (1 - (a/2) cot(a/2)) / a^2``.
+def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+    """In the plane and in space: logarithm w of the rotation, and ``(I - W/2 + d W^2) t`` with W = hat(w).
 
-    In Stumpff functions of the half angle, d = (c2 - c3) / (4 c1): no cancellation.
+    ``d = (1 - (a/2) cot(a/2)) / a^2`` for the angle a; in Stumpff functions of the half angle, d = (c2 - c3) / (4 c1):
+    no cancellation.
     """
-    w, t = so3_log(algebra, g[..., :3, :3]), g[..., :3, 3]
-    z = _square(w) / 4
+    rotation, t = g[..., :-1, :-1], g[..., :-1, -1:]
+    w = (so2_log if t.shape[-2] == 2 else so3_log)(algebra, rotation)
+    W = algebra.hat(jnp.concatenate([w, jnp.zeros_like(t[..., 0])], axis=-1))[..., :-1, :-1]
+    z = _square(w)[..., None] / 4
     d = (stumpff(2, z) - stumpff(3, z)) / (4 * stumpff(1, z))
-    turned = jnp.cross(w, t)
-    return jnp.concatenate([w, t - turned / 2 + d * jnp.cross(w, turned)], axis=-1)
+    u = t - W @ (t / 2 - d * (W @ t))
+    return jnp.concatenate([w, u[..., 0]], axis=-1)
 
 
 def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -133,7 +155,8 @@ def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
-    return _rotation_vector(*_unit_quaternion(g), 2 * (math.pi - HALF_TURN_MARGIN))
+    w, v = _unit_quaternion(g)
+    return jnp.where(_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), 2 * arc(_square(v), w) * v, jnp.nan)
 
 
 def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -314,8 +337,3 @@ def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _angle(w: jax.Array, v: jax.Array) -> jax.Array:
     """Twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
     return 2 * jnp.arctan2(jnp.sqrt(_square(v)), w)
-
-
-def _rotation_vector(w: jax.Array, v: jax.Array, limit: float) -> jax.Array:
-    """Twice the angle of the quaternion (w, v), of any norm, times its axis; NaN above the limit."""
-    return jnp.where(_angle(w, v) <= limit, 2 * arc(_square(v), w) * v, jnp.nan)

@@ -20,7 +20,7 @@ class ParameterError(ManifoldsError, ValueError):
 
 
 class DomainError(ManifoldsError, ValueError):
-    """A map evaluated outside its domain, such as the logarithm of a rotation by pi."""
+    """A map evaluated outside its domain, such as the logarithm of -I in SU(2)."""
 
 
 class OffManifoldError(DomainError):

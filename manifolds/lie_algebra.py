@@ -8,6 +8,8 @@ Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
+from fractions import Fraction
 from functools import cached_property
 
 import jax
@@ -16,7 +18,9 @@ import numpy as np
 import scipy.linalg
 
 from ._arrays import is_traced, real_components, square_matrices
+from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, jacobi_sums, rational_array
+from ._names import checked_names
 from .errors import (
     AntisymmetryError,
     ClosureError,
@@ -38,6 +42,10 @@ class LieAlgebra:
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
     (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
 
+    What is said about the structure (``is_semisimple``, ``derived_series``, …) holds for the algebra and not for its
+    basis: it is decided on constants that a scaling of the basis elements has made of similar size, where what is below
+    1e-10 counts as rounding.
+
     Attributes
     ----------
     dim : int
@@ -48,9 +56,12 @@ class LieAlgebra:
         The same constants as exact fractions, where they are recognised as such and are not too large.
     basis : ndarray, shape (dim, m, m), or None
         The matrices ``e_a``, where known.
+    basis_names : tuple of str, or None
+        What the basis elements are called, and the components of mu in Casimirs and pictures with them; see
+        :meth:`with_basis_names`.
     """
 
-    def __init__(self, structure_constants, *, name: str = "g", basis=None):
+    def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = _checked_constants(structure_constants)
         exact = rational_array(constants)
         machine_size = exact is not None and exact.numerator.dtype != object
@@ -59,18 +70,20 @@ class LieAlgebra:
         self.dim: int = self.structure_constants.shape[0]
         self.name = name
         self.basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
+        self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
         _check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
 
     # -- construction -------------------------------------------------------------------------------------------
 
     @classmethod
-    def from_structure_constants(cls, structure_constants, name: str = "g") -> LieAlgebra:
+    def from_structure_constants(cls, structure_constants, name: str = "g", basis_names=None) -> LieAlgebra:
         """The algebra with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
 
         Parameters
         ----------
         structure_constants : array of int, Fraction or float, shape (dim, dim, dim)
         name : str
+        basis_names : sequence of dim str, optional
 
         Raises
         ------
@@ -80,16 +93,17 @@ class LieAlgebra:
             If an axiom fails; the message names the basis elements and the residual. The check is exact when every
             constant is an integer or a fraction, and to 1e-12 relative otherwise.
         """
-        return cls(structure_constants, name=name)
+        return cls(structure_constants, name=name, basis_names=basis_names)
 
     @classmethod
-    def from_matrices(cls, basis, name: str = "g") -> LieAlgebra:
+    def from_matrices(cls, basis, name: str = "g", basis_names=None) -> LieAlgebra:
         """The algebra spanned over the reals by ``basis``, with the commutator.
 
         Parameters
         ----------
         basis : array, real or complex, shape (dim, m, m)
         name : str
+        basis_names : sequence of dim str, optional
 
         Raises
         ------
@@ -106,6 +120,10 @@ class LieAlgebra:
         if not np.isfinite(matrices).all():
             raise ComponentError("the matrix basis has entries that are not finite")
         dim = len(matrices)
+        sizes = np.linalg.norm(matrices, axis=(1, 2))
+        if not sizes.all():
+            raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
+        matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
         columns = _real_columns(matrices)
         singular = scipy.linalg.svdvals(columns)
         if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
@@ -117,21 +135,45 @@ class LieAlgebra:
             )
         products = np.einsum("aij,bjk->abik", matrices, matrices)
         commutators = _real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
+        commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
         coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
         residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
-        tolerance = 1e-10 * max(1.0, float(np.abs(commutators).max()))
+        tolerance = 1e-10
         if residuals.max() > tolerance:
             a, b = divmod(int(residuals.argmax()), dim)
             raise ClosureError(
-                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g}, "
-                f"tolerance {tolerance:.1g}); add the missing commutators to the basis",
+                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g} "
+                f"for matrices of norm 1, tolerance {tolerance:.1g}); add the missing commutators to the basis",
                 residual=float(residuals.max()),
                 tolerance=tolerance,
                 indices=(a, b),
             )
         constants = coordinates.T.reshape(dim, dim, dim)
         constants = (constants - constants.swapaxes(0, 1)) / 2
-        return cls(_without_rounding(constants, columns, commutators), name=name, basis=matrices)
+        scales = sizes[:, None, None] * sizes[:, None] / sizes
+        constants = _without_rounding(constants, scales, columns, commutators)
+        return cls(constants, name=name, basis=given, basis_names=basis_names)
+
+    def with_basis_names(self, *names: str) -> LieAlgebra:
+        """The same algebra with names for its basis elements, equal to the one without.
+
+        Its Casimirs print with these names in place of ``mu1``, ``mu2``, …, pictures label their axes so, and sums of
+        algebras that all have names keep them.
+
+        Raises
+        ------
+        ParameterError
+            If there are not ``dim`` different names, each an identifier such as ``Jx``.
+
+        Examples
+        --------
+        >>> g = manifolds.se(2).with_basis_names("L", "Px", "Py")
+        >>> print(*g.casimirs(2))
+        Px**2 + Py**2
+        """
+        named = copy(self)
+        named.basis_names = checked_names(names, self.dim)
+        return named
 
     # -- the operations -----------------------------------------------------------------------------------------
 
@@ -170,6 +212,12 @@ class LieAlgebra:
         """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
         return self._killing_form
 
+    def killing_signature(self) -> tuple[int, int, int]:
+        """Numbers of positive, negative and zero eigenvalues of the Killing form, the same in every basis."""
+        eigenvalues = np.linalg.eigvalsh(_killing_form(self._balanced[0]))
+        positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
+        return positive, negative, self.dim - positive - negative
+
     def hat(self, x) -> jax.Array:
         """The matrix ``sum_a x_a e_a``, shape (..., m, m)."""
         return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._known_basis())
@@ -189,7 +237,7 @@ class LieAlgebra:
         components = jnp.einsum("ai,...i->...a", self._left_inverse, flat)
         if not is_traced(flat):
             residual = float(jnp.max(jnp.abs(components @ _real_columns(basis).T - flat), initial=0.0))
-            tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(flat), initial=0.0)))
+            tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(flat), initial=0.0)))
             if not residual <= tolerance:
                 raise LieAlgebraError(
                     f"the matrix is not in {self.name}: it is {residual:.3g} away from its span "
@@ -207,12 +255,11 @@ class LieAlgebra:
 
     def is_semisimple(self) -> bool:
         """Whether the Killing form is nondegenerate (Cartan's criterion)."""
-        eigenvalues = np.abs(self._killing_eigenvalues)
-        return bool(eigenvalues.min() > 1e-10 * max(eigenvalues.max(), 1e-300))
+        return self.killing_signature()[2] == 0
 
     def is_compact_type(self) -> bool:
         """Whether the Killing form is negative definite: the algebra of a compact semisimple group."""
-        return self.is_semisimple() and bool(self._killing_eigenvalues.max() < 0)
+        return self.killing_signature() == (0, self.dim, 0)
 
     def is_solvable(self) -> bool:
         """Whether the derived series ends at zero."""
@@ -224,8 +271,8 @@ class LieAlgebra:
 
     def is_unimodular(self) -> bool:
         """Whether ``tr ad_x = 0`` for every x."""
-        traces = np.einsum("abb->a", self.structure_constants)
-        return bool(np.abs(traces).max() <= AXIOM_TOLERANCE * max(1.0, np.abs(self.structure_constants).max()))
+        traces = np.einsum("abb->a", self._balanced[0])
+        return bool(np.abs(traces).max() <= STRUCTURE_TOLERANCE)
 
     def derived_series(self) -> list[int]:
         """Dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
@@ -264,12 +311,14 @@ class LieAlgebra:
     def casimirs(self, degree: int):
         """All homogeneous polynomial Casimirs of this degree, modulo products of those of lower degree.
 
-        Returns a list of :class:`manifolds.casimirs.Polynomial`, callable on ``mu`` and printing as
-        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational.
+        Returns a list of :class:`manifolds.Polynomial`, callable on ``mu`` and printing as
+        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational. Where there
+        are too many monomials and the algebra is semisimple or reductive, :class:`manifolds.TracePolynomial`.
         """
         from .casimirs import casimirs
 
-        return casimirs(self, degree)
+        found = casimirs(self, degree)
+        return found if self.basis_names is None else [F.with_names(*self.basis_names) for F in found]
 
     # -- Python ---------------------------------------------------------------------------------------------------
 
@@ -304,11 +353,12 @@ class LieAlgebra:
 
     @cached_property
     def _killing_form(self) -> np.ndarray:
-        return _frozen(np.einsum("acd,bdc->ab", self.structure_constants, self.structure_constants, optimize=True))
+        return _frozen(_killing_form(self.structure_constants))
 
     @cached_property
-    def _killing_eigenvalues(self) -> np.ndarray:
-        return np.linalg.eigvalsh(self._killing_form)
+    def _balanced(self) -> tuple[np.ndarray, np.ndarray]:
+        """The constants in a basis scaled by factors, the largest of size 1, and the factors."""
+        return balanced(self.structure_constants)
 
     @cached_property
     def _cartan_involution(self) -> np.ndarray:
@@ -316,14 +366,17 @@ class LieAlgebra:
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
         if self.is_compact_type():
             return _frozen(np.eye(self.dim))
-        return _frozen(_cartan_involution(self.structure_constants, self.name))
+        constants, factors = self._balanced
+        theta = _cartan_involution(constants, self.name) * factors[:, None] / factors
+        snapped = np.asarray(np.round(theta))
+        return _frozen(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
 
     def _series(self, factors: Callable) -> list[int]:
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
             left, right = factors(ideal)
-            products = np.einsum("ia,jb,abc->ijc", left, right, self.structure_constants, optimize=True)
-            ideal = _row_space(products.reshape(-1, self.dim), scale=float(np.abs(self.structure_constants).max()))
+            products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced[0], optimize=True)
+            ideal = _row_space(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims
             dims.append(len(ideal))
@@ -353,38 +406,72 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
                 for e in own
             ]
         )
-    return LieAlgebra(constants, name=" + ".join(g.name for g in algebras), basis=basis)
+    return LieAlgebra(
+        constants, name=" + ".join(g.name for g in algebras), basis=basis, basis_names=_joined_names(*algebras)
+    )
 
 
-def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> LieAlgebra:
-    """Semidirect sum of g with the vector space V it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u)``.
+def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
+    """Semidirect sum of g with what it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
 
     Parameters
     ----------
     g : LieAlgebra
     representation : array, shape (g.dim, m, m), or callable
-        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``.
+        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal its
+        derivations: the columns of ``rho(e_a)`` are the images of the basis elements.
+    name : str, optional
+    ideal : LieAlgebra, of dimension m, optional
+        The algebra that u and v are in; by default the abelian one of a vector space.
 
     Returns
     -------
     LieAlgebra
-        Dimension ``g.dim + m``: the elements of g first, then those of V. Its matrices are the affine ones
-        ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful.
+        Dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
+        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful. With an ideal
+        they are the adjoint ones where its centre is zero, and unknown otherwise.
 
     Raises
     ------
     RepresentationError
-        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, which is named.
+        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, or ``rho(e_a) [u, v]`` is not
+        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; they are named.
     """
+    if ideal is not None and not isinstance(ideal, LieAlgebra):
+        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
     if callable(representation):
         representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
     rho = np.asarray(representation, dtype=np.float64)
-    if rho.ndim != 3 or rho.shape[0] != g.dim or rho.shape[1] != rho.shape[2]:
-        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, m, m), not {rho.shape}")
+    m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
+    if rho.shape != (g.dim, m, m):
+        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
+    _check_representation(g, rho)
+    dim = g.dim + m
+    constants = np.zeros((dim, dim, dim))
+    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
+    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
+    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
+    if ideal is None:
+        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
+    _check_derivations(g, rho, ideal)
+    constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
+    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=_joined_names(g, ideal))
+    adjoint = total._balanced[0].reshape(dim, -1)
+    faithful = adjoint.any() and len(_row_space(adjoint)) == dim
+    return LieAlgebra(
+        constants,
+        name=total.name,
+        basis=total.structure_constants.swapaxes(1, 2) if faithful else None,
+        basis_names=total.basis_names,
+    )
+
+
+def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
     products = np.einsum("aij,bjk->abik", rho, rho)
     defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
     residuals = np.abs(defect).max(axis=(2, 3))
-    tolerance = AXIOM_TOLERANCE * max(1.0, float(np.abs(products).max()))
+    images = float(np.abs(g.structure_constants).max() * np.abs(rho).max())
+    tolerance = AXIOM_TOLERANCE * max(float(np.abs(products).max()), images)
     if residuals.max() > tolerance:
         a, b = np.unravel_index(residuals.argmax(), residuals.shape)
         raise RepresentationError(
@@ -394,24 +481,46 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None) -> Li
             tolerance=tolerance,
             indices=(int(a), int(b)),
         )
+
+
+def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> None:
+    C = ideal.structure_constants
+    defect = np.einsum("ijk,alk->aijl", C, rho)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
+    defect -= np.einsum("aki,kjl->aijl", rho, C) + np.einsum("akj,ikl->aijl", rho, C)
+    residuals = np.abs(defect).max(axis=3)
+    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(rho).max())
+    if residuals.max() > tolerance:
+        a, i, j = (int(index) for index in np.unravel_index(residuals.argmax(), residuals.shape))
+        raise RepresentationError(
+            f"rho(e{a + 1}) of {g.name} is not a derivation D of {ideal.name}: D [u{i + 1}, u{j + 1}] differs from "
+            f"[D u{i + 1}, u{j + 1}] + [u{i + 1}, D u{j + 1}] by {residuals.max():.3g} (tolerance {tolerance:.1g})",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(a, i, j),
+        )
+
+
+def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
     m, dim = rho.shape[1], g.dim + rho.shape[1]
-    constants = np.zeros((dim, dim, dim))
-    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
-    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
-    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
     affine = np.zeros((dim, m + 1, m + 1))
     affine[: g.dim, :m, :m] = rho
     affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
-    basis: np.ndarray | None = affine
-    if len(_row_space(rho.reshape(g.dim, -1))) < g.dim:
-        basis = None
-        if g.basis is not None:
-            upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
-            basis = np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
-    return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=basis)
+    sizes = np.linalg.norm(rho, axis=(1, 2))
+    if sizes.all() and len(_row_space(rho.reshape(g.dim, -1) / sizes[:, None])) == g.dim:
+        return affine
+    if g.basis is None:
+        return None
+    upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
+    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
+    """The names of all basis elements, where all have some and no two the same."""
+    names = [name for g in algebras for name in g.basis_names or ()]
+    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
 
 
 def _checked_constants(values) -> np.ndarray:
@@ -462,19 +571,23 @@ def _check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None)
         )
 
 
-def _without_rounding(constants: np.ndarray, columns: np.ndarray, commutators: np.ndarray) -> np.ndarray:
-    """The constants snapped to nearby fractions, if the commutators then hold at least as well."""
-    snapped = np.array([_nearest_fraction(c) for c in constants.ravel()]).reshape(constants.shape)
-    defect = np.abs(columns @ snapped.reshape(len(constants) ** 2, -1).T - commutators).max()
-    scale = max(1.0, float(np.abs(commutators).max()))
-    return snapped if defect <= 4 * np.finfo(float).eps * scale else constants
+def _without_rounding(
+    constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
+) -> np.ndarray:
+    """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.
+
+    The constants are those of matrices of norm 1, the ``columns``.
+    """
+    scaled = constants * scales
+    nearest = [_nearest_fraction(c, scale) for c, scale in zip(scaled.ravel(), scales.ravel(), strict=True)]
+    snapped = np.array(nearest).reshape(constants.shape)
+    defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
+    return snapped if defect <= 4 * np.finfo(float).eps else scaled
 
 
-def _nearest_fraction(value: float) -> float:
-    from fractions import Fraction
-
+def _nearest_fraction(value: float, scale: float) -> float:
     nearest = float(Fraction(float(value)).limit_denominator(64))
-    return nearest if abs(nearest - value) < 1e-12 * max(1.0, abs(value)) else float(value)
+    return nearest if abs(nearest - value) < 1e-12 * max(scale, abs(value)) else float(value)
 
 
 def _real_columns(matrices: np.ndarray) -> np.ndarray:
@@ -483,11 +596,14 @@ def _real_columns(matrices: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1).T
 
 
-def _row_space(rows: np.ndarray, scale: float | None = None) -> np.ndarray:
-    """An orthonormal basis of the span of the rows; singular values below 1e-10 of ``scale`` count as zero."""
+def _killing_form(constants: np.ndarray) -> np.ndarray:
+    return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
+
+
+def _row_space(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the span of rows of size 1; what is smaller than STRUCTURE_TOLERANCE is rounding."""
     _, singular, basis = np.linalg.svd(rows, full_matrices=False)
-    scale = float(singular.max(initial=0.0)) if scale is None else scale
-    return basis[singular > 1e-10 * max(scale, 1e-300)]
+    return basis[singular > STRUCTURE_TOLERANCE]
 
 
 def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
@@ -538,8 +654,7 @@ def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
             residual=float(residual),
             tolerance=tolerance,
         )
-    snapped = np.asarray(np.round(theta))
-    return snapped if np.abs(snapped - theta).max() < 1e-10 else theta
+    return theta
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -25,11 +25,15 @@ from . import matrix_functions as general
 from ._arrays import at, first, is_traced, real_components, square_matrices
 from .errors import ComponentError, DomainError, LieAlgebraError
 from .lie_algebra import LieAlgebra
+from .symmetric import rotation_log
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
 
-_LOG_NEEDS = f"principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}"
+_LOG_NEEDS = (
+    f"principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
+    "to choose from (not where one plane of SO(n), SE(2) or SE(3) is turned by pi)"
+)
 
 _registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
 
@@ -153,15 +157,18 @@ class MatrixGroup:
         Parameters
         ----------
         g : array, shape (..., m, m)
-            Within 1e-8 of the group, and with every eigenvalue at an angle below pi - 1e-8 from the positive axis: a
-            rotation by less than pi.
+            Within 1e-8 of the group, and with every eigenvalue at an angle below pi - 1e-8 from the positive axis. In
+            SO(n), SE(2) and SE(3) one plane may be turned by pi.
 
         Returns
         -------
         array, shape (..., dim)
             Accurate to rounding; where the logarithm itself is ill-conditioned, as for a pair of eigenvalues at the
             angles +-(pi - d) in a noncompact group, to about 1e-15/d. Its derivative is that of x along the group:
-            changes of g that leave the group are projected out.
+            changes of g that leave the group are projected out. Of the two logarithms of a half turn, pi times an axis
+            and its negative, the one is returned whose first component that is not zero (1e-8 of the axis) is positive.
+            That holds up to 1e-8 from the half turn, where the angle may be larger than pi by as much. More than one
+            plane turned by pi, and -I in SU(2), have a continuum of logarithms with nothing to choose one by.
 
         Raises
         ------
@@ -312,6 +319,7 @@ def SO(n: int) -> MatrixGroup:
         catalogue.so(n),
         closed.unitary_defect,
         closed.unitary_inverse,
+        log_map=rotation_log,
         restore_map=general.orthonormalized,
     )
     if n == 2:
@@ -328,8 +336,10 @@ def SE(n: int) -> MatrixGroup:
     group = MatrixGroup(
         f"SE({n})", catalogue.se(n), closed.rigid_defect, closed.rigid_inverse, restore_map=closed.rigid_restored
     )
+    if n == 2:
+        return replace(group, log_map=closed.rigid_log)
     if n == 3:
-        group = replace(group, exp_map=closed.se3_exp, log_map=closed.se3_log)
+        group = replace(group, exp_map=closed.se3_exp, log_map=closed.rigid_log)
         return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
     return group
 

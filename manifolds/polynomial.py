@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from numbers import Rational, Real
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._arrays import real_components
+from ._names import checked_names, component_names
 from .errors import ComponentError, ShapeError
 
 Coefficient = Fraction | float
@@ -37,10 +39,13 @@ class Polynomial:
     dim : int
     terms : tuple of (exponents, coefficient)
         The nonzero terms, in lexicographic order: ``mu1**2`` before ``mu1*mu2`` before ``mu2**3``.
+    names : tuple of str, or None
+        What the components are printed as, if not as ``mu1``, ``mu2``, …; see :meth:`with_names`.
     """
 
     dim: int
     terms: tuple[tuple[tuple[int, ...], Coefficient], ...]
+    names: tuple[str, ...] | None = field(compare=False)
 
     __array_ufunc__ = None  # lets np.float64(2) * polynomial reach __rmul__
 
@@ -59,6 +64,13 @@ class Polynomial:
         nonzero = ((power, terms[power]) for power in sorted(terms, reverse=True) if terms[power])
         object.__setattr__(self, "dim", powers.shape[1])
         object.__setattr__(self, "terms", tuple(nonzero))
+        object.__setattr__(self, "names", None)
+
+    def with_names(self, *names: str) -> Polynomial:
+        """The same polynomial, equal to this one, printed with these names of its components."""
+        named = copy(self)
+        object.__setattr__(named, "names", checked_names(names, self.dim))
+        return named
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -107,14 +119,15 @@ class Polynomial:
 
     def __add__(self, other) -> Polynomial:
         other = self._operand(other)
-        return NotImplemented if other is None else self._from(self.terms + other.terms)
+        return NotImplemented if other is None else self._from(self.terms + other.terms, other.names)
 
     def __mul__(self, other) -> Polynomial:
         other = self._operand(other)
         if other is None:
             return NotImplemented
         return self._from(
-            [(tuple(i + j for i, j in zip(p, q, strict=True)), c * d) for p, c in self.terms for q, d in other.terms]
+            [(tuple(i + j for i, j in zip(p, q, strict=True)), c * d) for p, c in self.terms for q, d in other.terms],
+            other.names,
         )
 
     __radd__ = __add__
@@ -137,14 +150,18 @@ class Polynomial:
             raise ShapeError(f"polynomials in {self.dim} and in {other.dim} variables do not combine")
         return other if isinstance(other, Polynomial) else None
 
-    def _from(self, terms) -> Polynomial:
+    def _from(self, terms, names=None) -> Polynomial:
+        """A polynomial in the same components, with the names of this one or those given."""
         powers = np.array([power for power, _ in terms], dtype=np.int64).reshape(len(terms), self.dim)
-        return Polynomial(powers, [coefficient for _, coefficient in terms])
+        made = Polynomial(powers, [coefficient for _, coefficient in terms])
+        names = self.names or names
+        return made if names is None else made.with_names(*names)
 
     # -- printing ---------------------------------------------------------------------------------------------------
 
     def __str__(self) -> str:
-        text = " + ".join(_term(power, coefficient) for power, coefficient in self.terms)
+        names = component_names(self.names, self.dim)
+        text = " + ".join(_term(power, coefficient, names) for power, coefficient in self.terms)
         return text.replace("+ -", "- ") or "0"
 
     def __repr__(self) -> str:
@@ -159,9 +176,9 @@ def _coefficient(value) -> Coefficient:
     return float(value)
 
 
-def _term(power: tuple[int, ...], coefficient: Coefficient) -> str:
+def _term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...]) -> str:
     number = str(coefficient) if isinstance(coefficient, Fraction) else f"{coefficient:.15g}"
-    factors = [f"mu{i + 1}" + (f"**{e}" if e > 1 else "") for i, e in enumerate(power) if e]
+    factors = [name + (f"**{e}" if e > 1 else "") for name, e in zip(names, power, strict=True) if e]
     if factors and number in ("1", "-1"):
         return number[:-1] + "*".join(factors)
     return "*".join([number, *factors])

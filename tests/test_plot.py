@@ -159,6 +159,14 @@ def test_momentum_sphere_shows_the_trajectory(body, relaxed):
     np.testing.assert_allclose(extent, extent[0], rtol=1e-12)  # equal aspect
 
 
+def test_momentum_sphere_is_labelled_by_the_names_of_the_basis(relaxed):
+    algebra = mf.so(3).with_basis_names("Lx", "Ly", "Lz")
+    system = lt.LiePoissonSystem(algebra, lt.Quadratic([0.1, 0.2, 1.0]), lt.Quadratic(np.ones(3)), validate=False)
+    ax = lt.plot.momentum_sphere(relaxed, system).axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()) == ("Lx", "Ly", "Lz")
+    assert "Lx**2 + Ly**2 + Lz**2" in system._casimirs()
+
+
 def test_momentum_sphere_of_a_loaded_solution(body, relaxed, tmp_path):
     loaded = lt.load(relaxed.save(tmp_path / "body.nc"))
     assert labels(lt.plot.momentum_sphere(loaded)) == labels(lt.plot.momentum_sphere(relaxed, body))

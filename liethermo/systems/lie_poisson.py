@@ -79,7 +79,7 @@ class LiePoissonSystem(System):
         return ad.T @ (x + self.dissipation.momentum(dH, ad @ dS))
 
     def casimirs(self) -> dict[str, Energy]:
-        return _recorded_casimirs(self.algebra)
+        return _recorded_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
     def has_all_casimirs(self) -> bool:
@@ -107,7 +107,8 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
 
 
 @functools.cache
-def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
+def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
+    del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
     found: dict[str, Energy] = {}
     count = algebra.casimir_count()
     for degree in range(1, algebra.dim + 1):
@@ -127,7 +128,7 @@ def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
 @functools.cache
 def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
     """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
-    found, x = _recorded_casimirs(algebra).values(), np.random.default_rng(0).standard_normal(algebra.dim)
+    found, x = _recorded_casimirs(algebra, algebra.basis_names).values(), np.random.default_rng(0).standard_normal(algebra.dim)
     if not found or len(found) < algebra.casimir_count():
         return False
     with jax.ensure_compile_time_eval():

@@ -226,7 +226,8 @@ class Space(ABC):
         ------
         DomainError
             If y is at the cut locus of x, as its antipode is on a sphere, or (SU(n) with n > 2, Stiefel) beyond the
-            domain of the logarithm used. Under tracing the result is NaN instead.
+            domain of the logarithm used. Under tracing the result is NaN instead. A rotation by pi in one plane is no
+            error: of its two logarithms the one of :meth:`manifolds.MatrixGroup.log` is returned.
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         v = self._compiled("_log", x, y)

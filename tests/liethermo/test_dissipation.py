@@ -89,6 +89,24 @@ def test_killing_dissipation_works_or_refuses_with_a_reason(g):
         assert refusal.value.residual < 0
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e-6, 1e6])
+def test_killing_dissipation_on_a_basis_of_any_scale(scale):
+    """Whether an algebra is solvable, or minus its Killing form indefinite, has nothing to do with its units."""
+    form = lt.KillingDissipation.inner_product
+
+    def scaled(g):
+        return mf.LieAlgebra.from_structure_constants(scale * g.structure_constants)
+
+    for g in (mf.so(3), mf.sl(2), mf.se(3)):
+        np.testing.assert_allclose(form(scaled(g)), scale**2 * form(g), rtol=1e-12, atol=1e-12 * scale**2)
+    H, S = energy_of(3, 0), lt.Quadratic(np.ones(3))
+    assert lt.LiePoissonSystem(scaled(mf.so(3)), H, S, lt.KillingDissipation()).dissipation.form is not None
+    with pytest.raises(lt.InputError, match=r"solvable.* use ProjectedMetric"):
+        lt.LiePoissonSystem(scaled(mf.se(2)), H, lt.Quadratic(np.diag([0.0, 1, 1])), lt.KillingDissipation())
+    with pytest.raises(lt.IndefiniteError, match="indefinite"):
+        form(scaled(mf.gl(2)))
+
+
 def test_killing_on_so3_is_the_projected_metric():
     """-kappa / 2 is the dot product: rate 1/2 reproduces (2.2) and the relaxed rigid body."""
     g, H, S = mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3))

@@ -110,6 +110,7 @@ STRUCTURE = {
     "sl(3)": (1, 0, 0, 0, 1),
     "sp(1)": (1, 0, 0, 0, 1),
     "sp(2)": (1, 0, 0, 0, 1),
+    "g2": (1, 1, 0, 0, 1),
     "gl(1)": (0, 0, 1, 1, 1),
     "gl(2)": (0, 0, 0, 0, 1),
     "se(2)": (0, 0, 1, 0, 1),
@@ -146,6 +147,87 @@ def test_structural_predicates(g):
     assert found == tuple(map(bool, STRUCTURE[g.name]))
 
 
+def structure(g):
+    """Everything about the structure that does not depend on a basis."""
+    return {
+        "abelian": g.is_abelian(),
+        "semisimple": g.is_semisimple(),
+        "compact": g.is_compact_type(),
+        "solvable": g.is_solvable(),
+        "nilpotent": g.is_nilpotent(),
+        "unimodular": g.is_unimodular(),
+        "derived series": g.derived_series(),
+        "lower central series": g.lower_central_series(),
+        "signature": g.killing_signature(),
+        "Casimirs": g.casimir_count(),
+    }
+
+
+def random_basis(dim, rng, condition=1e2):
+    """Columns: the elements of a random basis of this condition number."""
+    left, right = (np.linalg.qr(rng.standard_normal((dim, dim)))[0] for _ in range(2))
+    return left * np.geomspace(1.0, 1.0 / condition, dim) @ right
+
+
+def in_basis(g, columns):
+    """The algebra from floating-point constants, in the basis of the columns."""
+    constants = np.einsum(
+        "ai,bj,abc,kc->ijk", columns, columns, g.structure_constants, np.linalg.inv(columns), optimize=True
+    )
+    return mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2, name=f"{g.name} moved")
+
+
+def _triangular(n):
+    units = [np.eye(n)[:, [i]] * np.eye(n)[j] for i in range(n) for j in range(i + 1, n)]
+    return mf.LieAlgebra.from_matrices(units, name=f"upper triangular {n}")
+
+
+@pytest.mark.parametrize("g", [*ALGEBRAS, _triangular(5)], ids=algebra_id)
+def test_structure_does_not_depend_on_the_basis(g):
+    """Random bases, scaled as a whole and each element by itself."""
+    rng, expected = np.random.default_rng(20), structure(g)
+    for scale in (1e-6, 1.0, 1e6):
+        assert structure(in_basis(g, scale * random_basis(g.dim, rng))) == expected
+    units = 10.0 ** rng.uniform(-3, 3, g.dim)
+    assert structure(in_basis(g, np.diag(units))) == expected
+    assert structure(in_basis(g, random_basis(g.dim, rng) * units)) == expected
+
+
+def test_a_nilpotent_algebra_with_rounding_is_not_semisimple():
+    """Its Killing form is rounding, of either sign, and no scale but that of the constants shows it."""
+    g = mf.heisenberg(1)
+    for seed in range(10):
+        h = in_basis(g, np.random.default_rng(seed).standard_normal((3, 3)))
+        assert not h.is_semisimple()
+        assert not h.is_compact_type()
+        assert h.is_nilpotent()
+
+
+def test_matrices_that_commute_to_rounding():
+    """Their commutators are rounding, not constants that break the Jacobi identity."""
+    rng = np.random.default_rng(22)
+    columns = random_basis(6, rng, 1e3)
+    diagonal = [columns * rng.standard_normal(6) @ np.linalg.inv(columns) for _ in range(4)]
+    assert mf.LieAlgebra.from_matrices(diagonal).is_abelian()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-5, 1e7])
+def test_matrices_of_any_size(scale):
+    """Closure and dependence are judged relative to the matrices; so is what counts as a zero constant."""
+    g = mf.LieAlgebra.from_matrices(scale * np.asarray(mf.so(3).basis))
+    np.testing.assert_allclose(g.structure_constants, scale * mf.so(3).structure_constants, rtol=1e-14)
+    assert g.is_compact_type()
+    units = scale * np.array([1.0, 1e-9, 1e3])
+    h = mf.LieAlgebra.from_matrices(units[:, None, None] * np.asarray(mf.sl(2).basis))
+    assert structure(h) == structure(mf.sl(2))
+    with pytest.raises(mf.ClosureError, match="leaves the span"):
+        mf.LieAlgebra.from_matrices(scale * np.asarray(mf.so(3).basis)[:2])
+    with pytest.raises(mf.ClosureError, match="e2 is the zero matrix"):
+        mf.LieAlgebra.from_matrices(scale * np.asarray([np.eye(2), np.zeros((2, 2))]))
+    with pytest.raises(mf.LieAlgebraError, match="not in g"):
+        g.vee(scale * np.eye(3))
+
+
 @each_algebra
 def test_cartan_involution(g):
     """theta is an involutive automorphism and -kappa(x, theta y) is positive definite; none without semisimplicity."""
@@ -158,6 +240,16 @@ def test_cartan_involution(g):
     assert close(theta @ theta, np.eye(g.dim), 10.0)
     assert close(theta @ np.asarray(g.bracket(x, y)), g.bracket(theta @ x, theta @ y), 100.0)
     assert np.linalg.eigvalsh(-g.killing_form() @ theta).min() > 0.1
+
+
+def test_cartan_involution_in_a_basis_of_any_scale():
+    g, rng = mf.sl(3), np.random.default_rng(21)
+    for columns in (1e-6 * random_basis(8, rng, 10.0), np.diag(10.0 ** rng.uniform(-3, 3, 8))):
+        h = in_basis(g, columns)
+        theta = h.cartan_involution()
+        assert np.abs(theta @ theta - np.eye(8)).max() < 1e-8 * np.abs(theta).max() ** 2
+        form, units = -h.killing_form() @ theta, np.linalg.norm(columns, axis=0)
+        assert np.linalg.eigvalsh((form + form.T) / 2 / np.outer(units, units)).min() > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -210,6 +302,73 @@ def test_sums():
         mf.semidirect_sum(mf.so(3), 2 * np.asarray(mf.so(3).basis))
     with pytest.raises(mf.ShapeError):
         mf.semidirect_sum(mf.so(3), np.zeros((2, 2, 2)))
+
+
+def test_semidirect_sums_by_derivations():
+    """An algebra acts on another: the oscillator algebra is R acting on heisenberg(1) by a rotation of q and p."""
+    rotation = np.zeros((1, 3, 3))
+    rotation[0, 1, 0], rotation[0, 0, 1] = 1.0, -1.0
+    line, heisenberg = mf.abelian(1), mf.heisenberg(1)
+    g = mf.semidirect_sum(line, rotation, ideal=heisenberg)
+    assert (g.name, g.dim, g.derived_series(), g.casimir_count()) == ("abelian(1) x heisenberg(1)", 4, [4, 3, 1, 0], 2)
+    assert np.array_equal(g.bracket([1, 0, 0, 0], [0, 1, 0, 0]), [0, 0, 1, 0])
+    assert np.array_equal(g.bracket([0, 1, 0, 0], [0, 0, 1, 0]), [0, 0, 0, 1])
+    assert str(g.casimirs(2)[0]) == "2*mu1*mu4 + mu2**2 + mu3**2"
+    assert g.basis is None  # a centre: the adjoint matrices are not faithful
+    # sl(2) acts on heisenberg(1) too: on the plane of q and p, and z is left alone
+    plane = np.zeros((3, 3, 3))
+    plane[:, :2, :2] = mf.sl(2).basis
+    jacobi = mf.semidirect_sum(mf.sl(2), plane, "jacobi", ideal=heisenberg)
+    assert (jacobi.name, jacobi.dim, jacobi.is_unimodular(), jacobi.casimir_count()) == ("jacobi", 6, True, 2)
+    # an algebra acts on itself by its adjoint matrices; g x g is then so(3) + so(3) in another basis
+    so3 = mf.so(3)
+    twice = mf.semidirect_sum(so3, so3.ad, ideal=so3)
+    assert structure(twice) == structure(mf.so(4))
+    x, y = vectors(twice, 3, 2)
+    assert close(twice.vee(twice.hat(x) @ twice.hat(y) - twice.hat(y) @ twice.hat(x)), twice.bracket(x, y), 100.0)
+    # on an abelian ideal it is the sum with a vector space
+    assert np.array_equal(
+        mf.semidirect_sum(so3, so3.basis, ideal=mf.abelian(3)).structure_constants, mf.se(3).structure_constants
+    )
+    scaling = np.diag([1.0, 1.0, 1.0])[None]  # z must scale by 2
+    with pytest.raises(
+        mf.RepresentationError, match=r"rho\(e1\) .* not a derivation D of heisenberg\(1\): D \[u1, u2\]"
+    ):
+        mf.semidirect_sum(line, scaling, ideal=heisenberg)
+    with pytest.raises(mf.RepresentationError, match="not a representation"):
+        mf.semidirect_sum(so3, 2 * so3.ad(np.eye(3)), ideal=so3)
+    with pytest.raises(mf.ShapeError, match=r"shape \(1, 3, 3\)"):
+        mf.semidirect_sum(line, np.zeros((1, 2, 2)), ideal=heisenberg)
+    with pytest.raises(mf.ComponentError, match="ideal"):
+        mf.semidirect_sum(line, rotation, ideal=heisenberg.structure_constants)
+
+
+def test_names_of_basis_elements():
+    g = mf.se(2).with_basis_names("L", "Px", "Py")
+    assert g == mf.se(2)
+    assert hash(g) == hash(mf.se(2))
+    [F] = g.casimirs(2)
+    assert str(F) == "Px**2 + Py**2"
+    assert mf.se(2).casimirs(2)[0] == F
+    assert str(mf.se(2).casimirs(2)[0]) == "mu2**2 + mu3**2"  # although both are remembered
+    assert str(2 * F * F - 1) == "2*Px**4 + 4*Px**2*Py**2 + 2*Py**4 - 1"
+    assert [str(dF) for dF in F.gradient()] == ["0", "2*Px", "2*Py"]
+    by_constants = mf.LieAlgebra.from_structure_constants(g.structure_constants, basis_names=g.basis_names)
+    by_matrices = mf.LieAlgebra.from_matrices(g.basis, basis_names=["L", "Px", "Py"])
+    assert by_constants.basis_names == by_matrices.basis_names == ("L", "Px", "Py")
+    spin = mf.so(3).with_basis_names("Sx", "Sy", "Sz")
+    both = mf.direct_sum(g, spin)
+    assert both.basis_names == ("L", "Px", "Py", "Sx", "Sy", "Sz")
+    assert mf.direct_sum(spin, spin).basis_names is None
+    assert mf.direct_sum(spin, mf.so(3)).basis_names is None
+    assert mf.semidirect_sum(spin, spin.ad, ideal=mf.so(3).with_basis_names("a", "b", "c")).basis_names[3:] == tuple(
+        "abc"
+    )
+    sextic = mf.g2().with_basis_names(*"abcdefghijklmn").casimirs(6)[0]
+    assert sextic.names == tuple("abcdefghijklmn")
+    for names in (("a", "b"), ("a", "b", "b"), ("a", "b", "1"), ("a", "b", 3), "abc"):
+        with pytest.raises(mf.ParameterError, match="3 basis elements need 3 different names"):
+            mf.LieAlgebra.from_matrices(g.basis, basis_names=names)
 
 
 # -- what is refused ----------------------------------------------------------------------------------------------

@@ -570,9 +570,8 @@ def test_a_vector_that_is_not_tangent():
     ("space", "x", "y", "message"),
     [
         (mf.Sphere(2), NORTH, -NORTH, r"S\^2: log\(x, y\) is not defined: y is within 0 of the antipode"),
-        (mf.SpecialOrthogonal(3), np.eye(3), np.diag([1.0, -1.0, -1.0]), r"x\^-1 y has the eigenvalue -1.* below pi"),
+        (mf.SpecialOrthogonal(4), np.eye(4), -np.eye(4), r"x\^-1 y has the eigenvalue -1.* below pi"),
         (mf.SpecialUnitary(2), np.eye(2), -np.eye(2), r"SU\(2\): log\(x, y\) is not defined"),
-        (mf.SpecialEuclidean(3, 0.5), np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), "has the eigenvalue -1"),
         (mf.Sphere(2) ** 2, [NORTH, NORTH], [NORTH, -NORTH], r"in copy 1, y is within 0 of the antipode"),
         (mf.Euclidean(1) * mf.Sphere(2), [0, *NORTH], [0, *-NORTH], r"in factor 1, S\^2, y is within 0"),
         pytest.param(
@@ -588,6 +587,15 @@ def test_a_vector_that_is_not_tangent():
 def test_points_at_the_cut_locus(space, x, y, message):
     with pytest.raises(mf.DomainError, match=message):
         space.log(x, y)
+
+
+@pytest.mark.parametrize("space", [mf.SpecialOrthogonal(3), mf.SpecialEuclidean(3, 0.5)], ids=lambda S: S.name)
+def test_a_rotation_by_pi_has_a_logarithm(space):
+    n = space.shape[0]
+    x, y = np.eye(n), np.diag([1.0, -1.0, -1.0, 1.0][:n])
+    assert float(space.distance(x, y)) == pytest.approx(np.pi, rel=1e-15)
+    assert close(space.exp(x, space.log(x, y)), y)
+    assert float(space.velocity(x, space.log(x, y))[0]) == pytest.approx(np.pi, rel=1e-15)  # of -pi and pi
 
 
 def test_arrays_of_the_wrong_kind():

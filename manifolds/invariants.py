@@ -1,0 +1,351 @@
+"""Casimirs of semisimple and reductive algebras by invariant theory: traces of powers of a matrix linear in mu.
+
+Let ``X(mu) = sum_a mu_a X_a`` be equivariant: ``X(Ad*_g mu)`` is ``X(mu)`` conjugated. Then ``tr(W X(mu)**k)`` is a
+Casimir for every W that commutes with all of X. Such X come from a representation with a nondegenerate trace form,
+where X(mu) represents the element dual to mu: the matrices of the algebra, or its adjoint ones; and from the second
+derivatives of a cubic Casimir, with an index lowered by the Killing form. In even dimension the matrices of so(p, q)
+have a Pfaffian besides.
+
+The generators of the ring of Casimirs are algebraically independent, as many as the rank, and their degrees add up to
+``(dim + rank) / 2`` [Chevalley, Solomon]. Casimirs that are independent and whose degrees have this sum generate it: so
+a set is known to be complete.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import permutations
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._arrays import real_components
+from ._names import checked_names
+from ._null_space import numerical_null_space
+from .errors import LieAlgebraError, ShapeError
+from .lie_algebra import LieAlgebra
+from .polynomial import Polynomial
+
+LARGEST_COMMUTANT = 40
+"""Matrices up to this size are searched for others that commute with them."""
+
+LARGEST_PFAFFIAN = 20000
+"""Most products in a Pfaffian that is written out."""
+
+LARGEST_EXPANSION = 200_000
+"""Most monomials in a trace that is written out."""
+
+INDEPENDENT = 1e-6
+"""Sine of the angle from the span of other gradients above which a gradient is independent of them."""
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, init=False, repr=False, eq=False)
+class TracePolynomial:
+    """The homogeneous polynomial ``tr(W X(mu)**degree)``, ``X(mu) = sum_a mu_a X_a``, as powers of matrices.
+
+    It stands for a Casimir with too many monomials to be written out. Like a :class:`Polynomial` it is immutable,
+    hashable, a static leaf of a pytree, and callable on batches; its derivatives are JAX's (``jax.grad``). A value
+    costs a few products of matrices.
+
+    Parameters
+    ----------
+    matrices : array of float, shape (dim, m, m)
+        The X_a.
+    degree : int
+    weight : array of float, shape (m, m), optional
+        W, the identity by default.
+    label : str
+        What ``str`` says.
+
+    Attributes
+    ----------
+    dim, degree : int
+    matrices, weight : ndarray, read-only
+    """
+
+    matrices: np.ndarray
+    degree: int
+    weight: np.ndarray
+    label: str
+    names: tuple[str, ...] | None
+
+    def __init__(self, matrices, degree: int, weight=None, label: str | None = None):
+        X = np.array(matrices, dtype=np.float64)
+        if X.ndim != 3 or X.shape[1] != X.shape[2]:
+            raise ShapeError(f"the matrices of a trace have shape (dim, m, m), not {X.shape}")
+        W = np.eye(X.shape[1]) if weight is None else np.array(weight, dtype=np.float64)
+        if W.shape != X.shape[1:]:
+            raise ShapeError(f"the weight of a trace has shape {X.shape[1:]}, not {W.shape}")
+        X.setflags(write=False)
+        W.setflags(write=False)
+        label = label or f"tr(X**{degree})"
+        attributes = {"matrices": X, "degree": int(degree), "weight": W, "label": label, "names": None}
+        for name, value in attributes.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def dim(self) -> int:
+        """Number of components of mu."""
+        return self.matrices.shape[0]
+
+    def with_names(self, *names: str) -> TracePolynomial:
+        """The same trace; names show where it is :meth:`expanded`."""
+        named = TracePolynomial(self.matrices, self.degree, self.weight, self.label)
+        object.__setattr__(named, "names", checked_names(names, self.dim))
+        return named
+
+    def __call__(self, mu) -> jax.Array:
+        """The value at ``mu``, shape (..., dim) -> (...)."""
+        X = jnp.einsum("...a,aij->...ij", real_components(mu, self.dim, "mu"), self.matrices)
+        half = _power(X, self.degree // 2)
+        other = half @ X if self.degree % 2 else half
+        return jnp.einsum("...ij,...ji->...", self.weight @ half, other)
+
+    def expanded(self) -> Polynomial:
+        """The same written out: a :class:`Polynomial` with coefficients of float, those that are rounding left out.
+
+        Raises
+        ------
+        LieAlgebraError
+            If there are more than 200,000 monomials of this degree.
+        """
+        size = math.comb(self.dim + self.degree - 1, self.degree)
+        if size > LARGEST_EXPANSION:
+            raise LieAlgebraError(
+                f"{self} has up to {size} monomials, more than the {LARGEST_EXPANSION} that are written out"
+            )
+        coefficients, m = self.weight[None], self.weight.shape[0]
+        factors = np.zeros((1, 0), dtype=np.int64)
+        for _ in range(self.degree):  # the matrix W X**k: a coefficient for each monomial, given by its sorted factors
+            products = np.einsum("nij,ajk->naik", coefficients, self.matrices, optimize=True).reshape(-1, m, m)
+            last = np.tile(np.arange(self.dim), len(factors))[:, None]
+            longer = np.hstack([np.repeat(factors, self.dim, axis=0), last])
+            factors, row = np.unique(np.sort(longer, axis=1), axis=0, return_inverse=True)
+            coefficients = np.zeros((len(factors), m, m))
+            np.add.at(coefficients, row.ravel(), products)
+        values = np.einsum("nii->n", coefficients)
+        kept = np.abs(values) > 1e-13 * np.abs(values).max()
+        exponents = (factors[kept][:, :, None] == np.arange(self.dim)).sum(axis=1)
+        written = Polynomial(exponents, values[kept].tolist())
+        return written if self.names is None else written.with_names(*self.names)
+
+    def _gradient(self, mu: np.ndarray) -> np.ndarray:
+        """Where W commutes with X; zero where it is rounding."""
+        X = np.einsum("a,aij->ij", mu, self.matrices)
+        product = self.weight @ np.linalg.matrix_power(X, self.degree - 1)
+        bound = np.linalg.norm(self.weight) * np.linalg.norm(X) ** (self.degree - 1) * np.linalg.norm(self.matrices)
+        gradient = np.einsum("ij,aji->a", product, self.matrices)
+        return self.degree * np.where(np.linalg.norm(gradient) > 1e-12 * bound, gradient, 0.0)
+
+    @cached_property
+    def _key(self):
+        return self.matrices.shape, self.matrices.tobytes(), self.degree, self.weight.tobytes()
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, TracePolynomial) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __str__(self) -> str:
+        return self.label
+
+    def __repr__(self) -> str:
+        return f"<TracePolynomial {self.label}, X of shape {self.matrices.shape[1:]}>"
+
+
+def _power(X, exponent: int):
+    """``X**exponent``, exponent >= 0, by squaring."""
+    result = None
+    while exponent:
+        if exponent % 2:
+            result = X if result is None else result @ X
+        exponent //= 2
+        if exponent:
+            X = X @ X
+    return jnp.broadcast_to(jnp.eye(X.shape[-1]), X.shape) if result is None else result
+
+
+# -- complete sets ------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def fundamental_invariants(g: LieAlgebra) -> tuple[TracePolynomial | Polynomial, ...] | None:
+    """Casimirs that generate all polynomial ones, in the order of their degrees; None where no such set is found."""
+    sources: list[_Source] = []
+    for source in _sources(g):
+        sources.append(source)
+        found = _independent_invariants(g, sources)
+        if found is not None:
+            return found
+    return None
+
+
+def _independent_invariants(g: LieAlgebra, sources: list[_Source]) -> tuple[TracePolynomial | Polynomial, ...] | None:
+    from .casimirs import casimir_count
+
+    count = casimir_count(g)
+    total = (g.dim + count) // 2
+    points = np.random.default_rng(0).standard_normal((3, g.dim))
+    found: list[TracePolynomial | Polynomial] = []
+    spans = [np.zeros((0, g.dim)) for _ in points]
+    for degree in range(1, total + 1):
+        for F in (F for source in sources for F in source.invariants(degree)):
+            gradients = [_gradient_at(F, mu) for mu in points]
+            if not all(_is_invariant(g, row, mu) for row, mu in zip(gradients, points, strict=True)):
+                return None  # an algebra whose constants are too inaccurate
+            wider = [_wider(span, row) for span, row in zip(spans, gradients, strict=True)]
+            if all(len(new) > len(old) for new, old in zip(wider, spans, strict=True)):
+                spans = wider
+                found.append(F)
+        if len(found) >= count:
+            break
+    complete = len(found) == count and sum(F.degree for F in found) == total
+    return tuple(found) if complete else None
+
+
+def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
+    return F._gradient(mu) if isinstance(F, TracePolynomial) else np.asarray(jax.grad(F)(mu))
+
+
+def _is_invariant(g: LieAlgebra, gradient: np.ndarray, mu: np.ndarray) -> bool:
+    motion = np.einsum("abc,a,c->b", g.structure_constants, gradient, mu)
+    size = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
+    return bool(np.linalg.norm(motion) <= 1e-10 * size)
+
+
+def _wider(span: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """The orthonormal rows, and the direction of the part of ``row`` orthogonal to them if it is a part that counts."""
+    rest = row - span.T @ (span @ row)
+    rest -= span.T @ (span @ rest)
+    size = np.linalg.norm(rest)
+    return np.vstack([span, rest / size]) if size > INDEPENDENT * np.linalg.norm(row) else span
+
+
+class _Source(NamedTuple):
+    """Equivariant matrices X_a, those that commute with all of them, and the Pfaffian or None."""
+
+    name: str
+    matrices: np.ndarray
+    weights: list[np.ndarray]
+    pfaffian: Polynomial | None = None
+
+    def invariants(self, degree: int) -> Iterator[TracePolynomial | Polynomial]:
+        power = self.name if degree == 1 else f"{self.name}**{degree}"
+        for i, W in enumerate(self.weights):
+            yield TracePolynomial(self.matrices, degree, W, f"tr(W{i} {power})" if i else f"tr({power})")
+        if self.pfaffian is not None and self.pfaffian.degree == degree:
+            yield self.pfaffian
+
+
+def _sources(g: LieAlgebra) -> Iterator[_Source]:
+    """The cheap ones first: the matrices of the algebra, the adjoint ones, the second derivatives of cubic Casimirs."""
+    if g.basis is not None:
+        basis = _real_matrices(g.basis)
+        X = _dual(basis)
+        if X is not None:
+            yield _Source("X", X, _commutant(X, g.name), _pfaffian(basis, X, g.name))
+    if not g.is_semisimple():
+        return
+    ad = g.structure_constants.swapaxes(1, 2)
+    X = np.einsum("ab,bij->aij", np.linalg.inv(g.killing_form()), ad)
+    yield _Source("ad(X)", X, _commutant(X, g.name))
+    for i, cubic in enumerate(_cubics(g)):
+        D = _third_derivatives(cubic) @ g.killing_form()  # from g to g* to g
+        yield _Source(f"D{i + 1}", D, [np.eye(g.dim)])
+
+
+def _cubics(g: LieAlgebra) -> list[Polynomial]:
+    from .casimirs import _new_casimirs
+
+    try:
+        return list(_new_casimirs(g, 3))
+    except LieAlgebraError:  # too many monomials, or no clear rank
+        return []
+
+
+def _third_derivatives(cubic: Polynomial) -> np.ndarray:
+    derivatives = np.zeros((cubic.dim,) * 3)
+    for power, coefficient in cubic.terms:
+        value = float(coefficient) * math.prod(math.factorial(e) for e in power)
+        for place in set(permutations(np.repeat(np.arange(cubic.dim), power).tolist())):
+            derivatives[place] = value
+    return derivatives
+
+
+def _real_matrices(basis: np.ndarray) -> np.ndarray:
+    """Complex matrices of size m as real ones of size 2m."""
+    if not np.iscomplexobj(basis):
+        return np.asarray(basis)
+    return np.block([[basis.real, -basis.imag], [basis.imag, basis.real]])
+
+
+def _dual(basis: np.ndarray) -> np.ndarray | None:
+    """The matrices X_a of ``X(mu)``, dual by the form ``tr(xy)``; None where that is degenerate.
+
+    Only a reductive algebra has a nondegenerate one.
+    """
+    form = np.einsum("aij,bji->ab", basis, basis)
+    sizes = np.linalg.norm(basis, axis=(1, 2))
+    if np.abs(np.linalg.eigvalsh(form / np.outer(sizes, sizes))).min() < 1e-8:
+        return None
+    return np.linalg.solve(form, basis.reshape(len(basis), -1)).reshape(basis.shape)
+
+
+def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
+    """A basis of the matrices that commute with all of X, the identity first."""
+    m = X.shape[1]
+    identity = np.eye(m)
+    if m > LARGEST_COMMUTANT:
+        return [identity]
+    random = np.random.default_rng(1).standard_normal((2, len(X)))  # two elements generate a semisimple algebra
+    generic = np.einsum("ra,aij->rij", random / np.abs(X).max(), X)
+    conditions = np.concatenate([np.kron(identity, x.T) - np.kron(x, identity) for x in generic])
+    found = numerical_null_space(conditions, name).reshape(-1, m, m)
+    return [identity, *found[1:]]
+
+
+def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
+    """Of ``J X(mu)``, where the matrices keep one form J alone, up to a factor, and it is symmetric: so(p, q)."""
+    m = X.shape[1]
+    if m % 2 or m > LARGEST_COMMUTANT:
+        return None
+    random = np.random.default_rng(2).standard_normal((2, len(basis)))
+    generic = np.einsum("ra,aij->rij", random / np.abs(basis).max(), basis)
+    conditions = np.concatenate([np.kron(x.T, np.eye(m)) + np.kron(np.eye(m), x.T) for x in generic])
+    forms = numerical_null_space(conditions, name).reshape(-1, m, m)
+    if len(forms) != 1 or not np.allclose(forms[0], forms[0].T, rtol=0.0, atol=1e-9):
+        return None
+    skew = np.einsum("ij,ajk->iak", forms[0], X)
+    skew = (skew - skew.transpose(2, 1, 0)) / 2
+    skew /= np.abs(skew).max()
+    skew[np.abs(skew) < 1e-12] = 0.0
+    nearest = np.rint(skew)
+    skew = nearest if np.abs(skew - nearest).max() < 1e-12 else skew
+    terms = max(int((skew[i, :, j] != 0).sum()) for i in range(m) for j in range(i))
+    if terms ** (m // 2) * math.prod(range(m - 1, 0, -2)) > LARGEST_PFAFFIAN:
+        return None
+    number, units = int if skew is nearest else float, np.eye(len(X), dtype=np.int64)
+    entries = {(i, j): Polynomial(units, [number(c) for c in skew[i, :, j]]) for i in range(m) for j in range(i + 1, m)}
+    pfaffian = _expanded_pfaffian(entries, tuple(range(m)))
+    return -pfaffian if pfaffian.coefficients[0] < 0 else pfaffian
+
+
+def _expanded_pfaffian(entries: dict, rows: tuple[int, ...]) -> Polynomial:
+    """By its first row; ``entries`` are those above the diagonal."""
+    first, *others = rows
+    if len(rows) == 2:
+        return entries[first, others[0]]
+    total = None
+    for k, j in enumerate(others):
+        minor = _expanded_pfaffian(entries, tuple(r for r in others if r != j))
+        term = entries[first, j] * minor * (-1) ** k
+        total = term if total is None else total + term
+    assert total is not None
+    return total
