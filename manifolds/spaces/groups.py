@@ -77,12 +77,12 @@ class GroupSpace(Space):
         return y @ (self.group.inverse_map(x) @ u)
 
     def _cayley(self, x, v):
-        self.group._need_cayley()
+        self.group._need("cayley")
         assert self.group.cayley_map is not None
         return self._restored(x @ self.group.cayley_map(self.group.algebra, self._velocity(x, v)))
 
     def _inverse_cayley(self, x, y):
-        self.group._need_cayley()
+        self.group._need("cayley")
         return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative(x, y)))
 
     def _restored(self, x):
