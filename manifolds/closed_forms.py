@@ -158,7 +158,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X: unit quaternions."""
+    """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
     X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
     dual = jnp.zeros_like(X)

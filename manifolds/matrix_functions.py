@@ -96,7 +96,7 @@ _NODES, _WEIGHTS = (a[16:] for a in np.polynomial.legendre.leggauss(32))
 
 
 def from_adjoint_cayley(algebra: LieAlgebra, g) -> jax.Array:
-    """The components x, none of them in the centre, with ``cay(ad x) = g``, for g of the size of the algebra, near I."""
+    """The components x, none in the centre, with ``cay(ad x) = g``, for g of the size of the algebra, near I."""
     identity = jnp.eye(algebra.dim)
     return _adjoint(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
 
@@ -242,6 +242,17 @@ def solve_near_identity(a, b) -> jax.Array:
 def inverse(a) -> jax.Array:
     """Inverse matrix, with entries that are not finite where a is singular."""
     return solve(a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape))
+
+
+def spectral_radius(X) -> jax.Array:
+    """Upper bound ``|X^64|^(1/64)`` on the size of the eigenvalues, and little above it."""
+    total = jnp.zeros(X.shape[:-2])
+    for k in range(7):
+        size = jnp.sqrt((jnp.abs(X) ** 2).sum(axis=(-2, -1)))
+        total = total + jnp.log(size) / 2.0**k
+        X = X / jnp.where(size > 0.0, size, 1.0)[..., None, None]
+        X = X @ X
+    return jnp.exp(total)
 
 
 def determinant(a) -> jax.Array:

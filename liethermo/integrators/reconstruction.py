@@ -25,14 +25,14 @@ class WithAttitude(OneStepMethod):
     ``"cayley"`` is Gauss collocation on the matrices, ``G_i = g + h sum_j A_ij G_j hat(xi_j)``: with one stage
     ``g' = g cayley(h xi)``. It keeps what is quadratic in g: that g is orthogonal, unitary or symplectic.
 
-    ``"coadjoint"`` is the same collocation on the matrices Ad(g), ``g' = g adjoint_cayley(x)`` with ``Ad(g') = Ad(g) R``
-    and ``cay(ad x) = R``: with one stage x = h xi. A free body's ``mu' = ad*_xi mu`` is then ``mu' = R^T mu`` at every
-    number of stages, for every step and every energy, as long as the method takes its slopes from Pi alone. So the
-    spatial momentum ``Ad_star(inverse(g), mu)`` is kept to rounding. That R is an adjoint action is a property of the
-    group: it is for SO(2), SO(3), SO(4), SE(2), SE(3), SU(2), SL(2), Sp(1), GL(2) and Heisenberg(n), of which "cayley"
-    is the same on SO(2), SO(3), SE(2) and Heisenberg(n). It is not for SU(n) and SL(n) with n > 2, Sp(n) with n > 1,
-    SO(n) with n > 4, SE(n) with n > 3: there mu' itself is off the coadjoint orbit of mu by O(h^(2s)), since Casimirs
-    of higher degree drift, and no reconstruction can keep the spatial momentum better than to the order of the method.
+    ``"coadjoint"`` is the same collocation on the matrices Ad(g), which ends at ``Ad(g) R``: ``g' = g
+    adjoint_cayley(x)`` with ``cay(ad x) = R``, and with one stage x = h xi. A free body's ``mu' = ad*_xi mu`` gives
+    ``mu' = R^T mu`` at every number of stages, for every step and every energy, as long as the method takes its slopes
+    from Pi alone. So the spatial momentum ``Ad_star(inverse(g), mu)`` is kept to rounding. That R is an adjoint action
+    is a property of the group: it is for SO(2), SO(3), SO(4), SE(2), SE(3), SU(2), SL(2), Sp(1), GL(2) and
+    Heisenberg(n), of which ``"cayley"`` is the same on SO(2), SO(3), SE(2) and Heisenberg(n). It is not for SU(n) and
+    SL(n) with n > 2, Sp(n) with n > 1, SO(n) with n > 4, SE(n) with n > 3: there collocation takes mu off its coadjoint
+    orbit by O(h^(2s)), as Casimirs of higher degree drift, and the spatial momentum is kept to the order of the method.
 
     ``"exp"`` is collocation in the algebra, ``g' = g exp(h sum b_i k_i)`` with ``k_i = dexp^-1(h sum_j A_ij k_j) xi_i``
     [Munthe-Kaas 1999]: with one stage ``g' = g exp(h xi)``. It stays in every group; spatial momenta are kept to the

@@ -278,7 +278,7 @@ def test_the_reconstruction_chosen_for_a_group_of_ones_own(group, kind):
     assert run.audit().passed
     M = np.asarray(own.Ad_star(own.inverse(run.attitude), run.x))
     drift = np.abs(M - M[0]).max()
-    assert (drift <= SPATIAL) is (group.name != "Sp(2)")
+    assert bool(drift <= SPATIAL) == (group.name != "Sp(2)")
 
 
 def heavy_top():
