@@ -29,12 +29,15 @@ class Tolerances:
         Relative drift of the functions that the system conserves.
     residual : float
         Of the stage equations: their rounding plateau.
+    attitude : float
+        Distance from the group, relative to the size of the attitude, as ``manifolds.MatrixGroup.belongs`` has it.
     """
 
     energy: float = 1e-13
     entropy: float = 4 * EPS
     casimirs: float = 1e-12
     residual: float = 1e-12
+    attitude: float = 1e-10
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -139,6 +142,8 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
             AuditRow(name, float(series[-1] - series[0]), None, None, "from outside: the energy above is without")
         )
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
+    if stats.attitude_residual is not None:
+        rows.append(_verdict("attitude in group", stats.attitude_residual, tolerances.attitude))
     status = solution.status  # a run stopped by its user is short, but breaks no law
     failed = not status.ok and status.code != "interrupted"
     rows.append(

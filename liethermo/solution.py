@@ -68,6 +68,8 @@ class Stats:
         Smallest and largest energy met.
     least_entropy_increment, largest_energy_increment : float
         Of one step. These three are None where no step was followed (no step taken, or ``Reference``).
+    attitude_residual : float or None
+        Largest distance from the group of the attitudes kept, relative to their size; None without a group.
     wall_time : float
         Seconds, compilation included.
     """
@@ -81,6 +83,7 @@ class Stats:
     energy_range: tuple[float, float] | None = None
     least_entropy_increment: float | None = None
     largest_energy_increment: float | None = None
+    attitude_residual: float | None = None
     wall_time: float = 0.0
 
     @property

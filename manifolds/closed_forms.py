@@ -167,6 +167,38 @@ def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.where(_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
+def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``(I + X) / sqrt(det(I + X))`` for matrices X of size 2 without trace, times the exponential of half of a trace.
+
+    X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
+    det(I + X) <= 0.
+    """
+    X, identity = algebra.hat(x), jnp.eye(2)
+    half = jnp.trace(X, axis1=-2, axis2=-1)[..., None, None] / 2
+    X = X - half * identity
+    square = -jnp.trace(X @ X, axis1=-2, axis2=-1).real[..., None, None] / 2
+    return jnp.exp(half) * (identity + X) / _root(1.0 + square)
+
+
+def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
+    X, identity = algebra.hat(x), jnp.eye(4)
+    rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
+    dual = jnp.zeros_like(X)
+    for i, j, k, m in [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (3, 1, 0, 2), (2, 3, 0, 1)]:
+        dual = dual.at[..., i, j].set(rows[k][m]).at[..., j, i].set(rows[m][k])
+    factors = [identity + (X + sign * dual) / 2 for sign in (1.0, -1.0)]
+    sizes = [jnp.sqrt((f**2).sum(axis=(-2, -1), keepdims=True)) / 2 for f in factors]
+    return (factors[0] / sizes[0]) @ (factors[1] / sizes[1])
+
+
+def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """Cayley's rotation, and the translation ``(u + w × u / 2) / (1 + |w|^2/4)``: Cayley's of the dual rotation."""
+    w, u = x[..., :3], x[..., 3:]
+    translation = (u + jnp.cross(w, u) / 2) / (1.0 + _square(w) / 4)
+    return affine(so3_cayley(algebra, x), translation[..., None])
+
+
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
     X = algebra.hat(x)
@@ -213,9 +245,7 @@ def invertible_defect(g) -> jax.Array:
 
 def heisenberg_defect(g) -> jax.Array:
     """Of the entries outside the first row and the last column from those of I."""
-    free = np.zeros(g.shape[-2:], dtype=bool)
-    free[0, 1:] = free[:-1, -1] = True
-    return largest(jnp.where(free, 0.0, g - jnp.eye(g.shape[-1])))
+    return largest(jnp.where(_free(g), 0.0, g - jnp.eye(g.shape[-1])))
 
 
 # -- inverses -----------------------------------------------------------------------------------------------------
@@ -255,13 +285,27 @@ def unchanged(g) -> jax.Array:
 
 def unitary_restored(g) -> jax.Array:
     """Orthonormal rows, and determinant 1."""
-    g = orthonormalized(g)
-    return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
+    return unimodular_restored(orthonormalized(g))
 
 
 def rigid_restored(g) -> jax.Array:
     """An orthonormal linear part."""
     return affine(orthonormalized(g[..., :-1, :-1]), g[..., :-1, -1:])
+
+
+def unimodular_restored(g) -> jax.Array:
+    """Determinant 1."""
+    return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
+
+
+def symplectic_restored(g) -> jax.Array:
+    """``g (3 I - g^* g) / 2`` with ``g^* = -J g^T J``, which squares the distance of ``g^* g`` from I."""
+    return 1.5 * g - 0.5 * g @ (symplectic_inverse(g) @ g)
+
+
+def heisenberg_restored(g) -> jax.Array:
+    """The entries outside the first row and the last column are those of I."""
+    return jnp.where(_free(g), g, jnp.eye(g.shape[-1]))
 
 
 def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
@@ -272,6 +316,18 @@ def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _free(g) -> np.ndarray:
+    """Which entries of a matrix of the Heisenberg group are its coordinates."""
+    free = np.zeros(g.shape[-2:], dtype=bool)
+    free[0, 1:] = free[:-1, -1] = True
+    return free
+
+
+def _root(z):
+    """``sqrt(z)``, NaN where z <= 0."""
+    return jnp.sqrt(jnp.where(z > 0.0, z, jnp.nan))
 
 
 def _sinc(t: jax.Array) -> jax.Array:

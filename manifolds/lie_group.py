@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -30,20 +30,30 @@ from .symmetric import rotation_log
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
 
+LEAVES_TOLERANCE = 1e-10
+"""How far from the group, relative to its size, a map may end that is said to stay in it."""
+
 _LOG_NEEDS = (
     f"principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
     "to choose from (not where one plane of SO(n), SE(2) or SE(3) is turned by pi)"
 )
 
 _registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
+_catalogued: set[MatrixGroup] = set()
+"""Groups made by a registered constructor: the property suite has tested their maps, so that no user waits for it."""
 
 
 def register(*arguments: tuple):
     """Decorator: run the property suite on the constructor called with each of these argument tuples."""
 
     def remember(constructor):
-        _registry.extend((constructor, a) for a in arguments)
-        return constructor
+        @wraps(constructor)
+        def build(*arguments, **keywords):
+            _catalogued.add(group := constructor(*arguments, **keywords))
+            return group
+
+        _registry.extend((build, a) for a in arguments)
+        return build
 
     return remember
 
@@ -60,7 +70,8 @@ class MatrixGroup:
     """A group of matrices: its algebra, a measure of distance from it, and the maps that have a special form.
 
     Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the
-    rest defaults to general matrix functions.
+    rest defaults to general matrix functions. Whether those stay in the group is tested where they are used, at random
+    elements: see :meth:`leaves`.
 
     Attributes
     ----------
@@ -72,6 +83,8 @@ class MatrixGroup:
     inverse_map, exp_map, log_map, cayley_map, inverse_cayley_map : callable or None
         ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
         or None where the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
+    adjoint_cayley_map : callable or None
+        ``(algebra, x) -> g`` with ``Ad(g) = cay(ad x)``, or None where ``cay(ad x)`` is not an adjoint action.
     restore_map : callable
         ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it, where it has a formula.
     """
@@ -84,6 +97,7 @@ class MatrixGroup:
     log_map: Callable = general.log
     cayley_map: Callable | None = general.cayley
     inverse_cayley_map: Callable = general.inverse_cayley
+    adjoint_cayley_map: Callable | None = general.adjoint_cayley
     restore_map: Callable = closed.unchanged
 
     @property
@@ -195,15 +209,17 @@ class MatrixGroup:
         Raises
         ------
         LieAlgebraError
-            For SL(n) and SU(n) with n > 2, where the determinant of the result is not 1.
+            If the map leaves the group: for SL(n) and SU(n) with n > 2, where the determinant of the result is not 1.
         DomainError
             If X has an eigenvalue 2, or for GL(n) also -2. Under tracing the result is NaN instead.
         """
-        self._need_cayley()
+        self._need("cayley")
         x = self._components(x, "x")
         g = _cayley(self, x)
         if (index := _first_failure(g, 2)) is not None:
-            raise DomainError(f"cayley on {self.name}: x{at(index)} {self._why_no_cayley(np.asarray(x[index]))}")
+            x = np.asarray(x[index])
+            why = self._why_no_cayley(x, self.algebra.hat(x) if np.isfinite(x).all() else x)
+            raise DomainError(f"cayley on {self.name}: x{at(index)} {why}")
         return g
 
     def inverse_cayley(self, g) -> jax.Array:
@@ -212,17 +228,64 @@ class MatrixGroup:
         Raises
         ------
         LieAlgebraError
-            For SL(n) and SU(n) with n > 2, as for :meth:`cayley`.
+            As for :meth:`cayley`.
         DomainError
             If g is not in the group or has the eigenvalue -1. Under tracing the result is NaN instead.
         """
-        self._need_cayley()
+        self._need("cayley")
         g = self._element(g, "g")
         x = _inverse_cayley(self, g)
         if (index := _first_failure(x, 1)) is not None:
             why = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
             raise DomainError(f"inverse_cayley on {self.name}: g{at(index)} {why}")
         return x
+
+    def adjoint_cayley(self, x) -> jax.Array:
+        """The group element near ``exp(x)`` whose adjoint action is Cayley's map of ``ad x``: ``Ad(g) = cay(ad(x))``.
+
+        ``Ad_star(g, mu)`` is then the end of a step of the midpoint scheme, ``nu = mu + ad_star(x, (mu + nu) / 2)``.
+        It is :meth:`cayley` for SO(3) and SE(2), and another map to third order for SU(2), SL(2), SE(3) and SO(4).
+
+        Parameters
+        ----------
+        x : array, shape (..., dim)
+
+        Returns
+        -------
+        array, shape (..., m, m)
+
+        Raises
+        ------
+        LieAlgebraError
+            If ``cay(ad(x))`` is not an adjoint action: for SO(n) with n > 4, SE(n) with n > 3, SU(n) and SL(n) with
+            n > 2, Sp(n) with n > 1.
+        DomainError
+            If ad(x) has a real eigenvalue of size 2 or more. Under tracing the result is NaN instead.
+        """
+        self._need("adjoint_cayley")
+        assert self.adjoint_cayley_map is not None
+        x = self._components(x, "x")
+        g = _compiled(self.adjoint_cayley_map, self.algebra, x)
+        if (index := _first_failure(g, 2)) is not None:
+            x = np.asarray(x[index])
+            why = self._why_no_cayley(x, self.algebra.ad(x))
+            raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{at(index)} {why}")
+        return g
+
+    def leaves(self, kind: str) -> float:
+        """How far a map of this group leads away from it: the largest :attr:`defect` at random elements of the algebra.
+
+        Parameters
+        ----------
+        kind : {"exp", "cayley", "adjoint_cayley"}
+            For ``"adjoint_cayley"`` the distance of ``Ad(g)`` from ``cay(ad(x))``, relative to its size, counts too.
+
+        Returns
+        -------
+        float
+            Of the order of rounding for a map that stays in the group; infinite where it gives no finite result.
+        """
+        return _leaves(self, kind)
 
     def Ad(self, g) -> jax.Array:
         """Adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
@@ -290,22 +353,50 @@ class MatrixGroup:
             "compose(inverse(h), g)"
         )
 
-    def _need_cayley(self) -> None:
-        if self.cayley_map is None:
-            raise LieAlgebraError(
-                f"the Cayley map does not take {self.algebra.name} into {self.name}: det (I - X/2)^-1 (I + X/2) is "
-                "not 1 when X^3 has a trace; use exp"
-            )
+    def cayley_is_adjoint(self) -> bool:
+        """Whether :meth:`cayley` is :meth:`adjoint_cayley`: ``Ad(cayley(x)) = cay(ad(x))``, as for SO(3) and SE(2)."""
+        if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued:
+            return self.cayley_map is self.adjoint_cayley_map and self._stays("cayley")
+        return replace(self, adjoint_cayley_map=self.cayley_map)._stays("adjoint_cayley")
 
-    def _why_no_cayley(self, x: np.ndarray) -> str:
+    def _stays(self, kind: str) -> bool:
+        """Whether the group has a map, and the map stays in it."""
+        if getattr(self, f"{kind}_map") is None:
+            return False
+        return self in _catalogued or self.leaves(kind) <= LEAVES_TOLERANCE
+
+    def _need(self, kind: str) -> None:
+        """Raise unless the group has a map, and the map stays in it."""
+        if self._stays(kind):
+            return
+        what, otherwise = _MAPS[kind]
+        residual = self.leaves(kind)
+        if residual <= LEAVES_TOLERANCE:
+            raise LieAlgebraError(f"{self.name} has been given None for its {kind}_map; {otherwise}")
+        raise LieAlgebraError(
+            f"{what} does not take {self.algebra.name} into {self.name}: at random elements it misses by "
+            f"{residual:.3g} (tolerance {LEAVES_TOLERANCE:.0e}); {otherwise}",
+            residual=residual,
+            tolerance=LEAVES_TOLERANCE,
+        )
+
+    def _why_no_cayley(self, x: np.ndarray, matrix) -> str:
         if not np.isfinite(x).all():
             return "has entries that are not finite"
-        eigenvalues = np.linalg.eigvals(self.algebra.hat(x))
+        eigenvalues = np.linalg.eigvals(np.asarray(matrix))
         nearest = eigenvalues[np.abs(eigenvalues**2 - 4).argmin()]
         return (
             f"has the eigenvalue {nearest:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
             f"number {general.CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
         )
+
+
+_MAPS = {
+    "exp": ("the exponential map", "its defect, its exp_map or the matrices of its algebra are wrong"),
+    "cayley": ("the Cayley map", "use exp"),
+    "adjoint_cayley": ("the map that makes Cayley's of ad x an adjoint action", "use exp"),
+}
+"""The maps from the algebra to the group, and what to do where one leaves it."""
 
 
 # -- the groups -----------------------------------------------------------------------------------------------------
@@ -320,26 +411,36 @@ def SO(n: int) -> MatrixGroup:
         closed.unitary_defect,
         closed.unitary_inverse,
         log_map=rotation_log,
+        adjoint_cayley_map=None,
         restore_map=general.orthonormalized,
     )
     if n == 2:
-        return replace(group, exp_map=closed.so2_exp, log_map=closed.so2_log)
+        return replace(
+            group, exp_map=closed.so2_exp, log_map=closed.so2_log, adjoint_cayley_map=general.cayley
+        )  # abelian: any map will do
     if n == 3:
-        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log)
+        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log, adjoint_cayley_map=closed.so3_cayley)
         return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
-    return group
+    return replace(group, adjoint_cayley_map=closed.so4_adjoint_cayley) if n == 4 else group
 
 
 @register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
     """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
     group = MatrixGroup(
-        f"SE({n})", catalogue.se(n), closed.rigid_defect, closed.rigid_inverse, restore_map=closed.rigid_restored
+        f"SE({n})",
+        catalogue.se(n),
+        closed.rigid_defect,
+        closed.rigid_inverse,
+        adjoint_cayley_map=general.cayley if n == 2 else None,
+        restore_map=closed.rigid_restored,
     )
     if n == 2:
         return replace(group, log_map=closed.rigid_log)
     if n == 3:
-        group = replace(group, exp_map=closed.se3_exp, log_map=closed.rigid_log)
+        group = replace(
+            group, exp_map=closed.se3_exp, log_map=closed.rigid_log, adjoint_cayley_map=closed.se3_adjoint_cayley
+        )
         return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
     return group
 
@@ -356,27 +457,43 @@ def SU(n: int) -> MatrixGroup:
     )
     if n == 2:
         group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
-        return replace(group, inverse_cayley_map=closed.su2_inverse_cayley)
-    return replace(group, cayley_map=None)
+        return replace(
+            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
+        )
+    return replace(group, cayley_map=None, adjoint_cayley_map=None)
 
 
 @register((2,), (3,))
 def SL(n: int) -> MatrixGroup:
     """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
-    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect)
-    return group if n == 2 else replace(group, cayley_map=None)
+    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.unimodular_restored)
+    if n == 2:
+        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley)
+    return replace(group, cayley_map=None, adjoint_cayley_map=None)
 
 
 @register((2,))
 def Sp(n: int) -> MatrixGroup:
     """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
-    return MatrixGroup(f"Sp({n})", catalogue.sp(n), closed.symplectic_defect, closed.symplectic_inverse)
+    return MatrixGroup(
+        f"Sp({n})",
+        catalogue.sp(n),
+        closed.symplectic_defect,
+        closed.symplectic_inverse,
+        adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
+        restore_map=closed.symplectic_restored,
+    )
 
 
 @register((2,))
 def GL(n: int) -> MatrixGroup:
     """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
-    return MatrixGroup(f"GL({n})", catalogue.gl(n), closed.invertible_defect)
+    return MatrixGroup(
+        f"GL({n})",
+        catalogue.gl(n),
+        closed.invertible_defect,
+        adjoint_cayley_map={1: general.cayley, 2: closed.plane_adjoint_cayley}.get(n),
+    )
 
 
 @register((1,), (2,))
@@ -391,6 +508,8 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
         closed.heisenberg_log,
         closed.heisenberg_exp,
         closed.heisenberg_log,
+        closed.heisenberg_exp,
+        closed.heisenberg_restored,
     )
 
 
@@ -420,6 +539,37 @@ def _cayley(group: MatrixGroup, x):
 def _inverse_cayley(group: MatrixGroup, g):
     x = group.inverse_cayley_map(group.algebra, g)
     return jnp.where((group.defect(g) <= MEMBERSHIP_TOLERANCE)[..., None], x, jnp.nan)
+
+
+@cache
+def _leaves(group: MatrixGroup, kind: str) -> float:
+    """See :meth:`MatrixGroup.leaves`."""
+    algebra, x = group.algebra, np.random.default_rng(0).standard_normal((4, group.dim))
+    x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._known_basis()), axis=(-2, -1))[:, None]
+    if kind == "adjoint_cayley" and not (miss := _automorphism_residual(algebra, x)) <= LEAVES_TOLERANCE:
+        return miss
+    move = getattr(group, f"{kind}_map") or getattr(general, kind)
+
+    @jax.jit
+    def misses(x):
+        g = move(algebra, x)
+        miss = group.defect(g)
+        if kind != "adjoint_cayley":
+            return miss
+        wanted = general.cayley_of(algebra.ad(x))
+        return jnp.maximum(miss, general.largest(_adjoint_action(group, g) - wanted) / general.largest(wanted))
+
+    with jax.ensure_compile_time_eval():  # it may be asked for while a program is being traced
+        return float(np.nan_to_num(np.asarray(misses(x)), nan=np.inf).max())
+
+
+def _automorphism_residual(algebra: LieAlgebra, x: np.ndarray) -> float:
+    """How far ``cay(ad x)`` is from keeping brackets, relative to its size: an adjoint action keeps them."""
+    C, one = algebra.structure_constants, np.eye(algebra.dim)
+    ad = np.einsum("abc,...a->...cb", C, x)
+    R = np.linalg.solve(one - ad / 2, one + ad / 2)
+    apart = np.einsum("...ia,...jb,ijc->...abc", R, R, C) - np.einsum("abd,...cd->...abc", C, R)
+    return float(np.abs(apart).max() / max(np.abs(C).max() * np.abs(R).max() ** 2, np.finfo(float).tiny))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

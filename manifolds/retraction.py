@@ -22,6 +22,9 @@ import numpy as np
 
 from ._arrays import at, first, is_traced
 from .errors import DomainError, ParameterError, SpaceError
+from .lie_group import MEMBERSHIP_TOLERANCE, MatrixGroup
+from .matrix_functions import solve
+from .spaces import GroupSpace
 from .spaces.base import Space, run
 
 
@@ -124,7 +127,13 @@ class Retraction(ABC):
 
 
 class Chart(Retraction):
-    """A retraction with its base point at the start of the step: ``R_h(z, v) = (z, point(z, h v))``."""
+    """A retraction with its base point at the start of the step: ``R_h(z, v) = (z, point(z, h v))``.
+
+    A subclass is a frozen dataclass with a ``space``, decorated with ``jax.tree_util.register_static``. It gives
+    ``_point``, ``_vector`` and ``order``, plain JAX functions of arrays already checked, with batches in front. It may
+    give ``_reach``, where the chart does not reach as far as the geodesics of the space do, and ``_carry``, which
+    :class:`MidpointRetraction` needs in integrators, and replace the ``_middle`` that is found by iteration.
+    """
 
     symmetric = False
 
@@ -162,17 +171,24 @@ class Chart(Retraction):
         return run(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
 
     @abstractmethod
-    def _point(self, z, v): ...
+    def _point(self, z, v):
+        """The point of the chart around z for the tangent vector v: z for 0, with the derivative the identity there."""
 
     @abstractmethod
-    def _vector(self, z, x): ...
+    def _vector(self, z, x):
+        """The inverse of :meth:`_point`, NaN where it is not defined."""
 
-    @abstractmethod
     def _middle(self, x, y):
         """The z with ``vector(z, x) = -vector(z, y)``."""
 
-    @abstractmethod
-    def _carry(self, z, v, u): ...
+        def nearer(_, z):
+            return self._point(z, 0.5 * (self._vector(z, x) + self._vector(z, y)))
+
+        return jax.lax.fori_loop(0, _MIDDLE_STEPS, nearer, self._point(x, 0.5 * self._vector(x, y)))
+
+    def _carry(self, z, v, u):
+        """See :meth:`carry`."""
+        raise SpaceError(f"{self} gives no _carry, so it has its base point at the start of a step, not in the middle")
 
     def _reach(self, z, v):
         return self.space._reach(z, v)
@@ -195,18 +211,25 @@ class Chart(Retraction):
 
     def __post_init__(self):
         if not isinstance(self.space, Space):
-            raise SpaceError(f"{type(self).__name__} is made for a state space, not for {type(self.space).__name__}")
+            raise SpaceError(
+                f"{type(self).__name__} is made for a state space, not for {type(self.space).__name__}; of a group "
+                "make GroupSpace(group)"
+            )
         like = jax.ShapeDtypeStruct(self.space.shape, self.space.dtype)
         for kernel in ("_point", "_vector", "_reach"):  # a space that lacks one refuses here
             jax.eval_shape(getattr(self, kernel), like, like)
 
 
+_MIDDLE_STEPS = 32
+"""Each shortens the distance from the middle by the square of that between the points, relative to the curvature."""
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class RiemannianRetraction(Chart):
-    """``R_h(z, v) = (z, exp_z(h v))`` with the exponential map of the metric [BFM §4.4].
+    """``R_h(z, v) = (z, exp_z(h v))`` with the exponential map of the space, that of its metric [BFM §4.4].
 
-    On every space. The domain is the ball of the injectivity radius.
+    On every space that has geodesics. The domain is the ball of the injectivity radius.
     """
 
     space: Space
@@ -241,7 +264,7 @@ class EuclideanRetraction(Chart):
 
     @property
     def order(self):
-        return math.inf if self.space.bi_invariant else 1
+        return math.inf if self.space.exp_of_group else 1
 
     def _point(self, z, v):
         return z + v
@@ -262,6 +285,46 @@ class EuclideanRetraction(Chart):
         return 0.5 * self.space._straight_reach(z, v)
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class ProjectionRetraction(Chart):
+    """``R_h(z, v) = (z, project(z + h v))``, on every space, also on one that does not know its geodesics.
+
+    Its inverse is found by Newton's method in the frame of z. Of first order with any projection, of second with the
+    nearest point [Absil & Malick 2012].
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return 1
+
+    def _point(self, z, v):
+        return self.space._project(z + v)
+
+    def _vector(self, z, x):
+        space = self.space
+        z, x = jnp.broadcast_arrays(z, x)
+
+        def rest(c):
+            return self._point(z, space._from_coordinates(z, c)) - x
+
+        def newton(_, c):
+            missed, push = jax.linearize(rest, c)
+            axes = jnp.broadcast_to(jnp.eye(space.dim), (*c.shape, space.dim))
+            columns = jax.vmap(lambda axis: space._coordinates(z, push(axis)), in_axes=-1, out_axes=-1)(axes)
+            return c - solve(columns, space._coordinates(z, missed)[..., None])[..., 0]
+
+        c = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
+        missed = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
+        size = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
+        return jnp.where(missed <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
+
+
+_NEWTON_STEPS = 8
+
+
 class _GroupChart(Chart):
     def _middle(self, x, y):
         return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
@@ -275,14 +338,15 @@ class _GroupChart(Chart):
 class GroupRetraction(_GroupChart):
     """``R_h(z, v) = (z, z exp(h z^-1 v))`` with the exponential of the group, on groups and their products.
 
-    On SO(n) and SU(n) it is the Riemannian one. On SE(n) it follows screw motions, to first order the same.
+    On SO(n) and SU(n) it is the Riemannian one, and on a GroupSpace that of the space. On SE(n) it follows screw
+    motions, to first order the same.
     """
 
     space: Space
 
     @property
     def order(self):
-        return math.inf if self.space.bi_invariant else 1
+        return math.inf if self.space.exp_of_group else 1
 
     def _point(self, z, v):
         return self.space._group_exp(z, v)
@@ -294,7 +358,7 @@ class GroupRetraction(_GroupChart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class CayleyRetraction(_GroupChart):
-    """``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups with a Cayley map and their products: not SU(n) with n > 2.
+    """``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups that Cayley's map stays in, and products.
 
     Rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers all of the group
     but the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
@@ -305,7 +369,7 @@ class CayleyRetraction(_GroupChart):
 
     @property
     def order(self):
-        return 2 if self.space.bi_invariant else 1
+        return 2 if self.space.exp_of_group else 1
 
     def _point(self, z, v):
         return self.space._cayley(z, v)
@@ -366,6 +430,7 @@ class MidpointRetraction(Retraction):
 _BY_NAME: dict[str, Callable[[Space], Retraction]] = {
     "midpoint": lambda space: MidpointRetraction(RiemannianRetraction(space)),
     "exp": RiemannianRetraction,
+    "projection": ProjectionRetraction,
     "euclidean": EuclideanRetraction,
     "group_exp": GroupRetraction,
     "cayley": CayleyRetraction,
@@ -375,23 +440,27 @@ _BY_NAME: dict[str, Callable[[Space], Retraction]] = {
 }
 
 
-def retraction(space: Space, kind: str = "midpoint") -> Retraction:
+def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction:
     """A retraction of a space by name.
 
     Parameters
     ----------
-    space : Space
+    space : Space or MatrixGroup
+        A group stands for ``GroupSpace(group)``.
     kind : str
-        ``"midpoint"`` is the paper's (4.8), with the Riemannian chart. ``"exp"``, ``"euclidean"``, ``"group_exp"`` and
-        ``"cayley"`` have their base point at the start of the step; ``"midpoint_euclidean"``, ``"midpoint_group_exp"``
-        and ``"midpoint_cayley"`` have it in the middle.
+        ``"midpoint"`` is the paper's (4.8), with the Riemannian chart. ``"exp"``, ``"euclidean"``, ``"group_exp"``,
+        ``"cayley"`` and ``"projection"`` have their base point at the start of the step; ``"midpoint_euclidean"``,
+        ``"midpoint_group_exp"`` and ``"midpoint_cayley"`` have it in the middle.
 
     Raises
     ------
     SpaceError
-        If the space does not have what it takes, such as a group structure.
+        If the space does not have what it takes, such as a group structure or geodesics.
+    LieAlgebraError
+        If Cayley's map leaves the group.
     ParameterError
     """
+    space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
     if kind not in _BY_NAME:
         raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(_BY_NAME)}")
     return _BY_NAME[kind](space)

@@ -32,7 +32,7 @@ def scratch(tmp_path, monkeypatch):
     plt.close("all")
 
 
-COSTLY = ("on_manifolds", "friction_heat_work")
+COSTLY = ("on_manifolds", "own_space", "friction_heat_work")
 """Pages that compile much: in the slow tier."""
 
 

@@ -174,8 +174,10 @@ def in_charts(
         if retraction is not None:
             raise InputError("a retraction is for a system on a manifold, and this one is on R^n")
         return method
-    if not isinstance(retraction, mf.Retraction):
-        retraction = mf.retraction(system.space, default if retraction is None else retraction)
+    if retraction is None:
+        retraction = default if system.space.geodesics else "projection"
+    if isinstance(retraction, str):
+        retraction = mf.retraction(system.space, retraction)
     if retraction.space != system.space:
         other = retraction.space.name
         raise InputError(f"the retraction is one of {other}, but the system is on {system.space.name}")

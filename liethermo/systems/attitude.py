@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds import matrix_functions
 
 from ..energy import Energy, Sum
+from ..engine.interpret import at_points
 from ..errors import InputError
 from .base import System
 from .lie_poisson import LiePoissonSystem
@@ -60,7 +62,11 @@ class AttitudeSystem(System):
 
     @property
     def unrollable(self) -> bool:
-        return self.body.unrollable and self._parts == 1
+        general = {"exp": matrix_functions.exp, "coadjoint": matrix_functions.adjoint_cayley}
+        own = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
+        kind = self.body.reconstruction or ""
+        unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again
+        return self.body.unrollable and self._parts == 1 and unrolls
 
     def split(self, x) -> tuple[jax.Array, jax.Array]:
         """Momentum, shape (..., dim of the algebra), and group element, shape (..., m, m), of a state."""
@@ -99,17 +105,23 @@ class AttitudeSystem(System):
 
     def presented(self, solution):
         mu, g = self.split(solution.x)
+        stats = dataclasses.replace(solution.stats, attitude_residual=self.distance(solution.x))
         dense = solution.dense
         if dense is not None:
             dense = dataclasses.replace(dense, x=self.points(dense.x), k=self.points(dense.k))
         return dataclasses.replace(
-            self.body.presented(solution), x=mu, attitude=np.ascontiguousarray(g), dense=dense
+            self.body.presented(solution), x=mu, attitude=np.ascontiguousarray(g), dense=dense, stats=stats
         ).with_provenance(
             system=type(self.body).__name__,
             algebra=self.body.algebra.name,
             group=self.group.name,
             x0=np.asarray(mu[0]).tolist(),
         )
+
+    def distance(self, x) -> float:
+        """The largest distance of the attitudes of states, shape (m, n), from the group, relative to their size."""
+        rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
+        return float(np.max(at_points(_distance, self, np.asarray(x)[rows])))
 
     def invariants(self):
         return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
@@ -125,3 +137,7 @@ class AttitudeSystem(System):
     @property
     def _parts(self) -> int:
         return 2 if jnp.iscomplexobj(self.group.identity) else 1
+
+
+def _distance(system: AttitudeSystem, x) -> jax.Array:
+    return system.group.defect(system.split(x)[1])

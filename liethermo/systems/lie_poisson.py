@@ -39,8 +39,9 @@ class LiePoissonSystem(System):
     group : manifolds.MatrixGroup, optional
         A group of this algebra: :func:`liethermo.integrate` then returns attitudes g(t) with ``g' = g hat(grad H(mu))``
         beside mu(t). Velocities are the body's, so that the spatial momentum is ``Ad_star(inverse(g), mu)``.
-    reconstruction : {"cayley", "exp"}, optional
-        How; by default by Cayley's map where the group has one. See :class:`liethermo.WithAttitude`.
+    reconstruction : {"coadjoint", "cayley", "exp"}, optional
+        How; by default so that the spatial momentum of a free body is kept, where the group has such a way, else by
+        Cayley's map where that stays in the group. See :class:`liethermo.WithAttitude`.
 
     Raises
     ------
@@ -48,6 +49,8 @@ class LiePoissonSystem(System):
         If the entropy is not a Casimir.
     IndefiniteError, AxiomError, FunctionError, InputError
         If the dissipation, a function or the group does not fit.
+    manifolds.LieAlgebraError
+        If the reconstruction asked for leaves the group.
     """
 
     algebra: mf.LieAlgebra = eqx.field(static=True)
@@ -98,12 +101,22 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
     if ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0.0, atol=1e-12):
         raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
     if reconstruction is None:
-        return "exp" if group.cayley_map is None else "cayley"
-    if reconstruction not in ("cayley", "exp"):
-        raise InputError(f"the reconstruction is 'cayley' or 'exp', not {reconstruction!r}")
-    if reconstruction == "cayley":
-        group._need_cayley()
+        reconstruction = _best_reconstruction(group)
+    if reconstruction not in _MAPS:
+        raise InputError(f"the reconstruction is {', '.join(map(repr, _MAPS))}, not {reconstruction!r}")
+    group._need(_MAPS[reconstruction])
     return reconstruction
+
+
+_MAPS = {"coadjoint": "adjoint_cayley", "cayley": "cayley", "exp": "exp"}
+"""The map from the algebra to the group that a reconstruction takes its steps by."""
+
+
+def _best_reconstruction(group: mf.MatrixGroup) -> str:
+    """The one that keeps spatial momenta; else the cheapest that stays in the group."""
+    if group.cayley_is_adjoint():
+        return "cayley"
+    return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._stays(map_))
 
 
 @functools.cache

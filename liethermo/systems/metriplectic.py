@@ -30,8 +30,9 @@ class MetriplecticSystem(System):
     validate : bool
         Test the axioms at a few random points and refuse a system that fails. Turn off where the functions are not
         defined at normally distributed points, and use ``system.check(points=...)``.
-    space : manifolds.Space, optional
-        The manifold that the states live on; native, a product, or from ``manifolds.from_geomstats``. Energy, entropy
+    space : manifolds.Space or manifolds.MatrixGroup, optional
+        The manifold that the states live on; native, a product, or from ``manifolds.from_geomstats``; a group stands
+        for ``manifolds.GroupSpace(group)``. Energy, entropy
         and momentum maps are then functions of points, shape ``(*space.shape)``, and their gradients may be those of
         the ambient array: only their action on tangent vectors matters. What is handed to a Poisson structure or to a
         dissipation are flat real arrays, shape (space.size,), as ``space.to_vector`` makes them: a state x, and
@@ -51,15 +52,16 @@ class MetriplecticSystem(System):
         dim: int | None = None,
         momentum_maps=(),
         validate: bool = True,
-        space: mf.Space | None = None,
+        space: mf.Space | mf.MatrixGroup | None = None,
     ):
         if space is not None:
+            space = mf.GroupSpace(space) if isinstance(space, mf.MatrixGroup) else space
             if not isinstance(space, mf.Space):
                 raise InputError(
                     f"the space is a manifolds.Space such as manifolds.Sphere(2), not {type(space).__name__}; "
                     "for a manifold of geomstats give manifolds.from_geomstats(...)"
                 )
-            mf.RiemannianRetraction(space)  # raises for a space without exp or log
+            _chart(space)  # raises where a space lacks what it is run by
             dim = space.size if dim is None else dim
         if dim is None and (poisson is None or (callable(poisson) and not isinstance(poisson, mf.PoissonStructure))):
             raise InputError(
@@ -80,8 +82,12 @@ class MetriplecticSystem(System):
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
-        """Around a state of a manifold, in the coordinates of its exponential map; itself on R^n."""
+        """Around a state of a manifold, in the coordinates of its exponential map or of its projection."""
         if self.space is None:
             return self, x
-        around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
+        around = mf.coordinates_around(_chart(self.space), self.points(x))
         return ChartSystem(self, around, around.centre() if centred else None), jnp.zeros(self.space.dim)
+
+
+def _chart(space: mf.Space) -> mf.Chart:
+    return mf.RiemannianRetraction(space) if space.geodesics else mf.ProjectionRetraction(space)

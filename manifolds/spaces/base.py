@@ -50,8 +50,13 @@ class Space(ABC):
     All maps can be jitted, vmapped and differentiated. What they are handed is checked, and they raise where they are
     not defined; under tracing, where values cannot be looked at, they return NaN instead.
 
-    A subclass is a frozen dataclass. It gives the abstract members and may replace the others; each is a plain JAX
-    function of arrays already checked.
+    A subclass is a frozen dataclass, decorated with ``jax.tree_util.register_static``. It gives ``name``, ``dim``,
+    ``shape`` and ``_project``, and may replace the other members that begin with an underscore; each is a plain JAX
+    function of arrays already checked, with batches in front. The tangent spaces follow from ``_project``, any smooth
+    map from arrays to points that leaves points alone; the metric is that of the ambient array until ``_inner`` says
+    otherwise. There are geodesics where ``_exp``, ``_log`` and ``_transport`` are given, with
+    :meth:`injectivity_radius`; a space without is run in the chart of a :class:`manifolds.ProjectionRetraction`, or of
+    one's own. A closed form in place of what is derived is faster: the native spaces give all of it.
 
     Attributes
     ----------
@@ -64,9 +69,11 @@ class Space(ABC):
         Of a point: float64 or complex128.
     """
 
-    metric: str
+    metric: str = "induced"
     bi_invariant: bool = False
     """Whether the space is a group whose exponential is the Riemannian one."""
+    exp_of_group: bool = False
+    """Whether the space is a group and :meth:`exp` the exponential of it, as with a bi-invariant metric."""
     smooth: bool = True
     """Whether its maps have derivatives of every order, not of the first alone."""
     dtype: np.dtype = np.dtype(np.float64)
@@ -283,35 +290,70 @@ class Space(ABC):
     # -- what a subclass gives ------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _residual(self, x): ...
+    def _project(self, x):
+        """A point of the space, x itself where it is one; NaN where there is none."""
 
-    @abstractmethod
-    def _project(self, x): ...
+    def _residual(self, x):
+        y = self._project(x)
+        return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
 
-    @abstractmethod
-    def _random(self, key, size): ...
+    def _random(self, key, size):
+        return self._project(self.from_vector(jax.random.normal(key, (*size, self.size))))
 
-    @abstractmethod
-    def _project_tangent(self, x, w): ...
+    def _tangents(self, x):
+        """A basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size): of what _project lets by.
 
-    @abstractmethod
-    def _frame(self, x): ...
+        By Gram and Schmidt's process, the longest rest first.
+        """
+        push = jax.linearize(self._project, x)[1]
+        axes = self.from_vector(jnp.eye(self.size))
+        rest = jax.vmap(lambda axis: self.to_vector(push(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(axes)
+        basis: list[jax.Array] = []
+        for _ in range(self.dim):
+            best = jnp.argmax((rest**2).sum(axis=-1), axis=-1)[..., None] == jnp.arange(self.size)
+            e = jnp.where(best[..., None], rest, 0.0).sum(axis=-2)
+            e = e / jnp.sqrt((e**2).sum(axis=-1, keepdims=True))
+            rest = rest - (rest * e[..., None, :]).sum(axis=-1, keepdims=True) * e[..., None, :]
+            basis.append(e)
+        return jnp.stack(basis, axis=-2)
 
-    @abstractmethod
-    def _inner(self, x, u, v): ...
+    def _project_tangent(self, x, w):
+        basis, flat = self._tangents(x), self.to_vector(w)
+        weights = (basis * flat[..., None, :]).sum(axis=-1, keepdims=True)
+        return self.from_vector((weights * basis).sum(axis=-2))
 
-    @abstractmethod
-    def _flat(self, x, v): ...
+    def _frame(self, x):
+        frame: list[jax.Array] = []
+        for v in jnp.moveaxis(self.from_vector(self._tangents(x)), -1 - len(self.shape), 0):
+            for e in frame:
+                v = v - self._scale(self._inner(x, e, v), e)
+            frame.append(self._scale(1.0 / jnp.sqrt(self._inner(x, v, v)), v))
+        return jnp.stack(frame, axis=-1 - len(self.shape))
 
-    @abstractmethod
-    def _exp(self, x, v): ...
+    def _inner(self, x, u, v):
+        return self._pair(u.conj(), v + jnp.zeros_like(x))
 
-    @abstractmethod
+    def _flat(self, x, v):
+        x, v = jnp.broadcast_arrays(x, v)
+        return jax.grad(lambda w: self._inner(x, v, w).sum())(jnp.zeros_like(v))
+
+    @property
+    def geodesics(self) -> bool:
+        """Whether the space knows its geodesics: has :meth:`exp`, :meth:`log`, :meth:`transport` and what follows."""
+        return type(self)._exp is not Space._exp
+
+    def _exp(self, x, v):
+        raise SpaceError(
+            f"{self.name} does not say what its geodesics are: give _exp, _log and _transport, or go by a chart that "
+            "needs none, such as manifolds.ProjectionRetraction(space)"
+        )
+
     def _log(self, x, y):
         """NaN where it is not defined."""
+        return self._exp(x, y)  # raises
 
-    @abstractmethod
-    def _transport(self, x, v, u): ...
+    def _transport(self, x, v, u):
+        return self._exp(x, v)  # raises
 
     def _coordinates(self, x, v):
         return self._pair(self._frame(x), self._over_frame(self._flat(x, v)))
@@ -364,6 +406,8 @@ class Space(ABC):
 
     def _why_no_log(self, x, y) -> str:
         """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
+        if not self.geodesics:
+            return "the chart around x does not reach y; go by a point between them"
         return (
             "y is at the cut locus of x or beyond it (injectivity radius "
             f"{self.injectivity_radius():.6g}), where no one geodesic is the shortest; go by a point between them"
@@ -451,6 +495,10 @@ class Space(ABC):
     def _pair(self, alpha, v):
         """``Re sum(alpha * v)`` over the axes of one point."""
         return (alpha * v).sum(axis=self._axes).real
+
+    def _scale(self, factor, v):
+        """Vectors times numbers, one for each point."""
+        return factor.reshape(*factor.shape, *(1,) * len(self.shape)) * v
 
     def _over_frame(self, v):
         """``v`` with an axis of length 1 for the vectors of a frame."""

@@ -21,6 +21,7 @@ class Euclidean(Space):
     sizes: tuple[int, ...]
     metric = "flat"
     bi_invariant = True
+    exp_of_group = True
 
     def __init__(self, *sizes: int):
         object.__setattr__(self, "sizes", tuple(_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))

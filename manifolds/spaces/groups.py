@@ -1,38 +1,86 @@
-"""SO(n) and SU(n) with their bi-invariant metrics, and SE(n) with the metric of rotations times translations."""
+"""Matrix groups as state spaces: any with a left-invariant metric; SO(n), SU(n), SE(n) with Riemannian geodesics."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import as_numeric
 from ..catalogue import _size
 from ..closed_forms import affine
-from ..errors import ParameterError
-from ..lie_group import SE, SO, SU, MatrixGroup, _log
-from ..matrix_functions import determinant, polar
+from ..errors import ParameterError, SpaceError
+from ..lie_group import MEMBERSHIP_TOLERANCE, SE, SL, SO, SU, Heisenberg, MatrixGroup, _log
+from ..matrix_functions import determinant, polar, solve, spectral_radius
 from ..symmetric import orthonormal_columns
 from .base import Space, register
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
 
+@jax.tree_util.register_static
 class GroupSpace(Space):
-    """A matrix group as a state space; tangent vectors at g are ``g hat(xi)``, frames the left-invariant ones.
+    """A matrix group as a state space, also one of one's own; tangent vectors at g are ``g hat(xi)``.
 
-    Attributes
+    The metric is left-invariant. ``exp(x, x hat(xi))`` is ``x exp(xi)``, whatever the metric: geodesics of the
+    connection for which left-invariant fields are parallel, which keeps inner products, and of the metric itself where
+    that is right-invariant too. So :meth:`transport` keeps the velocity xi, and :meth:`distance` is the length of
+    ``log(x^-1 y)``, not less than that of the shortest curve. SO(n), SU(n) and SE(n) are spaces of their own, with the
+    Riemannian geodesics: :class:`SpecialOrthogonal`, :class:`SpecialUnitary`, :class:`SpecialEuclidean`.
+
+    Parameters
     ----------
     group : MatrixGroup
-        Its exponential, logarithm, Cayley map and adjoint actions.
+        With its exponential, logarithm, Cayley map and adjoint actions. A point near it is projected to it by its
+        ``restore_map`` alone.
+    inner : array, shape (dim, dim), optional
+        Inner products of the basis of the algebra; by default the basis is orthonormal.
+
+    Raises
+    ------
+    SpaceError
+        If that is no group of matrices.
+    ParameterError
+        If ``inner`` is not symmetric and positive definite.
     """
+
+    metric = "left-invariant"
+    exp_of_group = True
+
+    def __init__(self, group: MatrixGroup, inner=None):
+        if not isinstance(group, MatrixGroup):
+            raise SpaceError(f"GroupSpace is made of a MatrixGroup such as SL(3), not of {type(group).__name__}")
+        inner = np.eye(group.dim) if inner is None else np.asarray(as_numeric(inner, "inner"), dtype=np.float64)
+        if inner.shape != (group.dim,) * 2 or not np.allclose(inner, inner.T, rtol=1e-12, atol=0.0):
+            raise ParameterError(f"inner is a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
+        try:
+            self._root = np.linalg.cholesky(inner)
+        except np.linalg.LinAlgError:
+            least = np.linalg.eigvalsh(inner)[0]
+            raise ParameterError(
+                f"inner has the eigenvalue {least:.3g}: inner products are positive definite"
+            ) from None
+        self._group = group
+
+    def __eq__(self, other):
+        same = type(self) is type(other)
+        return same and self._group == other._group and np.array_equal(self._root, other._root)
+
+    def __hash__(self):
+        return hash((self._group, self._root.tobytes()))
 
     @property
     def group(self) -> MatrixGroup:
-        raise NotImplementedError
+        """The group, with its exponential, logarithm, Cayley map and adjoint actions."""
+        return self._group
+
+    @property
+    def dtype(self):  # type: ignore[override]
+        return self.group.algebra._known_basis().dtype
 
     @property
     def name(self):
@@ -77,17 +125,84 @@ class GroupSpace(Space):
         return y @ (self.group.inverse_map(x) @ u)
 
     def _cayley(self, x, v):
-        self.group._need_cayley()
+        self.group._need("cayley")
         assert self.group.cayley_map is not None
         return self._restored(x @ self.group.cayley_map(self.group.algebra, self._velocity(x, v)))
 
     def _inverse_cayley(self, x, y):
-        self.group._need_cayley()
+        self.group._need("cayley")
         return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative(x, y)))
 
     def _restored(self, x):
         """One Newton step to the group, so that rounding does not add up."""
         return self.group.restore_map(x)
+
+    # -- the metric of this space, which its subclasses replace -----------------------------------------------------
+
+    def injectivity_radius(self, x=None):
+        """One that is sure: there eigenvalues of the velocity are smaller than pi."""
+        del x
+        basis = self._orthonormal
+        mixed = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
+        if not np.abs(np.linalg.matrix_power(mixed, len(mixed))).max() > 1e-12 * np.abs(mixed).max() ** len(mixed):
+            return math.inf  # nilpotent: no eigenvalue but zero
+        rows = basis.reshape(len(basis), -1)
+        return math.pi / math.sqrt(np.linalg.eigvalsh((rows.conj() @ rows.T).real)[-1])
+
+    def _reach(self, x, v):
+        return spectral_radius(self.group.algebra.hat(self._velocity(x, v))) / math.pi
+
+    def _project(self, x):
+        for _ in range(_MOST_RESTORES):
+            x = self._restored(x)
+        return jnp.where((self.group.defect(x) <= MEMBERSHIP_TOLERANCE)[..., None, None], x, jnp.nan)
+
+    def _random(self, key, size):
+        return self.group.exp_map(self.group.algebra, 0.5 * jax.random.normal(key, (*size, self.dim)))
+
+    def _project_tangent(self, x, w):
+        xi = self._velocity(x, w)
+        basis = x[..., None, :, :] @ self.group.algebra._known_basis()
+        rows = basis.reshape(*basis.shape[:-2], -1)
+        rest = (w - self._from_velocity(x, xi)).reshape(*xi.shape[:-1], -1, 1)
+        gram = (rows.conj() @ rows.swapaxes(-1, -2)).real
+        return self._from_velocity(x, xi + solve(gram, (rows.conj() @ rest).real)[..., 0])
+
+    @cached_property
+    def _orthonormal(self) -> np.ndarray:
+        """An orthonormal basis of the algebra, shape (dim, m, m)."""
+        return np.einsum("ab,bij->aij", np.linalg.inv(self._root), self.group.algebra._known_basis())
+
+    def _frame(self, x):
+        return x[..., None, :, :] @ self._orthonormal
+
+    def _coordinates(self, x, v):
+        return self._velocity(x, v) @ self._root
+
+    def _from_coordinates(self, x, c):
+        return self._from_velocity(x, c @ np.linalg.inv(self._root))
+
+    def _inner(self, x, u, v):
+        return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+
+    def _exp(self, x, v):
+        return self._group_exp(x, v)
+
+    def _log(self, x, y):
+        return self._group_log(x, y)
+
+    def _transport(self, x, v, u):
+        return self._left_carry(x, self._group_exp(x, v), u)
+
+    def _why_no_log(self, x, y):
+        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative(x, y)))}"
+
+
+_MOST_RESTORES = 8
+"""Each squares the distance, so that from 1/2 on these reach rounding."""
+
+register(())(lambda: GroupSpace(Heisenberg(1)))
+register(())(lambda: GroupSpace(SL(2), np.diag([1.0, 2.0, 2.0]) + 0.5))
 
 
 class BiInvariantSpace(GroupSpace):
@@ -118,19 +233,13 @@ class BiInvariantSpace(GroupSpace):
         basis = self.group.algebra._known_basis()
         return v.conj() / (np.abs(basis[0]) ** 2).sum()  # orthogonal matrices, all of this norm
 
-    def _exp(self, x, v):
-        return self._group_exp(x, v)
-
-    def _log(self, x, y):
-        return self._group_log(x, y)
+    def _reach(self, x, v):
+        return Space._reach(self, x, v)
 
     def _transport(self, x, v, u):
         """``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
         return x @ half @ self._relative(x, u) @ half
-
-    def _why_no_log(self, x, y):
-        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative(x, y)))}"
 
 
 @register((3,), (4,))
@@ -214,7 +323,7 @@ class SpecialEuclidean(GroupSpace):
 
     n: int
     length: float = 1.0
-    metric = "left-invariant"
+    exp_of_group = False
 
     def __post_init__(self):
         _size(self.n, 2, "SpecialEuclidean(n)")
@@ -247,6 +356,12 @@ class SpecialEuclidean(GroupSpace):
     def _frame(self, x):
         scale = np.where(np.arange(self.dim) < self.rotations.dim, 1.0, self.length)
         return x[..., None, :, :] @ (scale[:, None, None] * self.group.algebra._known_basis())
+
+    def _coordinates(self, x, v):
+        return Space._coordinates(self, x, v)
+
+    def _from_coordinates(self, x, c):
+        return Space._from_coordinates(self, x, c)
 
     def _inner(self, x, u, v):
         return self._pair(self._flat(x, u), v)

@@ -149,6 +149,14 @@ class Product(Space):
         return all(factor.bi_invariant for factor in self.factors)
 
     @property
+    def exp_of_group(self):  # type: ignore[override]
+        return all(factor.exp_of_group for factor in self.factors)
+
+    @property
+    def geodesics(self):
+        return all(factor.geodesics for factor in self.factors)
+
+    @property
     def smooth(self):  # type: ignore[override]
         return all(factor.smooth for factor in self.factors)
 
@@ -272,6 +280,14 @@ class Power(Space):
     @property
     def bi_invariant(self):  # type: ignore[override]
         return self.base.bi_invariant
+
+    @property
+    def exp_of_group(self):  # type: ignore[override]
+        return self.base.exp_of_group
+
+    @property
+    def geodesics(self):
+        return self.base.geodesics
 
     @property
     def smooth(self):  # type: ignore[override]

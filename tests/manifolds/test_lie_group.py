@@ -1,5 +1,6 @@
 """Matrix groups: every registered one through the same properties, closed forms against general ones, and controls."""
 
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from math import factorial, pi
@@ -174,6 +175,44 @@ def test_cayley(G):
         assert abs(slope(SIZES, errors) - 3) < 0.2
 
 
+ADJOINT = ("SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "GL(2)", "Heisenberg(1)", "Heisenberg(2)")
+"""Groups in which Cayley's map of ad x is an adjoint action, by hand."""
+
+
+def test_adjoint_cayley(G):
+    if G.name not in ADJOINT:
+        with pytest.raises(mf.LieAlgebraError, match=r"an adjoint action does not take .* misses by 0\.0.*use exp"):
+            G.adjoint_cayley(np.zeros(G.dim))
+        return
+    x, mu = elements(G, 3), duals(G, 3)
+    g, ad = G.adjoint_cayley(x), np.asarray(G.algebra.ad(x))
+    one = np.eye(G.dim)
+    assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
+    assert close(G.Ad(g), np.linalg.solve(one - ad / 2, one + ad / 2), "product")
+    nu = np.asarray(G.Ad_star(g, mu))
+    assert close(nu, mu + G.algebra.ad_star(x, (mu + nu) / 2), "product")  # a step of the midpoint scheme
+    if not G.algebra.is_abelian():  # where every map will do; else the same by way of the exponential
+        assert close(G.adjoint_cayley(x / 2), matrix_functions.adjoint_cayley(G.algebra, x / 2), "product")
+    gaps = np.abs(G.adjoint_cayley(x[:1] * SIZES[:, None]) - G.exp(x[:1] * SIZES[:, None])).max(axis=(-2, -1))
+    assert gaps[-1] < 2e-15 or abs(slope(SIZES, gaps) - 3) < 0.2
+    assert G.cayley_is_adjoint() == bool(close(G.cayley(x), g, "product"))
+
+
+def test_maps_stay_in_the_group(G):
+    """What the constructor of a group says of its maps, measured."""
+    tolerance = TOLERANCES["member"][0]
+    assert G.leaves("exp") <= tolerance
+    assert (G.leaves("cayley") <= tolerance) is (G.cayley_map is not None)
+    assert (G.leaves("adjoint_cayley") <= tolerance) is (G.adjoint_cayley_map is not None)
+
+
+def test_restoring_squares_the_distance(G):
+    g = np.asarray(G.exp(elements(G, 20)))
+    near = np.asarray(G.restore_map(g + 1e-5 * np.random.default_rng(0).standard_normal(g.shape)))
+    assert close(G.restore_map(g), g, "product")
+    assert bool(G.belongs(near, 1e-8).all())
+
+
 # -- every registered group: arrays, derivatives, compiled programs ---------------------------------------------------
 
 
@@ -311,6 +350,22 @@ def test_wrong_shapes_and_kinds(G):
     else:
         with pytest.raises(mf.ComponentError, match="must be real"):
             G.log(np.eye(G.matrix_size, dtype=complex))
+
+
+# -- groups of one's own ----------------------------------------------------------------------------------------------
+
+
+def test_a_group_whose_cayley_map_leaves_it():
+    """The general map is the default of a new group, and is not what SL(3) takes."""
+    group = mf.MatrixGroup("mine", mf.sl(3), lambda g: jnp.abs(jnp.linalg.det(g) - 1.0))
+    for call in (lambda: group.cayley(np.zeros(8)), lambda: jax.jit(group.cayley)(np.zeros(8))):
+        with pytest.raises(mf.LieAlgebraError, match=r"sl\(3\) into mine: .* misses by 0\.0\d+ .*use exp") as info:
+            call()
+        assert info.value.tolerance < 1e-3 < info.value.residual
+    assert group.leaves("exp") < 1e-14
+    assert not group.cayley_is_adjoint()
+    with pytest.raises(mf.LieAlgebraError, match="None for its cayley_map"):
+        replace(mf.SO(3), cayley_map=None).cayley(np.zeros(3))
 
 
 # -- particular groups ------------------------------------------------------------------------------------------------
