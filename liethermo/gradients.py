@@ -241,7 +241,10 @@ class Path(NamedTuple):
 
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
-    """Of one term; ``along`` says which components of the slopes to correct along, by default all."""
+    """Of one term; ``along`` says which components of the slopes to correct along, by default all.
+
+    It may give them weights, shape (m,), and may be a function of the gradients at the stages, shape (s, m).
+    """
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, low, d, k, h, b = path.start, path.low, path.step, path.slopes, path.h, path.b
@@ -260,11 +263,11 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
     difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
     defect = difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
-    direction = k if along is None else along * k
-    square = jnp.dot(b, jnp.sum(direction * direction, axis=1))
+    direction = k if along is None else (along(gradients) if callable(along) else along) * k
+    square, length = (jnp.dot(b, jnp.sum(direction * v, axis=1)) for v in (k, direction))
     slope = jnp.linalg.norm(mean)
     noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
-    harmless = 1.0 - _gate(_divide(defect, h * jnp.sqrt(square)), HARMLESS * slope)
+    harmless = 1.0 - _gate(_divide(defect, h * square) * jnp.sqrt(length), HARMLESS * slope)
     opened = jnp.maximum(_gate(defect, noise), harmless * _gate(spread, SPREAD * slope))
     alpha = _divide(smooth + _let_through(defect, opened), h * square)
     return gradients + alpha * direction

@@ -18,17 +18,6 @@ from ..energy import Energy, Sum
 from .base import System
 
 
-class InChart(Energy):
-    """A function of states, as one of coordinates."""
-
-    energy: Energy
-    coordinates: mf.Coordinates
-    space: mf.Space = eqx.field(static=True)
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
-
-
 class ChartSystem(System):
     """The system in coordinates c, shape (dim,).
 
@@ -67,7 +56,7 @@ class ChartSystem(System):
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
         assert self.manifold.space is not None
-        terms = tuple(InChart(term, self.coordinates, self.manifold.space) for term in energy.terms)
+        terms = tuple(term.in_chart(self.coordinates, self.manifold.space) for term in energy.terms)
         return terms[0] if len(terms) == 1 else Sum(terms)
 
     @property

@@ -69,6 +69,8 @@ class LiePoissonSystem(System):
         self.algebra = algebra
         self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
         self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
+        if group is not None and self.is_driven:
+            raise InputError("attitudes are reconstructed for energies that do not depend on time: leave out the group")
 
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
