@@ -252,10 +252,10 @@ class _Joined(eqx.Module):
 class WithTime(Energy):
     """A function of a state and the time behind it, with what it changes by divided between the two.
 
-    A discrete gradient is, in the state, one of the mean over both ends in time, and by the time the difference quotient
-    of the mean over both states. At the stages of a collocation method the components by the state and by the time are
-    corrected in proportion to their squares. So it does not matter in which units time is measured, and a function that
-    does not depend on it has the discrete gradients of a function of the state.
+    A discrete gradient is, by the state, one of the mean over both ends in time, and by the time the difference
+    quotient of the mean over both states. At the stages of a collocation method the corrections along the state and
+    along the time are weighted by the squares of the gradient by the one and by the other. So it does not matter in
+    which units time is measured, and a function that does not depend on it has the gradients of one of the state.
     """
 
     energy: Energy
@@ -291,7 +291,7 @@ class WithTime(Energy):
 
 
 def _squares(gradients) -> jax.Array:
-    """The squares of the parts of gradients, shape (s, m), by the state and by the time; one number for all the state."""
+    """Of gradients, shape (s, m), the squares of the part by the state, for each of its components, and by the time."""
     size = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(size > 0.0, size, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])

@@ -283,7 +283,8 @@ class Run:
             suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
         for name, function in suspects.items():
             if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
-                return f"the {name} first, near x = {np.array2string(np.asarray(system.seen(ahead)), precision=4, threshold=8)}"
+                near = np.array2string(np.asarray(system.seen(ahead)), precision=4, threshold=8)
+                return f"the {name} first, near x = {near}"
         return (
             system.outside(ahead) or f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
         )
@@ -386,7 +387,8 @@ def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
 def as_run(system: System, method) -> tuple[System, Any]:
     """The system and the method as they are run.
 
-    With clock and work where the energy depends on time, with attitudes where there is a group, in charts on a manifold.
+    With clock and work where the energy depends on time, with attitudes where there is a group, in charts on a
+    manifold.
     """
     if not isinstance(method, OneStepMethod):
         return driven(system, unit=1.0), method  # its errors are measured component by component

@@ -341,9 +341,7 @@ def stops_of(save_at, start: float, end: float) -> np.ndarray:
     return np.unique([*times, end])
 
 
-def suggest_step(
-    system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0
-) -> float:
+def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
     """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
 
     The smallest of the first thirty that adaptive steps take, once they no longer grow as fast as they are let,

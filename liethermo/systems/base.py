@@ -324,9 +324,7 @@ class System(eqx.Module):
             self.space.point(self.points(numbers))
         return real_array(x)
 
-    def check(
-        self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None
-    ) -> CheckReport:
+    def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
 
         Parameters

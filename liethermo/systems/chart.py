@@ -7,7 +7,6 @@ the gradients of the functions. So every law that a method keeps in R^dim it kee
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 

@@ -46,7 +46,7 @@ class DrivenSystem(System):
     def __init__(self, body: System, unit: float = UNIT):
         self.body, self.unit, self.dim = body, unit, body.dim + 2
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
-        if self.space is not None and self.space.dtype.kind == "c":
+        if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
         self.poisson = _WithClock(body.poisson, unit)
         energy = Sum((*map(self._term, body.energy.terms), _MinusWork(self.dim, unit)))

@@ -72,6 +72,7 @@ class EvolutionSystem(OnContactManifold):
     Parameters
     ----------
     energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy
+        Or of that and the time t: see :class:`liethermo.TimeDependent`.
     dim : int
         Number of state components, 2n + 1.
     momentum_maps : dict of functions, or a sequence of them

@@ -28,6 +28,7 @@ class LiePoissonSystem(System):
     ----------
     algebra : manifolds.LieAlgebra
     energy : function from mu, shape (dim,), to a scalar, or an Energy
+        Or of mu and the time t: see :class:`liethermo.TimeDependent`.
     entropy : likewise, optional
         A Casimir function of the algebra (checked).
     dissipation : Dissipation, optional

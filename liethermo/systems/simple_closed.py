@@ -292,7 +292,9 @@ def _in_one_array(lagrangian):
     if not callable(lagrangian) or isinstance(lagrangian, Energy):
         return lagrangian
     if needed_arguments(lagrangian) == 4:
-        raise InputError("the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external")
+        raise InputError(
+            "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
+        )
     return _Joined(lagrangian) if needed_arguments(lagrangian) == 3 else lagrangian
 
 
