@@ -22,7 +22,7 @@ from .dissipation import (
     ProjectedMetric,
 )
 from .each import Each
-from .energy import Energy, Function, Quadratic
+from .energy import Energy, Function, Quadratic, TimeDependent
 from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
@@ -63,6 +63,7 @@ from .systems import (
     ComposedSystem,
     ContactSystem,
     Copies,
+    DrivenSystem,
     EulerPoincareClosedSystem,
     EulerPoincareSystem,
     EvolutionSystem,
@@ -92,6 +93,7 @@ __all__ = [
     "DiscreteHerglotz",
     "Dissipation",
     "DoubleBracket",
+    "DrivenSystem",
     "Each",
     "Energy",
     "Ensemble",
@@ -137,6 +139,7 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "TimeDependent",
     "VariationalGauss",
     "VariationalIntegrator",
     "WithAttitude",

@@ -63,7 +63,7 @@ class Audit:
     Attributes
     ----------
     energy_drift : float
-        ``max |H - H0| / |H0|`` over every step (over 1 where H0 = 0).
+        ``max |H - H0| / |H0|`` over every step (over 1 where H0 = 0), H less the work done from outside.
     entropy_min_increment : float
         Smallest increment of the entropy in one step; NaN without an entropy.
     casimir_drift : float
@@ -98,20 +98,21 @@ class Audit:
 
 def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     """See :meth:`liethermo.Solution.audit`."""
-    stats, laws, rows = solution.stats, solution.laws, []
+    stats, laws, rows, energy = solution.stats, solution.laws, [], solution.energy_balance
+    name = " minus ".join(["energy", *laws.balance])
     low, high = stats.energy_range or (np.inf, -np.inf)
-    lowest, highest = min(low, float(solution.energy.min())), max(high, float(solution.energy.max()))
-    first = float(solution.energy[0])
+    lowest, highest = min(low, float(energy.min())), max(high, float(energy.max()))
+    first = float(energy[0])
     scale = abs(first) or 1.0
     drift = max(highest - first, first - lowest) / scale
     if laws.energy == "conserved":
-        rows.append(_verdict("energy drift", drift, tolerances.energy, _note(laws, "energy")))
+        rows.append(_verdict(f"{name} drift", drift, tolerances.energy, _note(laws, "energy")))
     elif laws.energy is None:
-        rows.append(AuditRow("energy drift", drift, None, None, "no law promised"))
+        rows.append(AuditRow(f"{name} drift", drift, None, None, "no law promised"))
     else:
-        increments = [*np.diff(solution.energy), _or(stats.largest_energy_increment, -np.inf)]
+        increments = [*np.diff(energy), _or(stats.largest_energy_increment, -np.inf)]
         risen = float(max(increments)) / scale
-        rows.append(_verdict("largest energy increment", risen, tolerances.energy, _note(laws, "energy")))
+        rows.append(_verdict(f"largest {name} increment", risen, tolerances.energy, _note(laws, "energy")))
 
     least = np.nan
     if solution.entropy is not None:

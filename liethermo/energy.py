@@ -7,6 +7,7 @@ midpoint is one already; a general term gets a correction of its own, along its 
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -37,7 +38,7 @@ COORDINATE_TOLERANCE = 1e-10
 class Energy(eqx.Module):
     """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
 
-    Calling one evaluates it: shape (..., n) to shape (...).
+    Calling one evaluates it: shape (..., n) to shape (...); with a time, shape (...), where it depends on one.
     """
 
     @abstractmethod
@@ -66,6 +67,10 @@ class Energy(eqx.Module):
         """Those of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
 
+    def in_chart(self, coordinates: mf.Coordinates, space: mf.Space) -> Energy:
+        """A function of state vectors of a space, as one of coordinates."""
+        return InChart(self, coordinates, space)
+
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         """The pattern of the Hessian: which components of the gradient depend on which of the state; None if unknown.
 
@@ -91,8 +96,26 @@ class Energy(eqx.Module):
         pulled = tuple(Pullback(term, coordinates) for term in self.terms)
         return pulled[0] if len(pulled) == 1 else Sum(pulled)
 
-    def __call__(self, x) -> jax.Array:
-        return jnp.vectorize(self.value, signature="(n)->()")(jnp.asarray(x, dtype=jnp.float64))
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether it is a function of the state and the time; see :class:`TimeDependent`."""
+        return False
+
+    def at_time(self, t) -> Energy:
+        """The function of the state alone that it is at a time."""
+        del t
+        return self
+
+    def with_time(self) -> Energy:
+        """The same as a function of the state with the time behind it, shape (n + 1,): of one that depends on both."""
+        raise NotImplementedError(f"{type(self).__name__} does not depend on time")
+
+    def __call__(self, x, t=None) -> jax.Array:
+        x = jnp.asarray(x, dtype=jnp.float64)
+        if t is None:
+            return jnp.vectorize(self.value, signature="(n)->()")(x)
+        at = jnp.vectorize(lambda x, t: self.at_time(t).value(x), signature="(n),()->()")
+        return at(x, jnp.asarray(t, dtype=jnp.float64))
 
     def __add__(self, other) -> Energy:
         return Sum((*self.terms, *as_energy(other, "a term of a sum").terms))
@@ -179,6 +202,108 @@ class Function(Energy):
         return jnp.asarray(self.function(x))
 
 
+class TimeDependent(Energy):
+    """An energy ``H(x, t)`` that is changed from outside: a field that is turned, a piston that is moved.
+
+    A plain function of two arguments is taken for one wherever the energy of a system is asked for; this class says so
+    of any function, and makes terms of sums. ``lt.Quadratic(A) + lt.TimeDependent(V)`` needs a correction for V only,
+    and ``lt.TimeDependent(V).on(range(n))`` is a function of the first n components and the time.
+
+    Parameters
+    ----------
+    function : function from x, shape (n,), and t, shape (), to a scalar
+        An ``equinox.Module`` too: its arrays are then parameters of the system.
+    """
+
+    function: Callable
+
+    @property
+    def depends_on_time(self) -> bool:
+        return True
+
+    def at_time(self, t) -> Energy:
+        return Function(_AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
+
+    def with_time(self) -> Energy:
+        return WithTime(Function(_Joined(self.function)))
+
+    def value(self, x) -> jax.Array:
+        raise InputError("this energy depends on time, so its value is known at a time only: energy(x, t)")
+
+    def __neg__(self) -> Energy:
+        return TimeDependent(_Minus(self.function))
+
+
+class _AtTime(eqx.Module):
+    function: Callable
+    time: jax.Array
+
+    def __call__(self, x):
+        return self.function(x, self.time)
+
+
+class _Joined(eqx.Module):
+    function: Callable
+
+    def __call__(self, z):
+        return self.function(z[:-1], z[-1])
+
+
+class WithTime(Energy):
+    """A function of a state and the time behind it, with what it changes by divided between the two.
+
+    A discrete gradient is, by the state, one of the mean over both ends in time, and by the time the difference
+    quotient of the mean over both states. At the stages of a collocation method the corrections along the state and
+    along the time are weighted by the squares of the gradient by the one and by the other. So it does not matter in
+    which units time is measured, and a function that does not depend on it has the gradients of one of the state.
+    """
+
+    energy: Energy
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.energy.is_quadratic
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(x)
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        if self.is_quadratic:
+            return scheme.quadratic(self, x, d, low)
+        low = jnp.zeros_like(x) + low
+        ends = jnp.stack([x + low, x + (low + d)])
+
+        def mean(states, times):
+            values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
+            return 0.5 * (values[0] + values[1])
+
+        def of_state(y):
+            return mean(jnp.stack([y, y]), ends[:, -1])
+
+        def of_time(t):
+            return mean(ends[:, :-1], jnp.concatenate([t, t]))
+
+        by_state = scheme.general(Function(of_state), x[:-1], d[:-1], low[:-1])
+        return jnp.concatenate([by_state, scheme.general(Function(of_time), x[-1:], d[-1:], low[-1:])])
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        return scheme(self, path, along=_squares)
+
+
+def _squares(gradients) -> jax.Array:
+    """Of gradients, shape (s, m), the squares of the part by the state, for each of its components, and by the time."""
+    size = jnp.max(jnp.abs(gradients))
+    squares = jnp.sum((gradients / jnp.where(size > 0.0, size, 1.0)) ** 2, axis=0)
+    return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
+
+
+class _Minus(eqx.Module):
+    function: Callable
+
+    def __call__(self, x, t):
+        return -jnp.asarray(self.function(x, t))
+
+
 class Pullback(Energy):
     """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
 
@@ -225,8 +350,27 @@ class Pullback(Energy):
     def check_places(self, dim: int, role: str) -> None:
         _check_coordinates(self, dim, role)
 
+    @property
+    def depends_on_time(self) -> bool:
+        return self.term.depends_on_time
+
+    def at_time(self, t) -> Energy:
+        return eqx.tree_at(lambda e: e.term, self, self.term.at_time(t)) if self.depends_on_time else self
+
+    def with_time(self) -> Energy:
+        return Pullback(self.term.with_time(), _BesideTime(self.of))
+
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.indices if self.function is None else self.function)
+
+
+class _BesideTime(eqx.Module):
+    """Coordinates of a state, and the time behind it."""
+
+    coordinates: Callable
+
+    def __call__(self, z):
+        return jnp.append(self.coordinates(z[:-1]), z[-1])
 
 
 class Negative(Energy):
@@ -273,6 +417,13 @@ class Sum(Energy):
     def is_quadratic(self) -> bool:
         return all(term.is_quadratic for term in self.summands)
 
+    @property
+    def depends_on_time(self) -> bool:
+        return any(term.depends_on_time for term in self.summands)
+
+    def at_time(self, t) -> Energy:
+        return Sum(tuple(term.at_time(t) for term in self.summands))
+
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         return union(term.couplings(dim) for term in self.summands)
 
@@ -287,14 +438,26 @@ class Sum(Energy):
 
 
 def as_energy(function, role: str) -> Energy:
-    """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function."""
+    """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function.
+
+    One that needs two arguments is a function of the state and the time.
+    """
     if isinstance(function, Energy):
         return function
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
         return _quadratic(function)
     if callable(function):
-        return Function(function)
+        return TimeDependent(function) if needed_arguments(function) == 2 else Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
+
+
+def needed_arguments(function: Callable) -> int | None:
+    """How many arguments a function needs by position; None where it does not tell."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)
 
 
 class OfPoint(Energy):
@@ -307,12 +470,37 @@ class OfPoint(Energy):
         return self.energy.value(self.space.from_vector(x))
 
 
+class InChart(Energy):
+    """A function of state vectors, as one of coordinates."""
+
+    energy: Energy
+    coordinates: mf.Coordinates
+    space: mf.Space = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
+
+
 def on_points(energy: Energy, space: mf.Space | None) -> Energy:
     """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
     if space is None or space.shape == (space.size,):
         return energy
-    terms = tuple(term if isinstance(term, Quadratic) else OfPoint(term, space) for term in energy.terms)
+    terms = tuple(_on_points(term, space) for term in energy.terms)
     return terms[0] if len(terms) == 1 else Sum(terms)
+
+
+def _on_points(term: Energy, space: mf.Space) -> Energy:
+    if isinstance(term, TimeDependent):
+        return TimeDependent(_OfPointAndTime(term.function, space))
+    return term if isinstance(term, Quadratic) else OfPoint(term, space)
+
+
+class _OfPointAndTime(eqx.Module):
+    function: Callable
+    space: mf.Space = eqx.field(static=True)
+
+    def __call__(self, x, t):
+        return self.function(self.space.from_vector(x), t)
 
 
 def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
@@ -335,6 +523,8 @@ def recognised(energy: Energy, dim: int) -> Energy:
         return Sum(tuple(recognised(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
         return Negative(recognised(energy.term, dim))
+    if isinstance(energy, WithTime):
+        return WithTime(recognised(energy.energy, dim))
     if isinstance(energy, Pullback):
         (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
@@ -347,13 +537,21 @@ def _value(energy: Energy, x):
     return energy.value(x)
 
 
-def check_scalar(energy: Energy, dim: int, role: str) -> None:
-    """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has."""
+def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> None:
+    """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has.
+
+    With ``timed`` it may depend on the time too.
+    """
+    if energy.depends_on_time and not timed:
+        raise InputError(
+            f"{role} depends on time, or is a function of two arguments, which only the energy of a system may be "
+            "(and the Lagrangian of an EulerPoincareSystem, and couplings of a ComposedSystem)"
+        )
     for term in energy.terms:
         term.check_places(dim, role)
-    state = jax.ShapeDtypeStruct((dim,), jnp.float64)
+    state, time = jax.ShapeDtypeStruct((dim,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
     try:
-        result = jax.eval_shape(energy.value, state)
+        result = jax.eval_shape(lambda x, t: energy.at_time(t).value(x), state, time)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         raise FunctionError(
             f"{role} could not be evaluated on a state of shape ({dim},): {type(error).__name__}: {error}. "

@@ -24,7 +24,7 @@ from .family import Family, common_size
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
 from .solution import Laws
-from .systems import AttitudeSystem, System
+from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import CHUNK_STEPS, Timetable
 
 LANES = 16
@@ -75,6 +75,9 @@ class Ensemble:
         Seconds, compilation included.
     attitude : ndarray, shape (B, m, m) or (B, times, m, m), or None
         Elements of the group, where the system has one and states are kept.
+    work : ndarray, shape (B,) or (B, times), or None
+        Done on the system from outside, where its energy depends on time; the drift and the increments of the energy
+        are then those of the energy less the work.
     """
 
     t: np.ndarray
@@ -94,6 +97,7 @@ class Ensemble:
     engine: str
     wall_time: float
     attitude: np.ndarray | None = None
+    work: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.status)
@@ -123,7 +127,7 @@ class Ensemble:
             As for :class:`Solution.audit`: relative drift, and fall in one step relative to ``max |S|``.
         """
         allowed = Tolerances(energy=energy, entropy=entropy)
-        rows, moved = [], self.steps > 0
+        rows, moved, name = [], self.steps > 0, " minus ".join(["energy", *self.laws.balance])
 
         def worst(law, values, tolerance):
             values = np.where(moved, values, 0.0)
@@ -133,10 +137,10 @@ class Ensemble:
             )
 
         if self.laws.energy == "conserved":
-            worst("energy drift", self.energy_drift, allowed.energy)
+            worst(f"{name} drift", self.energy_drift, allowed.energy)
         else:
             scale = np.maximum(np.abs(self.energy.reshape(len(self), -1)[:, -1]), np.finfo(float).tiny)
-            worst("relative energy increment", self.largest_energy_increment / scale, allowed.energy)
+            worst(f"relative {name} increment", self.largest_energy_increment / scale, allowed.energy)
         if self.laws.entropy == "nondecreasing":
             fall = -self.least_entropy_increment / np.where(self.entropy_scale > 0.0, self.entropy_scale, 1.0)
             worst("relative fall of the entropy", fall, allowed.entropy)
@@ -211,6 +215,8 @@ def ensemble(
         family, states = family.through(AttitudeSystem), np.asarray(member.begin(states, attitude, batch=True))
     elif attitude is not None:
         raise InputError(NO_GROUP)
+    if isinstance(member, DrivenSystem):
+        family, states = family.through(DrivenSystem), np.asarray(member.begin(states, times.start, batch=True))
     method.check(member)
     record = _Record(size, member, times, outputs)
 
@@ -243,6 +249,7 @@ class _Record:
         self.status = np.full(size, STATUSES.index("interrupted"), dtype=np.int8)
         self.steps, self.iterations = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self.x = self.path = None
+        self.work = np.full(size, np.nan)
         if outputs == "final":
             self.x = np.full((size, system.dim), np.nan)
         elif outputs == "trajectory":
@@ -268,6 +275,8 @@ class _Record:
         self.iterations[chosen] = after["fixed_point"] + after["newton"]
         if self.x is not None:
             self.x[chosen] = after["x"]
+        if isinstance(self.system, DrivenSystem):
+            self.work[chosen] = self.system.work(after["x"])
         if self.path is not None:
             self.path[chosen, 0] = np.column_stack([before["x"], first, before["entropy"]])
             if saved:
@@ -280,9 +289,12 @@ class _Record:
         x, energy, entropy, t = self.x, self.rows.pop("energy"), self.rows.pop("entropy"), self.times.times[-1:]
         if self.path is not None:
             x, energy, entropy, t = self.path[..., :-2], self.path[..., -2], self.path[..., -1], self.times.times
-        attitude = None
+        attitude = work = None
         if isinstance(self.system, AttitudeSystem) and x is not None:
             x, attitude = map(np.asarray, self.system.split(x))
+        if isinstance(self.system, DrivenSystem):
+            work = self.work if self.path is None else np.asarray(self.system.work(x))
+            x, energy = None if x is None else x[..., :-2], energy + work
         return Ensemble(
             t=t,
             x=x,
@@ -295,6 +307,7 @@ class _Record:
             engine=engine,
             wall_time=wall_time,
             attitude=attitude,
+            work=work,
             **self.rows,
         )
 

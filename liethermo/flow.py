@@ -9,7 +9,7 @@ from manifolds import matrix_functions
 
 from .engine import array
 from .integrators import DEFAULT_METHOD, OneStepMethod
-from .systems import System
+from .systems import DrivenSystem, System, driven
 from .timetable import Timetable
 
 
@@ -50,16 +50,17 @@ def flow(
     InputError
         If an argument cannot be used.
     """
-    method = (DEFAULT_METHOD if method is None else method).on(system)
-    table = Timetable(t_span, step, save_every)
-    x = system.state(x0)
+    x, table = system.state(x0), Timetable(t_span, step, save_every)
+    n, system = system.dim, driven(system)
+    x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
+    method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
     k = method.start(system, x)
     carry = (x, jnp.zeros_like(x), k, k)
     states = [x[None]]
     for h, saves, every in table.calls(limit=table.steps, saves=table.steps):
         carry, kept = _steps(system, method, carry, h, saves, every)
         states.append(kept)
-    path = jnp.concatenate(states)
+    path = jnp.concatenate(states)[:, :n]
     return path[-1] if save_every is None else path
 
 

@@ -255,7 +255,10 @@ class Path(NamedTuple):
 
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
-    """Of one term; ``along`` says which components of the slopes to correct along, by default all."""
+    """Of one term; ``along`` says which components of the slopes to correct along, by default all.
+
+    It may give them weights, shape (m,), and may be a function of the gradients at the stages, shape (s, m).
+    """
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, low, k, h, b = path.start, path.low, path.slopes, path.h, path.b
@@ -266,13 +269,36 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
         rates = jnp.sum(between * path.further[1], axis=1)
         smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
         spread = jnp.max(jnp.linalg.norm(between - b @ gradients, axis=1))
-    moving, symmetries = k, path.symmetries
-    if along is not None:
-        moving, symmetries = along * k, None if symmetries is None else along * symmetries
-    direction = moving
-    if symmetries is not None:
-        direction = jax.vmap(lambda d, vectors: frame(list(vectors)).off(d))(moving, symmetries)
-    return corrected(change, gradients, k, (moving, direction), h, b, smooth, spread)
+    weights = along(gradients) if callable(along) else along
+    return corrected(change, gradients, k, Direction.of(k, b, weights, path.symmetries), h, b, smooth, spread)
+
+
+class Direction(NamedTuple):
+    """What a correction goes along, one multiple of it at all stages.
+
+    Attributes
+    ----------
+    vectors : array, shape (s, m)
+    square : array, shape ()
+        ``sum_i b_i d_i . k_i``, d the vectors; not negative.
+    share : array, shape ()
+        The length of what symmetries leave of them, relative to what they are without. Near a relative equilibrium that
+        is little, and noise must not be divided by it.
+    """
+
+    vectors: jax.Array
+    square: jax.Array
+    share: jax.Array
+
+    @classmethod
+    def of(cls, k, b, weights=None, symmetries=None) -> Direction:
+        """``d = W k``, W diagonal with the weights, but orthogonal to the symmetries, shape (s, r, m)."""
+        root = 1.0 if weights is None else jnp.sqrt(weights)
+        whole = left = root * k
+        if symmetries is not None:
+            left = jax.vmap(lambda v, along: frame(list(along)).off(v))(whole, root * symmetries)
+        square, most = (jnp.dot(b, jnp.sum(v * v, axis=1)) for v in (left, whole))
+        return cls(root * left, square, _divide(jnp.sqrt(square), jnp.sqrt(most)))
 
 
 class Change(NamedTuple):
@@ -305,23 +331,19 @@ class Change(NamedTuple):
         return cls(difference, noise, gradients)
 
 
-def corrected(change: Change, gradients, k, directions, h, b, smooth=0.0, spread=0.0) -> jax.Array:
+def corrected(change: Change, gradients, k, direction: Direction, h, b, smooth=0.0, spread=0.0) -> jax.Array:
     """``gradients + alpha d``, shape (s, n), with ``h sum_i b_i (.)_i . k_i`` the change of the function.
 
-    ``directions`` are those of k that a correction may have, and d, what symmetries leave of them: ``d . k = |d|^2``.
-    Near a relative equilibrium that is little, and noise must not be divided by it. ``smooth`` is what a better
-    quadrature adds to that of the gradients, ``spread`` how far gradients between the stages are from the mean of those
-    at them.
+    ``smooth`` is what a better quadrature adds to that of the gradients, ``spread`` how far gradients between the stages
+    are from the mean of those at them.
     """
-    moving, direction = directions
-    mean = b @ gradients
+    mean, d = b @ gradients, direction.vectors
     slope, spread = jnp.linalg.norm(mean), jnp.maximum(spread, jnp.max(jnp.linalg.norm(gradients - mean, axis=1)))
     defect = change.difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
-    square = jnp.dot(b, jnp.sum(direction * direction, axis=1))
-    share = _divide(jnp.sqrt(square), jnp.sqrt(jnp.dot(b, jnp.sum(moving * moving, axis=1))))
-    harmless = 1.0 - _gate(_divide(defect, h * jnp.sqrt(square)), HARMLESS * slope * share)
+    length = jnp.sqrt(jnp.dot(b, jnp.sum(d * d, axis=1)))
+    harmless = 1.0 - _gate(_divide(defect, h * direction.square) * length, HARMLESS * slope * direction.share)
     opened = jnp.maximum(_gate(defect, change.noise), harmless * _gate(spread, SPREAD * slope))
-    return gradients + _divide(smooth + _let_through(defect, opened), h * square) * direction
+    return gradients + _divide(smooth + _let_through(defect, opened), h * direction.square) * d
 
 
 def compensated(x, d) -> tuple[jax.Array, jax.Array]:

@@ -370,7 +370,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     figure, axes = plt.subplots(
         panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
     )
-    _draw_energy(axes[0, 0], solution.t, solution.energy)
+    _draw_energy(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
     if solution.entropy is not None:
         _draw_entropy(axes[1, 0], solution.t, solution.entropy)
         _draw_production(axes[2, 0], solution.t, solution.entropy)
@@ -384,7 +384,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     return _finished(figure, path)
 
 
-def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray) -> None:
+def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, less: str) -> None:
     first = float(H[0])
     error = (H - first) / (abs(first) or 1.0)
     largest = float(np.abs(error).max())
@@ -394,7 +394,7 @@ def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray) -> None:
         ax.set_ylim(-1.4 * max(largest, EPS), 1.4 * max(largest, EPS))
     ax.plot(t, error, color=BLUE, linewidth=0.8)
     ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
-    ax.set_ylabel(r"$(H - H_0)\,/\,|H_0|$" if first else "$H - H_0$")
+    ax.set_ylabel(rf"$(H{less} - H_0)\,/\,|H_0|$" if first else f"$H{less} - H_0$")
 
 
 def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:

@@ -25,7 +25,7 @@ from .integrators import OneStepMethod, Reference, WithAttitude
 from .solution import Laws, Solution, Stats, Status
 from .stepwise import Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
-from .systems import AttitudeSystem, LiePoissonSystem, System
+from .systems import AttitudeSystem, LiePoissonSystem, System, driven
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 
 SMALL_DIM, SMALL_PROGRAM = 16, 4000
@@ -83,7 +83,7 @@ class Run:
         if self.system.sparsity() is None:
             if needed:
                 raise InputError(
-                    f"the sparse engine cannot run a {type(self.system).__name__} that does not know its sparsity: a "
+                    f"the sparse engine cannot run a {self.system.kind} that does not know its sparsity: a "
                     "ComposedSystem of lt.Copies joined by lt.Each does"
                 )
             return None
@@ -283,7 +283,8 @@ class Run:
             suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
         for name, function in suspects.items():
             if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
-                return f"the {name} first, near x = {np.array2string(np.asarray(ahead), precision=4, threshold=8)}"
+                near = np.array2string(np.asarray(system.seen(ahead)), precision=4, threshold=8)
+                return f"the {name} first, near x = {near}"
         return (
             system.outside(ahead) or f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
         )
@@ -384,10 +385,15 @@ def warn_of_fallback(error: UnsupportedPrimitive, stacklevel: int) -> None:
 
 @remembered
 def as_run(system: System, method) -> tuple[System, Any]:
-    """The system and the method as they are run: with attitudes where there is a group, in charts on a manifold."""
+    """The system and the method as they are run.
+
+    With clock and work where the energy depends on time, with attitudes where there is a group, in charts on a
+    manifold.
+    """
     if not isinstance(method, OneStepMethod):
-        return system, method
-    method = method.on(system)
+        return driven(system, unit=1.0), method  # its errors are measured component by component
+    system = driven(system)
+    method = method.pulled(system).on(system)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method
@@ -409,7 +415,7 @@ def laws_of(system: System, method, invariants) -> Laws:
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
-    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact)
+    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact, system.balance)
 
 
 def _value(function, x):

@@ -65,7 +65,7 @@ class Stats:
     worst_residual : float
         Largest ``h |k - slopes(k)| / |x|`` accepted.
     energy_range : (float, float)
-        Smallest and largest energy met.
+        Smallest and largest energy met; less the work done from outside, where there is any.
     least_entropy_increment, largest_energy_increment : float
         Of one step. These three are None where no step was followed (no step taken, or ``Reference``).
     attitude_residual : float or None
@@ -95,7 +95,8 @@ class Stats:
 class Laws:
     """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
 
-    ``ledger`` names those of the recorded functions that say what comes from outside, and ``inexact`` which of the two
+    ``ledger`` names those of the recorded functions that say what comes from outside, ``balance`` those of them that
+    the energy of a solution contains and its law is stated without (``dH = work``), and ``inexact`` which of the two
     laws ("energy", "entropy") the method makes no claim to keep: an audit judges them all the same, and says so.
     """
 
@@ -104,6 +105,7 @@ class Laws:
     conserved: tuple[str, ...] = ()
     ledger: tuple[str, ...] = ()
     inexact: tuple[str, ...] = ()
+    balance: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,11 @@ class Solution:
         if self.dense is None:
             raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
         return self.dense(t)
+
+    @property
+    def energy_balance(self) -> np.ndarray:
+        """The energy less the work done from outside, shape (times,): what the first law keeps of a driven system."""
+        return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held, as a table; see :class:`liethermo.audit.Tolerances` for the keywords."""
@@ -209,6 +216,10 @@ class Solution:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
 
 
+_LISTS = ("conserved", "ledger", "inexact", "balance")
+"""The fields of :class:`Laws` that are tuples of names."""
+
+
 def load(path: str | os.PathLike) -> Solution:
     """Read a file written by :meth:`Solution.save`.
 
@@ -241,7 +252,7 @@ def load(path: str | os.PathLike) -> Solution:
         names = [str(name) for name in dataset["invariant_name"].values]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in ("conserved", "ledger", "inexact")}
+        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in _LISTS}
         return Solution(
             t=t,
             x=x,

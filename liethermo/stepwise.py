@@ -20,7 +20,7 @@ from .engine.interpret import evaluator
 from .errors import FunctionError, InputError
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .integrators.tableaus import integrated
-from .systems import System
+from .systems import DrivenSystem, System, driven
 
 GROWTH = 3.0
 """Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""
@@ -160,7 +160,7 @@ def _excess(model, x):
 
 def _of_points(model, x):
     system, function = model
-    return function(system.points(x))
+    return function(system.seen(x))
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Dense:
         if self.along is None:
             return x + v
         n = x.shape[-1]
-        return np.asarray(self.along(x.reshape(-1, n), v.reshape(-1, n))).reshape(x.shape)
+        return np.asarray(self.along(x.reshape(-1, n), v.reshape(-1, n))).reshape(*x.shape[:-1], -1)
 
 
 @dataclass
@@ -341,7 +341,7 @@ def stops_of(save_at, start: float, end: float) -> np.ndarray:
     return np.unique([*times, end])
 
 
-def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None) -> float:
+def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
     """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
 
     The smallest of the first thirty that adaptive steps take, once they no longer grow as fast as they are let,
@@ -354,14 +354,17 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     rtol : float
     method : OneStepMethod
         ``MetriplecticGauss(1)`` by default, of order 2.
+    t0 : float
+        The time, for an energy that depends on it.
 
     Raises
     ------
     InputError
         Where nothing moves at x0, so that any step will do.
     """
-    method = (DEFAULT_METHOD if method is None else method).on(system)
-    x = np.asarray(system.state(x0))
+    system = driven(system)
+    method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
+    x = np.asarray(system.begin(x0, t0) if isinstance(system, DrivenSystem) else system.state(x0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")

@@ -12,7 +12,7 @@ from .progress import Progress
 from .running import NO_GROUP, Run, as_run, check_choice, prepared
 from .solution import Solution
 from .stepwise import Adaptive, Relaxed
-from .systems import AttitudeSystem, System
+from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import Timetable
 
 
@@ -40,7 +40,8 @@ def integrate(
     system : System
     x0 : array, shape (n,)
     t_span : (float, float)
-        Start and end, the end later. The last step is shortened to arrive there.
+        Start and end, the end later. The last step is shortened to arrive there. An energy that depends on time is
+        taken at these times.
     step : float or Adaptive
         Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
@@ -104,7 +105,12 @@ def integrate(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    x = system.begin(x0, attitude) if isinstance(system, AttitudeSystem) else system.state(x0)
+    if isinstance(system, AttitudeSystem):
+        x = system.begin(x0, attitude)
+    elif isinstance(system, DrivenSystem):
+        x = system.begin(x0, table.start)
+    else:
+        x = system.state(x0)
     if reason := system.outside(x):
         raise InputError(f"the run cannot start at this x0: {reason}")
     run = Run(system, method, x, table, save_to, engine)

@@ -80,12 +80,11 @@ class InCharts(OneStepMethod):
         The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
         what is hardly ever needed.
         """
-        size = jnp.max(jnp.abs(k))
-        step = EPS**0.5 * jnp.where(size > 0.0, size, 1.0)
-        shifts = jnp.concatenate([jnp.zeros((1, k.size)), step * jnp.eye(k.size)])
+        step = EPS**0.5 * system.sizes(k).ravel()
+        shifts = jnp.concatenate([jnp.zeros((1, k.size)), jnp.diag(step)])
         misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
         values = jax.lax.map(lambda shift: misfit(k.ravel() + shift), shifts)
-        return ((values[1:] - values[0]) / step).T
+        return ((values[1:] - values[0]) / step[:, None]).T
 
     def check(self, system: System) -> None:
         self.method.check(system)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ..energy import Energy
 from ..frames import Frame, frame
-from ..gradients import Change, corrected
+from ..gradients import Change, Direction, corrected
 
 NEWTON = 3
 """Steps of Newton's method to a level of the Casimirs: the distance is O(h), so what is left is O(h^8)."""
@@ -46,4 +46,4 @@ def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, low,
 
     weights = jax.vmap(derivatives)(h * (A @ rates))
     change = Change.of(S, x, low, h * (b @ k), [])
-    return jnp.einsum("ij,jin->in", corrected(change, weights, rates, (rates, rates), h, b), gradients)
+    return jnp.einsum("ij,jin->in", corrected(change, weights, rates, Direction.of(rates, b), h, b), gradients)

@@ -67,7 +67,7 @@ class DiscreteHerglotz(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError unless the state is a (q, p, S)."""
         if not isinstance(system, EvolutionSystem):
-            raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {type(system).__name__}")
+            raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         n, start = len(x) // 2, x + low

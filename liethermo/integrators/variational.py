@@ -277,7 +277,7 @@ def _momentum_by_v(model, v):
 
 def need_simple_closed(system: System, name: str) -> None:
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {type(system).__name__}")
+        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {system.kind}")
 
 
 def _maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:

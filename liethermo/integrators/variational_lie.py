@@ -51,7 +51,7 @@ class LieVariational(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError unless the Cayley map takes the algebra of the system to a group."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {type(system).__name__}")
+            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {system.kind}")
         algebra = system.algebra
         if algebra.basis is None:
             raise InputError(f"LieVariational needs matrices for {algebra.name}: build it with from_matrices")

@@ -5,6 +5,7 @@ from .base import System
 from .bodies import Copies, Subsystem
 from .chart import ChartSystem
 from .composed import ComposedSystem
+from .driven import DrivenSystem, driven
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
@@ -19,6 +20,7 @@ __all__ = [
     "ComposedSystem",
     "ContactSystem",
     "Copies",
+    "DrivenSystem",
     "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -30,4 +32,5 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "driven",
 ]

@@ -34,7 +34,8 @@ class System(eqx.Module):
     ----------
     poisson : manifolds.PoissonStructure
     energy, entropy : Energy
-        Callable on states of shape (..., n). ``entropy`` is None for a system without one.
+        Callable on states of shape (..., n), an energy that depends on time on a state and a time. ``entropy`` is None
+        for a system without one.
     dissipation : Dissipation or None
     momentum_maps : dict of Energy
         Further functions that are claimed to be conserved, by name.
@@ -66,7 +67,7 @@ class System(eqx.Module):
         self.momentum_maps = {
             name: on_points(as_energy(J, f"momentum map {name!r}"), space) for name, J in momentum_maps.items()
         }
-        check_scalar(self.energy, dim, "the energy")
+        check_scalar(self.energy, dim, "the energy", timed=True)
         if self.entropy is not None:
             check_scalar(self.entropy, dim, "the entropy")
         for name, J in self.momentum_maps.items():
@@ -88,6 +89,11 @@ class System(eqx.Module):
             self.dissipation = dissipation.prepared(self)
         if validate and not _has_tracers(self):
             self._validate()
+
+    @property
+    def kind(self) -> str:
+        """What it is, for messages."""
+        return type(self).__name__
 
     @property
     def unrollable(self) -> bool:
@@ -113,6 +119,11 @@ class System(eqx.Module):
         """
         return jnp.ones_like(x)
 
+    def sizes(self, k) -> jax.Array:
+        """The size that components of slopes, shape (..., n), are measured by, for differences: the largest for all."""
+        size = jnp.max(jnp.abs(k))
+        return jnp.full_like(k, jnp.where(size > 0.0, size, 1.0))
+
     # -- dynamics -------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
@@ -123,28 +134,58 @@ class System(eqx.Module):
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
-    def vector_field(self, x) -> jax.Array:
-        """``x'`` at a state or a batch of states, shape (..., n)."""
-        x = self.state(x, batch=True)
-        return jnp.vectorize(self._vector_field, signature="(n)->(n)")(x)
+    def vector_field(self, x, t=None) -> jax.Array:
+        """``x'`` at a state or a batch of states, shape (..., n); at a time, where the energy depends on one."""
+        return self.evaluated(lambda system, y: system._vector_field(y), x, t, "(n)")
 
-    def entropy_production(self, x) -> jax.Array:
-        """The rate of growth of the entropy, ``grad S @ x'``, shape (...)."""
+    def entropy_production(self, x, t=None) -> jax.Array:
+        """The rate of growth of the entropy, ``grad S @ x'``, shape (...); at a time, likewise."""
         entropy = self._needed_entropy()
-        return jnp.vectorize(lambda y: jnp.dot(entropy.gradient(y), self._vector_field(y)), signature="(n)->()")(
-            self.state(x, batch=True)
-        )
+        return self.evaluated(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
 
-    def friction_matrix(self, x, dissipation: Dissipation | None = None) -> jax.Array:
+    def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
         """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
 
         Of the dissipation of the system, or of another, such as one of its summands.
         """
-        x, dissipation = self.state(x), self.dissipation if dissipation is None else dissipation
-        if dissipation is None:
+        x, system = self.state(x), self if t is None else self.at_time(t)
+        part = self.dissipation if dissipation is None else dissipation
+        if part is None:
             return jnp.zeros((self.dim, self.dim))
-        force, dH, dL = dissipation.force, self.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
-        return jax.jacfwd(lambda dS: force(self, x, dH, dS, dL))(jnp.zeros(self.dim))
+        dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in part.preserve)
+        return jax.jacfwd(lambda dS: part.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
+
+    # -- time -------------------------------------------------------------------------------------------------------
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the energy depends on time, so that work is done from outside: ``H' = dH/dt`` at fixed x."""
+        return self.energy.depends_on_time
+
+    def at_time(self, t) -> System:
+        """The system whose energy is for ever what it is at a time; itself where that does not depend on time."""
+        return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
+
+    def evaluated(self, function: Callable, x, t, result: str) -> jax.Array:
+        """``function(system, x)`` for each state of a batch, the system as it is at the time t, or at each of several.
+
+        Parameters
+        ----------
+        result : str
+            The shape of one result, as in ``"(n)"``.
+
+        Raises
+        ------
+        InputError
+            If a time is needed and none is given.
+        """
+        x = self.state(x, batch=True)
+        if not self.is_driven:
+            return jnp.vectorize(lambda y: function(self, y), signature=f"(n)->{result}")(x)
+        if t is None:
+            raise InputError("the energy of this system depends on time: give the time beside the state")
+        at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result}")
+        return at(x, jnp.asarray(t, dtype=jnp.float64))
 
     # -- the manifold ---------------------------------------------------------------------------------------------
 
@@ -186,6 +227,14 @@ class System(eqx.Module):
     def presented(self, solution: Any) -> Any:
         """A solution of this system, as its user is to see it."""
         return solution
+
+    def seen(self, x) -> jax.Array:
+        """The part of a state that is the user's, as points: what the functions of an event are functions of."""
+        return self.points(x)
+
+    def pulled(self, energy: Energy) -> Energy:
+        """A function of the states that the user sees, as one of the states here."""
+        return energy
 
     def here(self, x) -> System:
         """The same system, for use at one state: what its Pi and K have in common there is computed once."""
@@ -262,6 +311,11 @@ class System(eqx.Module):
         """What the system receives from outside, recorded along a run, by name."""
         return {}
 
+    @property
+    def balance(self) -> tuple[str, ...]:
+        """Which entries of the ledger a solution has in its energy, and its laws are stated without."""
+        return ()
+
     # -- checks ---------------------------------------------------------------------------------------------------
 
     def state(self, x, batch: bool = False) -> jax.Array:
@@ -297,7 +351,7 @@ class System(eqx.Module):
             self.space.point(self.points(numbers))
         return real_array(x)
 
-    def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0) -> CheckReport:
+    def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
 
         Parameters
@@ -306,13 +360,15 @@ class System(eqx.Module):
             Where to test. By default ``samples`` normally distributed points of standard deviation ``scale``.
         samples, seed, scale
             Of the random points.
+        times : array, shape (m,), or float, optional
+            Of an energy that depends on time, those of the points; by default as random as the points.
 
         Returns
         -------
         CheckReport
             ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
         """
-        return check_system(self, points, samples, seed, scale)
+        return check_system(self, points, samples, seed, scale, times)
 
     def outside(self, x) -> str:
         """Why a state lies outside the domain of the system, in words; empty where it does not."""

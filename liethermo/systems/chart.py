@@ -7,7 +7,6 @@ the gradients of the functions. So every law that a method keeps in R^dim it kee
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -16,17 +15,6 @@ import manifolds as mf
 from ..dissipation import Dissipation, Several
 from ..energy import Energy, Sum
 from .base import System
-
-
-class InChart(Energy):
-    """A function of states, as one of coordinates."""
-
-    energy: Energy
-    coordinates: mf.Coordinates
-    space: mf.Space = eqx.field(static=True)
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
 
 
 class ChartSystem(System):
@@ -66,7 +54,7 @@ class ChartSystem(System):
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
         assert self.manifold.space is not None
-        terms = tuple(InChart(term, self.coordinates, self.manifold.space) for term in energy.terms)
+        terms = tuple(term.in_chart(self.coordinates, self.manifold.space) for term in energy.terms)
         return terms[0] if len(terms) == 1 else Sum(terms)
 
     @property

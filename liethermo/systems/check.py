@@ -58,13 +58,16 @@ class CheckReport:
         return "\n".join(line.rstrip() for line in [*lines, f"{total} (at {self.points} points)"])
 
 
-def check_system(system: System, points, samples: int, seed: int, scale: float) -> CheckReport:
+def check_system(system: System, points, samples: int, seed: int, scale: float, times=None) -> CheckReport:
     """See :meth:`liethermo.systems.base.System.check`."""
     if points is None:
         if samples < 1:
             raise InputError(f"samples must be a positive integer, not {samples}")
         points = system.samples(samples, seed, scale)
     points = np.asarray(system.state(points, batch=True)).reshape(-1, system.dim)
+    if system.is_driven:
+        times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
+        points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
     measured = at_points(_residuals, system, points)
     friction = measured.pop("friction", None)
     if friction is not None:
@@ -129,7 +132,12 @@ def _indefiniteness(K: np.ndarray) -> float:
 
 
 def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
-    """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix."""
+    """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix.
+
+    Of a system whose energy depends on time at a point with the time behind it.
+    """
+    if system.is_driven:
+        return _residuals(system.at_time(x[-1]), x[:-1])
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     found = {}
@@ -192,7 +200,7 @@ def _matrix_residuals(system: System, around: System | None, x, dH, dS):
         found["kernel"] = relative(size(K @ dH), size(K) * size(dH))
         found["friction"] = K
         for part in dissipation.terms:  # each keeps its own
-            own = system.friction_matrix(x, part) if part.preserve else K
+            own = system.friction_matrix(x, dissipation=part) if part.preserve else K
             for L in part.preserve:
                 dL = L.gradient(x)
                 residual = relative(size(own @ dL), size(own) * size(dL))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
@@ -15,7 +14,7 @@ import scipy.sparse
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, Function, check_scalar, is_traced
+from ..energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
 from ..errors import InputError
 from ..graph import Edges, edges, parts
 from ..indices import as_pattern, pattern, union
@@ -45,7 +44,7 @@ class ComposedSystem(System):
     Parameters
     ----------
     subsystems : sequence of Subsystem or Copies, or dict of them by name
-    coupling : function of q, or of (q, S), or an Energy of the whole state; or a sequence of such
+    coupling : function of q, of (q, S) or of (q, S, t), or an Energy of the whole state; or a sequence of such
         V, with q the positions of all subsystems in one array and S their entropies, shape (N,). An Energy may have
         coordinates of its own (``lt.Function(e).on(...)``), such as the squared distance of two bodies.
     conductance : array, shape (N, N), or SciPy sparse matrix; or sequence of (i, j, k); or a number for two bodies
@@ -94,7 +93,7 @@ class ComposedSystem(System):
             tuple(n for body in self.subsystems for n in (body.degrees_of_freedom,) * body.count)
         )
         energy = self._energy(structure, coupling)
-        check_scalar(energy, structure.dim, "the energy")
+        check_scalar(energy, structure.dim, "the energy", timed=True)
         entropy = entropy_component(structure.dim, structure.places.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected)
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
@@ -124,17 +123,16 @@ class ComposedSystem(System):
         """The S_a, shape (..., N)."""
         return self.state(x, batch=True)[..., self._places.S]
 
-    def temperatures(self, x) -> jax.Array:
-        """The ``T_a = H_{S_a}``, shape (..., N)."""
-        gradient = jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(self.state(x, batch=True))
-        return gradient[..., self._places.S]
+    def temperatures(self, x, t=None) -> jax.Array:
+        """The ``T_a = H_{S_a}``, shape (..., N); at a time, where the energy depends on one."""
+        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._places.S]
 
-    def fourier_factors(self, x) -> jax.Array:
+    def fourier_factors(self, x, t=None) -> jax.Array:
         """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
 
         All of it, zeros too: for few bodies. The dynamics works with the edges alone.
         """
-        cold = 1.0 / self.temperatures(x)
+        cold = 1.0 / self.temperatures(x, t)
         factors = jnp.zeros((*cold.shape, cold.shape[-1]))
         for part in () if self.dissipation is None else self.dissipation.terms:
             if isinstance(part, HeatConduction):
@@ -257,29 +255,20 @@ def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     if not callable(V):
         raise InputError(f"a coupling is a function of q, or of (q, S), or an Energy, not {type(V).__name__}")
     q, _, S, _ = structure.places
-    if _arguments(V) == 1:
+    needed, joined = needed_arguments(V), _Apart(V, len(q))
+    if needed == 1:
         return Function(V).on(q)
-    return Function(_Apart(V, len(q))).on(np.concatenate([q, S]))
-
-
-def _arguments(function: Callable) -> int:
-    """How many arguments a function takes by position, 2 where it does not tell."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return 2
-    needed = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty]
-    return len(needed)
+    return (TimeDependent(joined) if needed == 3 else Function(joined)).on(np.concatenate([q, S]))
 
 
 class _Apart(eqx.Module):
-    """V(q, S) as a function of one array."""
+    """V(q, S), or V(q, S, t), as a function of one array, and of t."""
 
     V: Callable
     positions: int = eqx.field(static=True)
 
-    def __call__(self, y):
-        return self.V(y[: self.positions], y[self.positions :])
+    def __call__(self, y, *t):
+        return self.V(y[: self.positions], y[self.positions :], *t)
 
 
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:

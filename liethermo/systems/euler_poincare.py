@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, EulerPoincareForce
-from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced
+from ..energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
 from ..errors import InputError
 from .lie_poisson import LiePoissonSystem
 
@@ -61,7 +61,7 @@ class EulerPoincareSystem(LiePoissonSystem):
     ----------
     algebra : manifolds.LieAlgebra
     lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
-        Its Hessian must be invertible (regular Lagrangian).
+        Its Hessian must be invertible (regular Lagrangian). It may depend on time, as a second argument.
     entropy, dissipation, momentum_maps, validate, group, reconstruction
         As for :class:`LiePoissonSystem`; functions of mu.
     force : function from xi to a covector, optional
@@ -83,7 +83,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         reconstruction: str | None = None,
     ):
         self.lagrangian = as_energy(lagrangian, "the Lagrangian")
-        check_scalar(self.lagrangian, algebra.dim, "the Lagrangian")
+        check_scalar(self.lagrangian, algebra.dim, "the Lagrangian", timed=True)
         if force is not None:
             forced = EulerPoincareForce(force)
             dissipation = forced if dissipation is None else dissipation + forced
@@ -92,18 +92,36 @@ class EulerPoincareSystem(LiePoissonSystem):
 
     @property
     def unrollable(self) -> bool:
-        return not isinstance(self.energy, Legendre)  # which iterates
+        return isinstance(self.energy, Quadratic)  # the others iterate
 
-    def velocity(self, mu) -> jax.Array:
-        """xi = dH/dmu at a state or batch of states, shape (..., dim)."""
-        return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(self.state(mu, batch=True))
+    def at_time(self, t) -> EulerPoincareSystem:
+        if not self.is_driven:
+            return self
+        lagrangian = self.lagrangian.at_time(t)
+        return eqx.tree_at(lambda s: (s.lagrangian, s.energy), self, (lagrangian, Legendre(lagrangian)))
 
-    def momentum(self, xi) -> jax.Array:
-        """mu = dl/dxi, shape (..., dim)."""
-        return jnp.vectorize(self.lagrangian.gradient, signature="(n)->(n)")(self.state(xi, batch=True))
+    def velocity(self, mu, t=None) -> jax.Array:
+        """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""
+        return self.evaluated(lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
+
+    def momentum(self, xi, t=None) -> jax.Array:
+        """mu = dl/dxi, shape (..., dim); likewise."""
+        return self.evaluated(lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
+
+
+class _LegendreAtTime(eqx.Module):
+    """The Hamiltonian of a Lagrangian ``l(xi, t)``, a function of mu and t."""
+
+    lagrangian: Energy
+
+    def __call__(self, mu, t):
+        return Legendre(self.lagrangian.at_time(t)).value(mu)
 
 
 def _hamiltonian(lagrangian: Energy, dim: int) -> Energy:
+    if lagrangian.depends_on_time:
+        _need_regular(lagrangian.at_time(0.0), dim)
+        return TimeDependent(_LegendreAtTime(lagrangian))
     if not isinstance(lagrangian, Quadratic):
         _need_regular(lagrangian, dim)
         return Legendre(lagrangian)

@@ -72,6 +72,7 @@ class EvolutionSystem(OnContactManifold):
     Parameters
     ----------
     energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy
+        Or of that and the time t: see :class:`liethermo.TimeDependent`.
     dim : int
         Number of state components, 2n + 1.
     momentum_maps : dict of functions, or a sequence of them
@@ -94,13 +95,13 @@ class EvolutionSystem(OnContactManifold):
 
     def __init__(self, energy, dim: int, momentum_maps=(), validate: bool = True):
         energy, structure = as_energy(energy, "the energy"), canonical(dim)
-        check_scalar(energy, dim, "the energy")
+        check_scalar(energy, dim, "the energy", timed=True)
         friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim))
         self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
 
-    def temperature(self, x) -> jax.Array:
-        """``T = H_S`` at a state or a batch of states, shape (...)."""
-        return jnp.vectorize(lambda y: self.energy.gradient(y)[-1], signature="(n)->()")(self.state(x, batch=True))
+    def temperature(self, x, t=None) -> jax.Array:
+        """``T = H_S`` at a state or a batch of states, shape (...); at a time, where the energy depends on one."""
+        return self.evaluated(lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         return tangency(self, x)

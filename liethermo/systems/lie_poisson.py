@@ -29,6 +29,7 @@ class LiePoissonSystem(System):
     ----------
     algebra : manifolds.LieAlgebra
     energy : function from mu, shape (dim,), to a scalar, or an Energy
+        Or of mu and the time t: see :class:`liethermo.TimeDependent`.
     entropy : likewise, optional
         A Casimir function of the algebra (checked).
     dissipation : Dissipation, optional
@@ -73,6 +74,8 @@ class LiePoissonSystem(System):
         self.algebra = algebra
         self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
         self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
+        if group is not None and self.is_driven:
+            raise InputError("attitudes are reconstructed for energies that do not depend on time: leave out the group")
 
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
@@ -141,7 +144,10 @@ def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) ->
 @functools.cache
 def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
     """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
-    found, x = _recorded_casimirs(algebra, algebra.basis_names).values(), np.random.default_rng(0).standard_normal(algebra.dim)
+    found, x = (
+        _recorded_casimirs(algebra, algebra.basis_names).values(),
+        np.random.default_rng(0).standard_normal(algebra.dim),
+    )
     if not found or len(found) < algebra.casimir_count():
         return False
     with jax.ensure_compile_time_eval():

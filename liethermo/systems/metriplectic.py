@@ -23,6 +23,7 @@ class MetriplecticSystem(System):
     poisson : manifolds.PoissonStructure, or function from x, shape (n,), to a skew (n, n) matrix, or a constant matrix
         None for a system that only relaxes.
     energy, entropy : function from x, shape (n,), to a scalar, or an Energy
+        The energy may depend on time: a function of x and t, see :class:`liethermo.TimeDependent`.
     dissipation : Dissipation, optional
     dim : int
         Number of state components; needed where ``poisson`` is a plain function or None, and no space is given.

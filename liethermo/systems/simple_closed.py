@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -15,7 +14,7 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Law, SkewFriction, semidefinite
-from ..energy import Energy, Quadratic, check_shape, is_traced
+from ..energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
 from ..engine.interpret import at_points
 from ..errors import InputError
 from .evolution import entropy_component
@@ -286,12 +285,17 @@ class _Linear(eqx.Module):
 
 def timed(function: Callable) -> Callable:
     """A function of (q, v, S) or (q, v, S, t) as one of (q, v, S, t)."""
-    return _Steady(function) if _arguments(function) == 3 else function
+    return _Steady(function) if needed_arguments(function) == 3 else function
 
 
 def _in_one_array(lagrangian):
-    apart = callable(lagrangian) and not isinstance(lagrangian, Energy) and _arguments(lagrangian) == 3
-    return _Joined(lagrangian) if apart else lagrangian
+    if not callable(lagrangian) or isinstance(lagrangian, Energy):
+        return lagrangian
+    if needed_arguments(lagrangian) == 4:
+        raise InputError(
+            "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
+        )
+    return _Joined(lagrangian) if needed_arguments(lagrangian) == 3 else lagrangian
 
 
 def _force(friction, n: int, what: str) -> Callable | None:
@@ -313,12 +317,3 @@ def _field(function, n: int, shape: tuple[int, ...], what: str) -> Callable:
     found = timed(function) if callable(function) else _Constant(jnp.asarray(function, dtype=jnp.float64))
     check_shape(found, ((n,), (n,), (), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")
     return found
-
-
-def _arguments(function: Callable) -> int:
-    """How many arguments a function needs by position."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return 0
-    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)

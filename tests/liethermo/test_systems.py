@@ -181,7 +181,7 @@ def test_a_momentum_map_that_is_not_conserved():
         (lambda mu: mu @ mu + 0j, lt.FunctionError, "real number"),
         (lambda mu: np.sin(float(mu[0])), lt.FunctionError, "jax.numpy"),
         (lambda mu: mu[0] + undefined, NameError, "undefined"),  # noqa: F821
-        (lambda a, b: a, lt.FunctionError, "could not be evaluated"),
+        (lambda a, b, c: a, lt.FunctionError, "could not be evaluated"),
         (3.0, lt.FunctionError, "lt.Quadratic"),
         (lt.Quadratic(np.ones(4)), lt.FunctionError, "shape"),
     ],

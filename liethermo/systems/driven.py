@@ -1,0 +1,284 @@
+"""Driven systems: an energy that depends on time, the clock and the work done as two more components of the state."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..dissipation import Dissipation, Several
+from ..energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
+from ..errors import InputError
+from .base import System
+
+UNIT = 2.0**-100
+"""Time and work are kept in a unit this small: beside the user's components they count for nothing in the size of a
+state or of its velocity, which convergence and errors are measured against. A power of two, so that nothing is rounded.
+"""
+
+
+class DrivenSystem(System):
+    """A system with ``H(x, t)``, made autonomous: ``x' = Pi dH + force``, ``t' = 1``, ``W' = dH/dt`` at fixed x.
+
+    It is the system of the energy ``H(x, t) - W`` and of the Poisson tensor ``Pi + [[0, -1], [1, 0]]`` on (t, W), with
+    the dissipation acting on x alone. So ``H - W`` is constant, which is the law ``dH = work``, and every method keeps
+    it as it keeps the energy of any system; K is rebuilt with the discrete gradient by x in its kernel, so the entropy
+    law holds as ever. What corrects the discrete gradient of H goes along x and t alone (:class:`WithTime`), so ``t' =
+    1`` holds to rounding and W is what the power comes to.
+
+    A state is that of the body followed by t and W, in units of ``unit``. Made by :func:`liethermo.integrate` from a
+    system whose energy depends on time.
+
+    Attributes
+    ----------
+    body : System
+    unit : float
+    """
+
+    body: System
+    unit: float = eqx.field(static=True)
+
+    def __init__(self, body: System, unit: float = UNIT):
+        self.body, self.unit, self.dim = body, unit, body.dim + 2
+        self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
+        if body.space is not None and body.space.dtype.kind == "c":
+            raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
+        self.poisson = _WithClock(body.poisson, unit)
+        energy = Sum((*map(self._term, body.energy.terms), _MinusWork(self.dim, unit)))
+        self.energy = energy if self.space is not None else recognised(energy, self.dim)
+        self.entropy = None if body.entropy is None else self._of_body(body.entropy)
+        self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
+        self.dissipation = None
+        if body.dissipation is not None:
+            parts = tuple(
+                _OnBody(part, tuple(map(self._of_body, part.preserve)), unit) for part in body.dissipation.terms
+            )
+            self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+
+    @property
+    def kind(self) -> str:
+        return f"{self.body.kind} whose energy depends on time"
+
+    # -- the state --------------------------------------------------------------------------------------------------
+
+    def begin(self, x, t: float, batch: bool = False) -> jax.Array:
+        """The state at a time, or several with ``batch``, no work having been done."""
+        x = self.body.state(x, batch)
+        clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
+        return jnp.concatenate([x, clock], axis=-1)
+
+    def seen(self, x):
+        return self.body.points(x[..., :-2])
+
+    def time(self, x) -> jax.Array:
+        """t, shape (...)."""
+        return x[..., -2] / self.unit
+
+    def work(self, x) -> jax.Array:
+        """W, shape (...)."""
+        return x[..., -1] / self.unit
+
+    def samples(self, count, seed=0, scale=1.0):
+        times = scale * np.random.default_rng(seed).standard_normal(count)
+        return np.column_stack([self.body.samples(count, seed, scale), self.unit * times, np.zeros(count)])
+
+    def outside(self, x) -> str:
+        return self._now(x).outside(x[:-2])
+
+    def sizes(self, k):
+        clock = jnp.full((*k.shape[:-1], 2), self.unit)
+        return jnp.concatenate([self.body.sizes(k[..., :-2]), clock], axis=-1)
+
+    # -- dynamics ---------------------------------------------------------------------------------------------------
+
+    @property
+    def unrollable(self) -> bool:
+        return self.body.unrollable
+
+    def field(self, x, dH, dS, dL=()):
+        dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
+        motion = self._now(x).field(x[:-2], dH[:-2], dS, dL)
+        return jnp.concatenate([motion, _clock(dH, self.unit)])
+
+    def raised(self, x, alpha):
+        """What is moved to correct something is moved in the body: never the clock, nor the work done."""
+        return jnp.concatenate([self.body.raised(x[:-2], alpha[:-2]), jnp.zeros(2)])
+
+    def lowered(self, x, v):
+        return jnp.concatenate([self.body.lowered(x[:-2], v[:-2]), v[-2:]])
+
+    def _now(self, x) -> System:
+        return self.body.at_time(self.time(x))
+
+    # -- functions ----------------------------------------------------------------------------------------------------
+
+    def pulled(self, energy: Energy) -> Energy:
+        return self._of_body(on_points(energy, self.body.space))
+
+    def _of_body(self, energy: Energy) -> Energy:
+        return energy.on(range(self.body.dim))
+
+    def _term(self, term: Energy) -> Energy:
+        if not term.depends_on_time:
+            return self._of_body(term)
+        if self.space is not None:
+            return _OnSpaceAndTime(term.with_time(), self.unit)
+        return term.with_time().on(_Clock(self.body.dim, self.unit))
+
+    def casimirs(self):
+        return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
+
+    @property
+    def has_all_casimirs(self) -> bool:
+        return self.body.has_all_casimirs
+
+    @property
+    def ledger(self):
+        return {"work": Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
+
+    @property
+    def balance(self):
+        return ("work",)
+
+    def presented(self, solution):
+        dense, body = solution.dense, self.body
+        if dense is not None and dense.along is None:
+            dense = dataclasses.replace(dense, x=dense.x[..., :-2], k=dense.k[..., :-2])
+        elif dense is not None:
+            along = dense.along
+            dense = dataclasses.replace(dense, along=lambda x, v: along(x, v)[..., :-2])
+        x = np.ascontiguousarray(solution.x[:, :-2])
+        entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
+        if hasattr(body, "algebra"):
+            entries["algebra"] = body.algebra.name
+        if body.dissipation is not None:
+            entries["dissipation"] = type(body.dissipation).__name__
+        energy = solution.energy + solution.casimirs["work"]
+        found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
+        return body.presented(found)
+
+
+class _WithClock(mf.PoissonStructure):
+    """``Pi + [[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
+
+    inner: mf.PoissonStructure
+    unit: float = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        assert self.inner.dim is not None
+        return self.inner.dim + 2
+
+    def tensor(self, x) -> jax.Array:
+        square = self.unit**2
+        padded = jnp.pad(self.inner.tensor(x[:-2]), ((0, 2), (0, 2)))
+        return padded.at[-2, -1].set(-square).at[-1, -2].set(square)
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return jnp.concatenate([self.inner.sharp(x[:-2], alpha[:-2]), _clock(alpha, self.unit)])
+
+
+def _clock(dH, unit: float) -> jax.Array:
+    """The velocities of t and W, shape (2,), from a gradient of the energy."""
+    return unit**2 * jnp.stack([-dH[-1], dH[-2]])
+
+
+class _OnBody(Dissipation):
+    """A dissipation of the body, as it is at the time of the state."""
+
+    part: Dissipation
+    functions: tuple[Energy, ...]
+    unit: float = eqx.field(static=True)
+
+    @property
+    def energy_law(self):
+        return self.part.energy_law
+
+    @property
+    def entropy_law(self):
+        return self.part.entropy_law
+
+    @property
+    def keeps_casimirs(self):
+        return self.part.keeps_casimirs
+
+    @property
+    def symmetric(self):
+        return self.part.symmetric
+
+    @property
+    def needs_entropy(self):
+        return self.part.needs_entropy
+
+    @property
+    def preserve(self):
+        return self.functions
+
+    def force(self, system, x, dH, dS, dL):
+        dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
+        return jnp.pad(self.part.force(system._now(x), x[:-2], dH[:-2], dS, dL), (0, 2))
+
+
+class _Clock(eqx.Module):
+    """From a state with clock and work to x and t."""
+
+    dim: int = eqx.field(static=True)
+    unit: float = eqx.field(static=True)
+
+    def __call__(self, y):
+        return jnp.append(y[: self.dim], y[self.dim] / self.unit)
+
+
+class _MinusWork(Energy):
+    """``-W``, the last component of a state."""
+
+    dim: int = eqx.field(static=True)
+    unit: float = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return -x[-1] / self.unit
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.zeros_like(x).at[-1].set(-1.0 / self.unit)
+
+    def in_chart(self, coordinates, space):
+        slope = jnp.zeros(space.dim).at[-1].set(-1.0 / self.unit)
+        return Quadratic(jnp.zeros(space.dim), slope, self.value(space.to_vector(coordinates.centre().point)))
+
+
+class _OnSpaceAndTime(Energy):
+    """A function of (x, t), shape (n + 1,), x a point of a space, on its product with clock and work."""
+
+    energy: Energy
+    unit: float = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(jnp.append(x[:-2], x[-2] / self.unit))
+
+    def in_chart(self, coordinates, space):
+        local = WithTime(_InChartAndTime(InChart(self, coordinates, space), self.unit))
+        return Pullback(local, _Clock(space.dim - 2, self.unit))
+
+
+class _InChartAndTime(Energy):
+    """A function of coordinates on a product with clock and work that does not depend on the work, as one of (c, t)."""
+
+    energy: Energy
+    unit: float = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(jnp.concatenate([x[:-1], jnp.stack([x[-1] * self.unit, jnp.zeros(())])]))
+
+
+def driven(system: System, unit: float = UNIT) -> System:
+    """The system as it is run: with clock and work where its energy depends on time."""
+    return DrivenSystem(system, unit) if system.is_driven else system
