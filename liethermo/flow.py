@@ -89,8 +89,9 @@ def _stages(system: System, method: OneStepMethod, x, low, h: float, guess) -> j
         solved = array.solve_stages(
             lambda k: misfit(k) + k,
             guess,
-            lambda k: size / h + jnp.max(jnp.abs(k)),
+            lambda k: size / h + jnp.max(jnp.abs(k)) + array.VANISHED,
             lambda k: method.jacobian(system, x, low, h, k),
+            lambda: array.noise_of(system, x),
         )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 

@@ -334,8 +334,8 @@ class Change(NamedTuple):
 def corrected(change: Change, gradients, k, direction: Direction, h, b, smooth=0.0, spread=0.0) -> jax.Array:
     """``gradients + alpha d``, shape (s, n), with ``h sum_i b_i (.)_i . k_i`` the change of the function.
 
-    ``smooth`` is what a better quadrature adds to that of the gradients, ``spread`` how far gradients between the stages
-    are from the mean of those at them.
+    ``smooth`` is what a better quadrature adds to that of the gradients, ``spread`` how far the gradients between the
+    stages are from their mean at the stages.
     """
     mean, d = b @ gradients, direction.vectors
     slope, spread = jnp.linalg.norm(mean), jnp.maximum(spread, jnp.max(jnp.linalg.norm(gradients - mean, axis=1)))

@@ -21,6 +21,7 @@ from .errors import FunctionError, InputError
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .integrators.tableaus import integrated
 from .systems import DrivenSystem, System, driven
+from .timetable import Timetable
 
 GROWTH = 3.0
 """Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""
@@ -37,12 +38,28 @@ DEADBAND = (0.9, 1.3)
 UNDERFLOW = 1e-14
 """Smallest step, relative to the span."""
 
+GROWTH_ERROR = 2e-3
+"""Largest relative error of the rate at which a small deviation grows: what falls from an unstable rest does so in its
+time, to a few thousandths. The error of the state does not show it, as the deviation is no part of the state yet."""
+
+TURNING = 0.01
+"""Rate of growth of an oscillation, relative to its frequency, from which it counts: the derivative of a motion that goes
+on varies, and gives oscillations that nothing excites small rates of either sign."""
+
+CHANGED = 0.05
+"""Change of the derivative of the motion, relative to it, below which what grows is not looked for again."""
+
+MOST_KEPT = 2**28
+"""Numbers that an adaptive run keeps at most (2 GiB)."""
+
 
 @dataclass(frozen=True)
 class Adaptive:
     """Steps chosen by an estimate of the local error, relative to the size of the state.
 
-    Each step's estimate is held below ``atol + rtol * max|x|``. The laws hold at every step, whatever its size.
+    Each step's estimate is held below ``atol + rtol * max|x|``. Steps are short enough, too, for what grows near the
+    state to grow at its rate, to :data:`GROWTH_ERROR`, however small it is yet: a body spinning about its middle axis
+    falls when it has to. The laws hold at every step, whatever its size.
 
     Parameters
     ----------
@@ -52,12 +69,15 @@ class Adaptive:
         First step to try.
     largest : float, optional
         No step is longer.
+    most_steps : int
+        The run ends with the status "step_limit" after so many, tried ones among them.
     """
 
     rtol: float = 1e-8
     atol: float = 0.0
     first: float | None = None
     largest: float | None = None
+    most_steps: int = 1_000_000
 
     def __post_init__(self):
         for name in ("rtol", "atol"):
@@ -72,6 +92,8 @@ class Adaptive:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise InputError(f"the {name} step must be positive and finite, not {value!r}")
+        if isinstance(self.most_steps, bool) or not isinstance(self.most_steps, int) or self.most_steps < 1:
+            raise InputError(f"most_steps must be a positive integer, not {self.most_steps!r}")
 
 
 @dataclass(frozen=True)
@@ -121,6 +143,52 @@ class Control:
         """After a step with too large an error; infinity where its equations could not be solved."""
         factor = UNSOLVED if not math.isfinite(error) else max(SHRINKAGE, SAFETY * error**-self._power)
         self.h = h * min(factor, 0.9)
+
+
+class Growth:
+    """How long steps may be for what grows near the state to grow at its rate.
+
+    A one-step method that solves a linear equation of rate r multiplies it by R(h r) in a step instead of exp(h r), and
+    one that damps or keeps what it does not resolve, as implicit ones do, sleeps through an instability in long steps.
+
+    Parameters
+    ----------
+    system : System
+    method : OneStepMethod
+        Its R is taken to be the diagonal Padé approximation of its order.
+    """
+
+    def __init__(self, system: System, method: OneStepMethod):
+        self._system, self._method = system, method
+        s = max(1, method.order // 2)
+        constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
+        self._reach = (GROWTH_ERROR * constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / constant + ...
+        self._seen, self._rate = np.full((1, 1), np.nan), 0.0
+
+    def look(self, x, stretch: np.ndarray) -> None:
+        """Note what lies around a state, as :func:`.array.error_and_stretch` sees it."""
+        self._x, self._stretch = x, stretch
+        self._size = math.sqrt(float((stretch * stretch).sum(axis=-1).max()))
+
+    def longest(self, h: float) -> float:
+        """The longest step from that state; infinity where a step of size h is short enough for certain."""
+        whole, stretch = self._stretch.shape[1] <= array.FEW, self._stretch
+        size = self._size * (math.sqrt(len(stretch)) if whole else 1.0)
+        if not self._reach < size * h < math.inf:
+            return math.inf
+        seen = stretch if whole else stretch[:1]
+        if not np.linalg.norm(seen - self._seen) <= CHANGED * np.linalg.norm(self._seen):
+            matrix = stretch if whole else np.asarray(array.growing(self._system, self._method, self._x))
+            self._seen, self._rate = seen, _fastest(matrix)
+        return self._reach / self._rate if self._rate > 0.0 else math.inf
+
+
+def _fastest(matrix: np.ndarray) -> float:
+    """The size of the largest eigenvalue among those that grow."""
+    if not np.isfinite(matrix).all():
+        return 0.0
+    rates = np.linalg.eigvals(matrix)
+    return float(np.abs(rates[rates.real > TURNING * np.abs(rates)]).max(initial=0.0))
 
 
 class Event:
@@ -210,6 +278,7 @@ class Outcome:
     event_time: float | None = None
     underflow: float | None = None
     interrupted: bool = False
+    limit: str = ""
 
 
 def run(
@@ -222,6 +291,7 @@ def run(
     stops: np.ndarray,
     event: Event | None,
     keep: Callable,
+    most_kept: int = MOST_KEPT,
 ) -> Outcome:
     """Step from the start of the span to its end, an event, a failure or Ctrl-C.
 
@@ -235,40 +305,62 @@ def run(
         Times at which steps have to end, increasing; the last is the end of the span.
     keep : function of (t, end, h, state before, state after)
         Told of every step taken, between the times t and its end.
+    most_kept : int
+        Adaptive steps after which there is no room for more.
     """
     t, end = span
-    control = Control(step, method.order, _first_step(state, end - t))
+    adaptive, shortest = isinstance(step, Adaptive), UNDERFLOW * (end - t)
+    control, growth = Control(step, method.order, _first_step(state, end - t)), Growth(system, method)
     value = event(np.asarray(state.x)) if event else 0.0
-    outcome, stop = Outcome(state), 0
+    outcome, stop, table, tried = Outcome(state), -1, None, 0
     try:
+        if adaptive:
+            control.h = min(control.h, _judged(growth, system, method, state, state, control.h)[1])
         while t < end:
-            while stops[stop] <= t:
+            if stop < 0 or stops[stop] <= t:
                 stop += 1
-            h, arrives = _fitted(control, t, stops[stop])
+                continue
+            if not adaptive:
+                if table is None or table.end <= t:
+                    table, since = Timetable((t, float(stops[stop])), step, None), int(state.step)
+                n = int(state.step) - since
+                h, reached = table.h if n < table.full else table.last, table.time(n + 1)
+            else:
+                h, arrives = _fitted(control, t, stops[stop])
+                reached = float(stops[stop]) if arrives else t + h
+                if tried >= step.most_steps or int(state.step) >= most_kept:
+                    outcome.limit = "steps" if tried >= step.most_steps else "memory"
+                    return outcome
             new = advance(state, h)
-            if isinstance(step, Adaptive):
-                error = _error(system, method, state, new, h, step)
-                if not error <= 1.0:
+            tried += 1
+            if adaptive:
+                error, longest = math.inf, math.inf
+                if int(new.status) == array.RUNNING:
+                    found, longest = _judged(growth, system, method, state, new, h)
+                    error = found / _allowed(step, state, new)
+                if not error <= 1.0 or h > 1.1 * longest:
                     outcome.rejected += 1
-                    control.reject(error, h)
-                    if control.h < UNDERFLOW * (end - span[0]):
+                    if not error <= 1.0:
+                        control.reject(error, h)
+                    control.h = min(control.h, longest)
+                    if control.h < shortest:
                         outcome.underflow = control.h
                         outcome.state = new if int(new.status) != array.RUNNING else state
                         return outcome
                     continue
                 control.accept(error, h)
+                control.h = min(control.h, growth.longest(control.h))
             if int(new.status) != array.RUNNING:
                 outcome.state = new
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0
             if event and event.happens(value, after):
                 h, new = _located(event, advance, system, method, state, new, h, value, after)
-                if h > UNDERFLOW * (end - span[0]):
+                if h > shortest:
                     keep(t, t + h, h, state, new)
                     outcome.state = new
                 outcome.event_time = t + h
                 return outcome
-            reached = float(stops[stop]) if arrives else t + h
             keep(t, reached, h, state, new)
             t = reached
             outcome.state = state = new
@@ -283,19 +375,22 @@ def _fitted(control: Control, t: float, stop: float) -> tuple[float, bool]:
     left = stop - t
     if left <= control.h * (1 + 1e-12):
         return left, True
-    if control.adaptive and left < 2.0 * control.h:
+    if left < 2.0 * control.h:
         return 0.5 * left, False
     return control.h, False
 
 
-def _error(system, method, state, new, h: float, step: Adaptive) -> float:
-    """The estimated local error as a fraction of what is allowed; infinity where the step could not be taken."""
-    if int(new.status) != array.RUNNING:
-        return math.inf
+def _judged(growth: Growth, system: System, method, state, new, h: float) -> tuple[float, float]:
+    """The estimated local error of a step that was taken, and the longest step from its start for what grows there."""
+    found, stretch = array.error_and_stretch(system, method, state.x, state.low, h, new.k)
+    growth.look(state.x, np.asarray(stretch))
+    return float(found), growth.longest(h)
+
+
+def _allowed(step: Adaptive, state, new) -> float:
+    """The largest local error."""
     size = max(float(np.abs(state.x).max()), float(np.abs(new.x).max()))
-    allowed = step.atol + step.rtol * size
-    found = float(array.error_of_step(system, method, state.x, state.low, h, new.k))
-    return found / allowed if allowed > 0.0 else math.inf
+    return max(step.atol + step.rtol * size, array.VANISHED)
 
 
 def _first_step(state, length: float) -> float:

@@ -20,6 +20,7 @@ from manifolds import matrix_functions
 
 from ..integrators import OneStepMethod
 from ..systems import System
+from .rounding import with_rounding
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -47,7 +48,12 @@ energy by 2e-15 in 1e6 steps. (Stopping at one eps lets it drift by 4e-14.)"""
 PLATEAU = 1e3 * EPS
 """Largest update at which an iteration that has stopped shrinking counts as converged, relative to ``|x|/h + |k|``.
 
-Rounding in the vector field leaves a few eps; a conditioning of 100 is allowed for."""
+Rounding in the vector field leaves a few eps; a conditioning of 100 is allowed for. Near a rest that lies at the origin
+this size vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the
+slopes are rounded."""
+
+VANISHED = 1e-280
+"""Size, of a state over a step, that is none: below it lie the numbers that have lost their digits."""
 
 DENSE_LIMIT = 12_000
 """Unknowns of a step up to which a full Jacobian matrix is formed (1.2 GB); larger ones have fixed-point iteration \
@@ -57,7 +63,8 @@ alone, unless the system knows its sparsity."""
 class Solved(NamedTuple):
     """Outcome of the stage equations.
 
-    ``converged``; whether the last evaluation was finite (``defined``); the last update; iterations of both kinds.
+    ``converged``; whether the last evaluation was finite (``defined``); the last update; iterations of both kinds; and
+    ``noise``, the size at which the slopes are rounded, where the iteration did not settle without it, else 0.
     """
 
     k: jax.Array
@@ -66,6 +73,7 @@ class Solved(NamedTuple):
     residual: jax.Array
     fixed_point: jax.Array
     newton: jax.Array
+    noise: jax.Array
 
 
 class Iteration(NamedTuple):
@@ -89,33 +97,49 @@ class Iteration(NamedTuple):
         stalled = jnp.where(update < SHRINKING * self.best, 0, self.stalled + 1)
         return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
 
-    def settled(self, scale) -> jax.Array:
-        """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk."""
-        return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & (self.update <= PLATEAU * scale))
+    def settled(self, scale, misfit=jnp.inf, noise=0.0) -> jax.Array:
+        """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
+
+        Small beside the scale of the slopes and the state; or the misfit is, beside the ``noise`` that slopes have.
+        """
+        small = (self.update <= PLATEAU * scale) | (misfit <= PLATEAU * noise)
+        return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & small)
 
 
-def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable) -> Solved:
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0) -> Solved:
     """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
 
+    def settled(s: Iteration):
+        return s.settled(scale(s.k), s.update, noise)
+
     def goes_on(s: Iteration):
-        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * scale(s.k))
+        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * jnp.maximum(scale(s.k), noise))
         hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
-        return ~s.settled(scale(s.k)) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
+        return ~settled(s) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
 
     s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k)), Iteration.begin(guess))
     finite = jnp.isfinite(s.update)
-    return Solved(s.k, s.settled(scale(s.k)) & finite, finite, s.update, s.made, jnp.zeros_like(s.made))
+    noise = jnp.zeros(()) + noise
+    return Solved(s.k, settled(s) & finite, finite, s.update, s.made, jnp.zeros_like(s.made), noise)
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable) -> Solved:
+def noise_of(system: System, x) -> jax.Array:
+    """The size at which the motion from a state is rounded, as a whole."""
+    return jnp.max(with_rounding(system.vector_field, x)[1])
+
+
+def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable, noise: Callable) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``.
 
-    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``.
+    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``, and
+    ``noise()`` the size at which the slopes are rounded, asked for where fixed-point iteration fails.
     """
     first = fixed_point(slopes, guess, scale)
     done = first.converged
+    size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
     if guess.size > DENSE_LIMIT:
-        return first
+        again = jax.lax.cond(done, lambda: first, lambda: fixed_point(slopes, first.k, scale, size))
+        return again._replace(fixed_point=first.fixed_point + jnp.where(done, 0, again.fixed_point))
 
     def misfit(k):
         return slopes(k) - k
@@ -123,8 +147,8 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
     def lost(s: Iteration, damped):
         return (s.made >= jnp.where(damped, 2, 1) * NEWTON_LIMIT) | ~jnp.isfinite(jnp.sum(s.k))
 
-    def unsolved(s: Iteration):
-        return ~done & ~s.settled(scale(s.k))
+    def unsolved(s: Iteration, found):
+        return ~done & ~s.settled(scale(s.k), jnp.max(jnp.abs(found)), size)
 
     def improved(k, step, size, plateau, damped):
         """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
@@ -156,23 +180,24 @@ def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: 
             return inner, found, jnp.where(whole, inner.made - before, NEWTON_REUSE)
 
         def goes_on(carry):
-            inner, _, used = carry
+            inner, found, used = carry
             fresh = (used == 0) | ((used < NEWTON_REUSE) & (inner.rate < 0.3))
-            return fresh & unsolved(inner) & ~lost(inner, damped)
+            return fresh & unsolved(inner, found) & ~lost(inner, damped)
 
         s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
         return s, found, damped
 
     def to_do(carry):
-        s, _, damped = carry
-        return unsolved(s) & ~(damped & lost(s, damped))
+        s, found, damped = carry
+        return unsolved(s, found) & ~(damped & lost(s, damped))
 
     start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), lambda: better_start(misfit, guess))
-    second = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))[0]
+    second, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
     k = jnp.where(done, first.k, second.k)
-    converged = (done | second.settled(scale(second.k))) & jnp.isfinite(jnp.sum(k))
+    converged = ~unsolved(second, found) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.residual, second.update)
-    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made)
+    size = jnp.where(second.settled(scale(second.k)), 0.0, size)
+    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made, size)
 
 
 def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -212,7 +237,9 @@ class State(eqx.Module):
     fixed_point: jax.Array
     newton: jax.Array
     most_iterations: jax.Array
-    residual: jax.Array  # of the last step tried, as h |k - slopes(k)| / |x|
+    residual: (
+        jax.Array
+    )  # of the last step tried, as h |k - slopes(k)| / |x|, or h times the noise of the slopes for |x|
     worst_residual: jax.Array  # of the steps taken
     largest_energy: jax.Array  # over all steps, relative to the first: for laws between the saved states
     smallest_energy: jax.Array
@@ -257,7 +284,10 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def jacobian(k):
         return method.jacobian(system, state.x, state.low, h, k)
 
-    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h), jacobian))
+    def noise():
+        return noise_of(system, state.x)
+
+    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h), jacobian, noise))
 
 
 def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[Callable, jax.Array, Callable]:
@@ -267,7 +297,7 @@ def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[C
         return method.slopes(system, state.x, state.low, h, k)
 
     def scale(k):
-        return jnp.max(jnp.abs(state.x)) / h + jnp.max(jnp.abs(k))
+        return jnp.max(jnp.abs(state.x)) / h + jnp.max(jnp.abs(k)) + VANISHED
 
     return slopes, method.predict(state.k, state.before), scale
 
@@ -278,7 +308,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
-    size = jnp.max(jnp.abs(x))
+    size = jnp.maximum(jnp.max(jnp.abs(x)), h * solved.noise)
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
     mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))
@@ -350,6 +380,83 @@ def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
 @eqx.filter_jit
 def _error(system, method, x, low, h, k):
     return method.error(system, x, low, h, k)
+
+
+FEW, KRYLOV = 8, 24
+"""Components up to which the whole Jacobian matrix of the motion is looked at at every step, and vectors from which its
+growing modes are found otherwise."""
+
+POWERS = 4
+"""Times that the Jacobian matrix is applied to see how large it is."""
+
+
+def error_and_stretch(system: System, method: OneStepMethod, x, low, h, k):
+    """The estimate of the local error and, from the start of the step, how the motion stretches what lies near.
+
+    The Jacobian matrix, shape (n, n), of a few components; otherwise its first :data:`POWERS` powers times a vector,
+    each over the size of the one before, shape (POWERS, n).
+    """
+    return _error_and_stretch(system, method, *(jnp.asarray(a) for a in (x, low, h, k)))
+
+
+@eqx.filter_jit
+def _error_and_stretch(system, method, x, low, h, k):
+    return method.error(system, x, low, h, k), _stretch(*method.judged(system, x))
+
+
+def _stretch(system: System, x):
+    stretched, n = _linearised(system, x), x.shape[0]
+    if n <= FEW:
+        return jax.vmap(stretched)(jnp.eye(n)).T
+
+    def power(v, _):
+        v = stretched(v)
+        return _unit(v), v
+
+    return jax.lax.scan(power, _unit(_uneven(n)), length=POWERS)[1]
+
+
+@eqx.filter_jit
+def growing(system, method, x):
+    """The matrix of the Jacobian in a Krylov space, shape (m, m): its eigenvalues lie near the outer ones [Arnoldi]."""
+    system, x = method.judged(system, x)
+    stretched, n = _linearised(system, x), x.shape[0]
+    m = min(n, KRYLOV)
+
+    def extended(carry, i):
+        frame, matrix = carry
+        v = stretched(frame[i])
+        parts, rest = without(frame, v)
+        length = jnp.linalg.norm(rest)
+        closed = length <= 1e-10 * jnp.linalg.norm(v)  # a space that the motion keeps: go on outside of it
+        length, rest = jnp.where(closed, 0.0, length), jnp.where(closed, jnp.roll(_uneven(n), i + 1), rest)
+        matrix = matrix.at[:m, i].set(parts[:m]).at[i + 1, i].set(length)
+        return (frame.at[i + 1].set(_unit(without(frame, _unit(rest))[1])), matrix), None
+
+    def without(frame, v):
+        parts = frame @ v
+        v = v - parts @ frame
+        again = frame @ v  # the second pass removes what rounding left of the first
+        return parts + again, v - again @ frame
+
+    frame = jnp.zeros((m + 1, n)).at[0].set(_unit(_uneven(n)))
+    (_, matrix), _ = jax.lax.scan(extended, (frame, jnp.zeros((m + 1, m))), jnp.arange(m))
+    return matrix[:m]
+
+
+def _linearised(system: System, x) -> Callable:
+    """The derivative of the motion at x, on tangent vectors."""
+    return lambda v: system.tangent(x, jax.jvp(system.vector_field, (x,), (system.tangent(x, v),))[1])
+
+
+def _uneven(n: int) -> np.ndarray:
+    """A vector that has a part in every direction of interest."""
+    return np.random.default_rng(0).standard_normal(n)
+
+
+def _unit(v):
+    length = jnp.linalg.norm(v)
+    return v / jnp.where(length > 0.0, length, 1.0)
 
 
 STEERED = 4 * EPS

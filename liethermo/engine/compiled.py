@@ -55,14 +55,14 @@ NUMBERS = {
 }
 """The fields of :class:`.array.State`, and the rows that hold them in the step loop."""
 
-WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS"
+WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS NOISE"
 """The other rows of one number."""
 
 OF_NEWTON = ("DIRECTION", "CHANGES", "LINEAR")
 """What Newton's method works with, for one lane at a time: one after another in an array of its own."""
 
 CONSTANTS = """FIXED_POINT_LIMIT FLOOR HALVINGS HARD IDLE ITERATING NEWTON_LIMIT NEWTON_REUSE NON_FINITE NOT_CONVERGED
-PLATEAU SHRINKING SLOW SOLVED"""
+PLATEAU SHRINKING SLOW SOLVED VANISHED"""
 
 
 def begin(system: System, method: OneStepMethod, x) -> State:
@@ -135,6 +135,9 @@ class Stepper:
             new = method.slopes(rebuilt(p), x, low, h[0], k)
             return new, jnp.max(jnp.abs(new - k)), jnp.max(jnp.abs(new))
 
+        def sound(p, x):
+            return array.noise_of(rebuilt(p), x)
+
         def along(p, x, low, h, k, direction):
             return method.change(rebuilt(p), x, low, h[0], k, direction)
 
@@ -165,6 +168,7 @@ class Stepper:
         self._start = self._traced(start, "P X")
         # Of a derivative, what is the same in every direction is computed once a Jacobian.
         self._derivative = lambda: self._traced(along, f"{step} DIRECTION").split([len(step.split())])
+        self._sound = lambda: self._traced(sound, "P X")
         self._step_arguments = step
 
         sizes = {name: math.prod(shape) for name, shape in self._shapes.items()}
@@ -290,21 +294,22 @@ class Stepper:
         lines += [f"{name} = {row * lanes}" for name, row in self._rows.items()]
         lines += [f"RELAXING = {self._relaxing * lanes}"]
         for name, pieces in programs.items():
-            looped = name in self._programs
+            looped = name not in ("linearise", "along")
             body = [line for i, piece in enumerate(pieces) for line in self._body(piece, f"_{i}")]
             plain = not spelled_out and all(is_plain(piece.program) for piece in pieces)
             lines += ["", "", *_function(name, body, looped, plain)]
         if not newton:
-            lines += ["", "", "linearise = along = njit(lambda p, w, l, v: None)"]
+            lines += ["", "", "linearise = along = sound = njit(lambda p, w, l, v: None)"]
         return "\n".join(lines) + "\n\n\n" + _template()
 
     def _add_derivative(self, programs: dict[str, list[_Piece]]) -> int:
-        """Add the programs of Newton's method; the length of what the first hands to the second."""
+        """Add the programs of Newton's method; the length of what ``linearise`` hands to ``along``."""
         linear, along = self._derivative()
         (size,) = self._shapes["LINEAR"] = linear.shapes[0]
         arguments = f"{self._step_arguments} DIRECTION"
         programs["linearise"] = [_Piece(linear, arguments, "LINEAR")]
         programs["along"] = [_Piece(along, f"{arguments} LINEAR", "CHANGES")]
+        programs["sound"] = [_Piece(self._sound(), "P X", "NOISE")]
         return size
 
     def _body(self, piece: _Piece, prefix: str) -> list[str]:

@@ -19,6 +19,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from . import array
 from .linear import Compression, Inverse
+from .rounding import with_rounding
 
 LIMIT = 80
 """Newton iterations: cheap ones, most of which use factors that are there already."""
@@ -89,27 +90,37 @@ class SparseEngine:
     def _newton(self, state: array.State, h, before: int) -> array.Solved:
         k, misfit, scale = _better_start(self.system, self.method, state, h)
         s, renew = array.Iteration.begin(k), float(h) != self._h
-        while not bool(s.settled(scale)) and int(s.made) < LIMIT:
+        noise = jnp.zeros(())
+        while not self._settled(s, scale, misfit, noise) and int(s.made) < LIMIT:
             if renew or self._inverse is None:
                 self._inverse, self._h = self._inverted(state, h, s.k), float(h)
                 if self._inverse is None:
                     break
             found = self._improved(state, h, s, misfit, scale, self._inverse, HALVINGS if renew else 1)
             if found is None and renew:
+                s = s._replace(stalled=jnp.asarray(2))  # no step, however short, solves the equations better
+                noise = _noise(self.system, state.x)
                 break
             renew = found is None
             if found is not None:
                 s, misfit, scale = found
                 renew = float(s.rate) > STALE and float(s.update) > array.PLATEAU * float(scale)
+            if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale)):
+                noise = _noise(self.system, state.x)
         defined = bool(jnp.isfinite(misfit).all())
         return array.Solved(
             k=s.k,
-            converged=jnp.asarray(bool(s.settled(scale)) and defined),
+            converged=jnp.asarray(self._settled(s, scale, misfit, noise) and defined),
             defined=jnp.asarray(defined),
             residual=s.update,
             fixed_point=jnp.asarray(before),
             newton=s.made,
+            noise=jnp.where(s.settled(scale), 0.0, noise),
         )
+
+    @staticmethod
+    def _settled(s: array.Iteration, scale, misfit, noise) -> bool:
+        return bool(s.settled(scale, jnp.max(jnp.abs(misfit)), noise))
 
     def _improved(self, state, h, s: array.Iteration, misfit, scale, inverse: Inverse, attempts: int):
         """After a Newton step, halved until the equations are solved better than before; None if that fails.
@@ -178,6 +189,12 @@ def _equations(system: System, method: OneStepMethod, state: array.State, h):
 def _misfit(system: System, method: OneStepMethod, state: array.State, h, k) -> tuple[Any, Any]:
     misfit, _, scale = _equations(system, method, state, h)
     return misfit(k), scale(k)
+
+
+@eqx.filter_jit
+def _noise(system: System, x) -> Any:
+    """The size at which the misfit is rounded."""
+    return jnp.max(with_rounding(lambda x: system.weights(x) * system.vector_field(x), x)[1])
 
 
 @eqx.filter_jit

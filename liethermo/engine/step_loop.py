@@ -22,6 +22,7 @@ from .array import (
     PLATEAU,
     SHRINKING,
     SLOW,
+    VANISHED,
 )
 
 IDLE, ITERATING, SOLVED, HARD = 0, 1, 2, 3
@@ -29,13 +30,13 @@ IDLE, ITERATING, SOLVED, HARD = 0, 1, 2, 3
 
 N = M = LANES = LENGTH = 1
 NEWTON = False
-"""Components of the state, of all stage slopes together; trajectories in a block; length of v; whether the last two
-programs are there."""
+"""Components of the state, of all stage slopes together; trajectories in a block; length of v; whether there are
+the programs that only Newton's method needs, ``linearise``, ``along`` and ``sound``."""
 
 X = LOW = K = BEFORE = GUESS = NEW = AFTER = AFTER_LOW = AFTER_ENERGY = AFTER_ENTROPY = CHECK = 0
 H = SIZE = UPDATE = SLOPE = PREVIOUS = BEST = STALLED = PHASE = CHANGE = TRIES = CORRECTIONS = 0
 STATUS = STEP = FIXED_POINT = NEWTONS = MOST = ENERGY = ENTROPY = RESIDUAL = WORST = 0
-HIGHEST = LOWEST = LEAST_RISE = LARGEST_GAIN = INTEGRAL = RELAXING = 0
+HIGHEST = LOWEST = LEAST_RISE = LARGEST_GAIN = INTEGRAL = RELAXING = NOISE = 0
 """Offsets of the rows in w. ENTROPY follows ENERGY; RELAXING is the distance to the one whose relaxation is timed."""
 
 
@@ -45,6 +46,10 @@ def prepare(p, w, first, last):
 
 def iterate(p, w, first, last):
     """NEW, the slopes at GUESS; UPDATE, their largest difference; SLOPE, the largest of them."""
+
+
+def sound(p, w, first, last):
+    """NOISE, the size at which the motion from the state is rounded."""
 
 
 def linearise(p, w, l, v):
@@ -81,7 +86,7 @@ def settle(w, made):
         rate = update / previous if made > 1 and previous > 0.0 else 0.0
         stalled = 0.0 if update < SHRINKING * best else w[STALLED + l] + 1.0
         best = update if update < best else best
-        scale = w[SIZE + l] / w[H + l] + w[SLOPE + l]
+        scale = w[SIZE + l] / w[H + l] + w[SLOPE + l] + VANISHED
         done = update <= FLOOR * scale or (stalled >= 2.0 and update <= PLATEAU * scale)
         hopeless = not update < np.inf or (made >= 3 and rate > SLOW and best > PLATEAU * scale)
         phase = SOLVED if done else (HARD if hopeless or made == FIXED_POINT_LIMIT else ITERATING)
@@ -145,7 +150,7 @@ def jacobian(p, w, l, matrix, v):
 
 @njit
 def misfit(p, w, l):
-    """``|slopes(k) - k|`` at the GUESS of a lane."""
+    """``|slopes(k) - k|`` at the GUESS of a lane; UPDATE, the largest component of it."""
     iterate(p, w, l, l + 1)
     total = 0.0
     for i in range(l, M * LANES, LANES):
@@ -175,13 +180,14 @@ def newton(p, w, l, matrix, order, b, v, damped):
         prepare(p, w, l, l + 1)
         found = misfit(p, w, l)
     status, update, best, rate, stalled, made, used = NOT_CONVERGED, np.inf, np.inf, 0.0, 0, 0, NEWTON_REUSE
+    w[NOISE + l] = 0.0
     while status == NOT_CONVERGED and made < NEWTON_LIMIT:
         if used >= NEWTON_REUSE or rate >= 0.3:
             jacobian(p, w, l, matrix, v)
             if not factorise(matrix, order):
                 return NON_FINITE, np.nan, made
             used = 0
-        scale = w[SIZE + l] / w[H + l] + largest(w, l)
+        scale = w[SIZE + l] / w[H + l] + largest(w, l) + VANISHED
         previous, update = update, 0.0
         for i in range(M):
             b[i] = w[NEW + i * LANES + l] - w[GUESS + i * LANES + l]
@@ -199,11 +205,16 @@ def newton(p, w, l, matrix, order, b, v, damped):
         rate = update / previous if made > 1 and previous > 0.0 else 0.0
         stalled = 0 if update < SHRINKING * best else stalled + 1
         best = min(best, update)
-        scale = w[SIZE + l] / w[H + l] + largest(w, l)
+        scale = w[SIZE + l] / w[H + l] + largest(w, l) + VANISHED
         if not np.isfinite(found + scale):
             status, update = NON_FINITE, np.nan
         elif update <= FLOOR * scale or (stalled >= 2 and update <= PLATEAU * scale):
-            status = 0
+            status, w[NOISE + l] = 0, 0.0
+        elif stalled >= 2:
+            if w[NOISE + l] == 0.0:
+                sound(p, w, l, l + 1)
+            if w[UPDATE + l] <= PLATEAU * w[NOISE + l]:
+                status = 0
     return status, update, made
 
 
@@ -219,7 +230,14 @@ def solve_by_newton(p, w, l, matrix, order, b, v):
     w[CHANGE + l] = update
     w[CORRECTIONS + l] = made
     if status != 0:
-        w[RESIDUAL + l] = w[H + l] * update / (w[SIZE + l] if w[SIZE + l] > 0.0 else 1.0)
+        w[RESIDUAL + l] = relative(w, l, update)
+
+
+@njit
+def relative(w, l, update):
+    """The residual: an update of the slopes relative to the state, or to the NOISE of the slopes."""
+    size = max(w[SIZE + l], w[H + l] * w[NOISE + l])
+    return w[H + l] * update / (size if size > 0.0 else 1.0)
 
 
 @njit
@@ -237,6 +255,7 @@ def take_step(p, w, matrix, order, b, v):
         w[BEST + l] = np.inf
         w[STALLED + l] = 0.0
         w[CORRECTIONS + l] = 0.0
+        w[NOISE + l] = 0.0
         going += 1 if running else 0
     made = 0
     while going > 0:
@@ -256,7 +275,7 @@ def take_step(p, w, matrix, order, b, v):
     for l in range(LANES):
         solved = w[PHASE + l] == SOLVED
         good = solved and np.isfinite(w[CHECK + l])
-        residual = w[H + l] * w[CHANGE + l] / (w[SIZE + l] if w[SIZE + l] > 0.0 else 1.0)
+        residual = relative(w, l, w[CHANGE + l])
         energy, entropy, relaxing = w[AFTER_ENERGY + l], w[AFTER_ENTROPY + l], w[AFTER_ENERGY + RELAXING + l]
         rise, gain = entropy - w[ENTROPY + l], energy - w[ENERGY + l]
         iterations = w[TRIES + l] + w[CORRECTIONS + l]

@@ -131,6 +131,9 @@ class WithAttitude(OneStepMethod):
         (mu, _), (mu_low, _), (rates, _) = map(system.split, (x, low, k))
         return self.method.error(system.body, mu, mu_low, h, rates)
 
+    def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
+        return self.method.judged(system.body, system.split(x)[0])
+
     def __str__(self) -> str:
         return f"{self.method} with attitudes by {self.kind}"
 

@@ -26,7 +26,7 @@ CANONICAL = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2
 
 @dataclass(frozen=True)
 class Problem:
-    """A system, its vector field by hand, where it starts, how long it runs, and what it conserves besides the energy."""
+    """A system, its vector field by hand, where it starts, how long it runs, and what it conserves beside H."""
 
     build: Callable[[], lt.systems.System]
     field: Callable[[np.ndarray], np.ndarray]
@@ -43,7 +43,7 @@ class Problem:
         return solution.y[:, -1]
 
 
-# -- the problems -------------------------------------------------------------------------------------------------------
+# -- the problems ------------------------------------------------------------------------------------------------------
 
 
 def angular_momentum(x):
@@ -238,7 +238,7 @@ PROBLEMS = {
 SYSTEMS = {name: functools.cache(problem.build) for name, problem in PROBLEMS.items()}
 
 
-# -- the methods, with every option -------------------------------------------------------------------------------------
+# -- the methods, with every option ------------------------------------------------------------------------------------
 
 STEPS = {1: (80, 160), 2: (40, 80), 4: (16, 32), 6: (10, 20)}
 """Numbers of steps, by order, in the asymptotic regime and above rounding."""
