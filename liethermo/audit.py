@@ -1,36 +1,51 @@
-"""The audit: did the laws hold along a run, at every step?"""
+"""The audit: did the laws hold along a run, at every step, and is it a run of the system at all?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .errors import InputError
 
 if TYPE_CHECKING:
+    from .evidence import Evidence
     from .solution import Laws, Solution
 
 EPS = float(np.finfo(np.float64).eps)
+
+
+VALUE = 8 * EPS
+"""Change of a function, relative to its value, that its own rounding can account for, whatever it varies by: as much as
+the engines leave uncorrected of the energy, and as much again for the values at both ends."""
 
 
 @dataclass(frozen=True)
 class Tolerances:
     """What an audit accepts.
 
+    A change of a function is judged against the size at which rounding sees the function, its *sensitivity*
+    ``max |grad f(x)| |x|`` along the run (:meth:`liethermo.Energy.sensitivity`), whatever its value is at the start.
+    Eight roundings of the value itself are allowed besides: nothing smaller can be seen where a constant is added.
+
     Attributes
     ----------
     energy : float
-        Relative drift. Exact schemes stay near 1e-15 for thousands of steps, below 2e-14 for a million.
+        Drift. Exact schemes stay near 1e-15 for thousands of steps, below 2e-14 for a million.
     entropy : float
-        Fall of the entropy in one step relative to ``max |S|``: four roundings of S itself.
+        Fall of the entropy in one step: four roundings of the state.
     casimirs : float
-        Relative drift of the functions that the system conserves.
+        Drift of the functions that the system conserves; and the fall of the entropy in all.
     residual : float
         Of the stage equations: their rounding plateau.
     attitude : float
         Distance from the group, relative to the size of the attitude, as ``manifolds.MatrixGroup.belongs`` has it.
+    accuracy : float
+        Estimated local error of a step relative to the distance that it goes (or to a hundredth of the whole motion,
+        where that is more): a second-order method has 0.05 where it takes eight steps to a period.
+    consistency : float
+        How far the slope of a step is from the vector field, relative to that, as the step gets shorter.
     """
 
     energy: float = 1e-13
@@ -38,11 +53,22 @@ class Tolerances:
     casimirs: float = 1e-12
     residual: float = 1e-12
     attitude: float = 1e-10
+    accuracy: float = 0.05
+    consistency: float = 1e-4
 
     def __post_init__(self):
         for name, value in vars(self).items():
             if not value >= 0.0:
                 raise InputError(f"the tolerance {name} must be >= 0, not {value}")
+
+    @classmethod
+    def of(cls, **given: float) -> Tolerances:
+        """Those given by name, and the defaults of the others; InputError where there is none of a name."""
+        names = [field.name for field in fields(cls)]
+        unknown = [name for name in given if name not in names]
+        if unknown:
+            raise InputError(f"an audit has no tolerance {unknown[0]!r}; those that it has are {', '.join(names)}")
+        return cls(**given)
 
 
 @dataclass(frozen=True)
@@ -56,20 +82,29 @@ class AuditRow:
     note: str = ""
 
 
+ACCURACY, CONSISTENCY = "accuracy", "consistency"
+"""The rows that are not about laws."""
+
+LAW_FAILS = "A LAW FAILS"
+
+
 @dataclass(frozen=True)
 class Audit:
-    """The laws of a run. Printing it gives a table.
+    """The laws of a run, how accurate it is, and whether it is one of its system. Printing it gives a table.
 
     Attributes
     ----------
     energy_drift : float
-        ``max |H - H0| / |H0|`` over every step (over 1 where H0 = 0), H less the work done from outside.
+        ``max |H - H0|`` over every step, H less the work done from outside, relative to the size at which H is rounded:
+        the larger of ``|H0|`` and ``max |grad H(x)| |x|`` along the run.
     entropy_min_increment : float
         Smallest increment of the entropy in one step; NaN without an entropy.
     casimir_drift : float
-        Largest relative drift of the functions that the system conserves; NaN where there is none.
+        Largest drift, relative to the same of each, of the functions that the system conserves and the method promises
+        to keep; NaN where there is none.
     worst_residual : float
     passed : bool
+        Whether no row fails. That of the accuracy does where the steps do not resolve the motion.
     rows : tuple of AuditRow
     """
 
@@ -83,6 +118,19 @@ class Audit:
     def passed(self) -> bool:
         return all(row.passed is not False for row in self.rows)
 
+    @property
+    def verdict(self) -> str:
+        """The whole in one line."""
+        failing = {row.law for row in self.rows if row.passed is False}
+        if failing - {ACCURACY, CONSISTENCY}:
+            return LAW_FAILS
+        if CONSISTENCY in failing:
+            return "the laws hold, but THIS IS NOT THE MOTION of the system"
+        if ACCURACY in failing:
+            return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
+        resolved = any(row.law == ACCURACY and row.passed for row in self.rows)
+        return "the laws hold, and the steps resolve the motion" if resolved else "the laws hold"
+
     def __str__(self) -> str:
         width = max(len(row.law) for row in self.rows)
         verdict = {True: "ok", False: "FAILS", None: "-"}
@@ -92,51 +140,71 @@ class Audit:
             lines.append(
                 f"{row.law:<{width}}  {row.value:10.2e}  {allowed}  {verdict[row.passed]:<5} {row.note}".rstrip()
             )
-        lines.append("the laws hold" if self.passed else "A LAW FAILS")
-        return "\n".join(lines)
+        return "\n".join([*lines, self.verdict])
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """The size at which a function is rounded along a run, and what an audit allows it to change by.
+
+    Attributes
+    ----------
+    value : float or ndarray
+        Its size, at the start or the largest.
+    sensitivity : float or ndarray
+    """
+
+    value: Any
+    sensitivity: Any
+
+    @property
+    def size(self) -> Any:
+        """What changes are given relative to."""
+        size = np.maximum(np.abs(self.value), self.sensitivity)
+        return np.where(size > 0.0, size, 1.0)
+
+    def allowed(self, tolerance: float) -> Any:
+        """The largest change accepted, relative to the size."""
+        return (tolerance * self.sensitivity + VALUE * np.abs(self.value)) / self.size
 
 
 def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     """See :meth:`liethermo.Solution.audit`."""
-    stats, laws, rows, energy = solution.stats, solution.laws, [], solution.energy_balance
+    stats, laws, evidence, rows, energy = solution.stats, solution.laws, solution.evidence, [], solution.energy_balance
     name = " minus ".join(["energy", *laws.balance])
     low, high = stats.energy_range or (np.inf, -np.inf)
     lowest, highest = min(low, float(energy.min())), max(high, float(energy.max()))
     first = float(energy[0])
-    scale = abs(first) or 1.0
-    drift = max(highest - first, first - lowest) / scale
+    rounding = _rounding(energy, evidence.energy)
+    drift = float(max(highest - first, first - lowest) / rounding.size)
+    allowed = float(rounding.allowed(tolerances.energy))
     if laws.energy == "conserved":
-        rows.append(_verdict(f"{name} drift", drift, tolerances.energy, _note(laws, "energy")))
+        rows.append(_verdict(f"{name} drift", drift, allowed, _note(laws, "energy")))
     elif laws.energy is None:
         rows.append(AuditRow(f"{name} drift", drift, None, None, "no law promised"))
     else:
         increments = [*np.diff(energy), _or(stats.largest_energy_increment, -np.inf)]
-        risen = float(max(increments)) / scale
-        rows.append(_verdict(f"largest {name} increment", risen, tolerances.energy, _note(laws, "energy")))
+        risen = float(max(increments)) / rounding.size
+        rows.append(_verdict(f"largest {name} increment", risen, allowed, _note(laws, "energy")))
 
     least = np.nan
     if solution.entropy is not None:
-        least = float(min([*np.diff(solution.entropy), _or(stats.least_entropy_increment, np.inf)]))
-        allowed = tolerances.entropy * float(np.abs(solution.entropy).max())
-        if laws.entropy == "nondecreasing":
-            held = bool(least >= -allowed)
-            rows.append(AuditRow("least entropy increment", least, -allowed, held, _note(laws, "entropy")))
-        elif laws.entropy == "conserved":
-            change = _drift(solution.entropy)
-            rows.append(_verdict("entropy drift", change, tolerances.casimirs, _note(laws, "entropy")))
-        else:
-            rows.append(AuditRow("least entropy increment", least, None, None, "no law promised"))
+        least, row = _entropy_row(solution, tolerances)
+        rows.append(row)
 
-    drifts = {name: _drift(series) for name, series in solution.casimirs.items() if name not in laws.ledger}
-    kept = [drifts[name] for name in laws.conserved if name in drifts]
-    casimir_drift = max(kept, default=np.nan)
-    for name, value in drifts.items():
-        promised = name in laws.conserved
-        rows.append(
-            _verdict(f"drift of {name}", value, tolerances.casimirs)
-            if promised
-            else AuditRow(f"change of {name}", value, None, None, "not a constant of this system")
-        )
+    kept = []
+    for name, series in solution.casimirs.items():
+        if name in laws.ledger:
+            continue
+        rounding = _rounding(series, evidence.invariants.get(name))
+        change = float(np.abs(series - series[0]).max() / rounding.size)
+        if name in laws.conserved:
+            kept.append(change)
+            rows.append(_verdict(f"drift of {name}", change, float(rounding.allowed(tolerances.casimirs))))
+        elif name in laws.unpromised:
+            rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED))
+        else:
+            rows.append(AuditRow(f"change of {name}", change, None, None, "not a constant of this system"))
     for name in laws.ledger:
         series = solution.casimirs[name]
         rows.append(
@@ -145,12 +213,59 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
     if stats.attitude_residual is not None:
         rows.append(_verdict("attitude in group", stats.attitude_residual, tolerances.attitude))
+    rows += _of_the_steps(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     failed = not status.ok and status.code != "interrupted"
     rows.append(
         AuditRow("steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else status.code)
     )
-    return Audit(drift, least, casimir_drift, stats.worst_residual, tuple(rows))
+    return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows))
+
+
+UNPROMISED = "a constant of this system, which the method does not promise to keep exactly"
+
+
+def _entropy_row(solution: Solution, tolerances: Tolerances) -> tuple[float, AuditRow]:
+    """The least increment of the entropy, and its law: at every step, and over all of the run."""
+    S, law = solution.entropy, solution.laws.entropy
+    assert S is not None
+    note, rounding = _note(solution.laws, "entropy"), _rounding(S, solution.evidence.entropy)
+    least = float(min([*np.diff(S), _or(solution.stats.least_entropy_increment, np.inf)]))
+    if law == "conserved":
+        change = float(np.abs(S - S[0]).max() / rounding.size)
+        return least, _verdict("entropy drift", change, float(rounding.allowed(tolerances.casimirs)), note)
+    if law is None:
+        return least, AuditRow("least entropy increment", least, None, None, "no law promised")
+    rounding = Rounding(float(np.abs(S).max()), rounding.sensitivity)
+    one, all_ = (float(rounding.allowed(t) * rounding.size) for t in (tolerances.entropy, tolerances.casimirs))
+    fall = float((np.maximum.accumulate(S) - S).max())
+    if fall > all_ >= 0.0 and least >= -one:  # step by step below what rounding hides
+        note = f"in all it falls by {fall:.2g}"
+    return least, AuditRow("least entropy increment", least, -one, bool(least >= -one and fall <= all_), note)
+
+
+def _of_the_steps(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
+    """Whether the steps resolve the motion, and whether it is that of the system."""
+    rows, missed = [accuracy_row(evidence, tolerances)], evidence.inconsistency
+    if missed is not None:
+        row = _verdict(CONSISTENCY, missed, tolerances.consistency)
+        note = "" if row.passed else "short steps of this method do not follow the vector field of this system"
+        rows.append(replace(row, note=note))
+    return rows
+
+
+def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
+    """Whether the steps resolve the motion."""
+    if evidence.local_error is None:
+        return AuditRow(ACCURACY, np.nan, None, None, "not estimated: how accurate the run is is not known")
+    row = _verdict(ACCURACY, evidence.local_error, tolerances.accuracy)
+    where = f"local error of a step, of the distance it goes; worst at t = {evidence.error_time:.4g}"
+    return replace(row, note=where if row.passed else f"the steps do not resolve the motion: try suggest_step; {where}")
+
+
+def _rounding(series: np.ndarray, sensitivity: float | None) -> Rounding:
+    """Of a function with this series; the largest of its values stands in for a sensitivity that is not known."""
+    return Rounding(abs(float(series[0])), float(np.abs(series).max()) if sensitivity is None else sensitivity)
 
 
 def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:
@@ -159,12 +274,6 @@ def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditR
 
 def _note(laws: Laws, law: str) -> str:
     return "not kept exactly by this method" if law in laws.inexact else ""
-
-
-def _drift(series: np.ndarray) -> float:
-    """Largest deviation from the first value, relative to it, or to the largest where it begins near zero."""
-    scale = max(abs(float(series[0])), EPS * float(np.abs(series).max())) or 1.0
-    return float(np.abs(series - series[0]).max()) / scale
 
 
 def _or(value: float | None, otherwise: float) -> float:

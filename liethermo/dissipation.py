@@ -28,6 +28,9 @@ from .indices import union
 if TYPE_CHECKING:
     from .systems import System
 
+KERNEL = "K grad H = 0, as given"
+"""The row of a check on a friction operator before it is projected."""
+
 Law = Literal["conserved", "nondecreasing", "nonincreasing"]
 T = TypeVar("T")
 
@@ -86,6 +89,11 @@ class Dissipation(eqx.Module):
         """This dissipation, checked against the system it is used in and completed with what that determines."""
         del system
         return self
+
+    def own_residuals(self, system: System, x) -> dict[str, jax.Array]:
+        """Residuals at x of what it was given and would have to mend, relative to what cancels, by their names."""
+        del system, x
+        return {}
 
     @abstractmethod
     def force(self, system: System, x, dH, dS, dL) -> jax.Array:
@@ -351,6 +359,9 @@ class ProjectedMetric(Dissipation):
 class FrictionOperator(Dissipation):
     """Dissipation by a friction matrix K(x) with ``K(x) grad H(x) = 0`` [BFM Remark 4.7].
 
+    That K has grad H in its kernel is tested where a system is built, and by ``system.check()``: of another K only the
+    projection ``P^T K P`` would act, P the projector off grad H. ``project=True`` says that this is meant.
+
     A discretisation hands it a discrete gradient dH beside ``grad H(x)``. The kernel is then moved from the one to the
     other: ``K_d = P^T K P`` with ``P = 1 - dH grad H^T / (grad H . dH)``, the projector along dH onto the complement of
     grad H. K_d is semidefinite, has dH in its kernel, keeps every other kernel vector of K that is orthogonal to grad H
@@ -360,18 +371,31 @@ class FrictionOperator(Dissipation):
     ----------
     K : function from x, shape (n,), to a matrix (n, n), or a constant matrix
     rate : float, >= 0
+    project : bool
+        Take any symmetric semidefinite K, and let its projection off grad H act.
     """
 
     K: Callable | jax.Array
     rate: jax.Array
+    project: bool = eqx.field(static=True)
 
-    def __init__(self, K, rate=1.0):
+    def __init__(self, K, rate=1.0, project: bool = False):
         self.K = K if callable(K) else semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
+        self.project = bool(project)
 
     def prepared(self, system):
         _check_matrix(self.K, system.dim, "the friction operator K")
         return self
+
+    def own_residuals(self, system, x):
+        if self.project:
+            return {}
+        K, dH = _at(self.K, x), system.energy.gradient(x)
+        dH = dH if system.space is None else system.lowered(x, system.raised(x, dH))
+        size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
+        missed = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
+        return {KERNEL: missed / jnp.where(size > 0.0, size, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
         gradient, raised, K = system.raised(x, system.energy.gradient(x)), system.raised(x, dH), _at(self.K, x)

@@ -49,6 +49,14 @@ class Energy(eqx.Module):
         """The gradient at one state, shape (n,)."""
         return jax.grad(self.value)(x)
 
+    def sensitivity(self, x) -> jax.Array:
+        """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.
+
+        One rounding of the state changes f by eps times this, whatever the value of f is: ``log |x|^2`` has the
+        sensitivity 2 where it vanishes, and a constant that is added to f has none. Every drift is judged against it.
+        """
+        return jax.lax.stop_gradient(jnp.linalg.norm(self.gradient(x)) * jnp.linalg.norm(x))
+
     @property
     def terms(self) -> tuple[Energy, ...]:
         """The summands, none of them a sum itself."""
@@ -159,6 +167,8 @@ class Quadratic(Energy):
             asymmetry = float(np.abs(matrix - matrix.T).max())
             if asymmetry > 1e-12 * float(np.abs(matrix).max()):
                 raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
+            if asymmetry > 0.0:  # the gradient A x of the value x A x / 2 has to be exact
+                self.A = real_array((matrix + matrix.T) / 2)
 
     @property
     def is_quadratic(self) -> bool:
@@ -331,6 +341,9 @@ class Pullback(Energy):
     def value(self, x) -> jax.Array:
         return self.term.value(self.of(x))
 
+    def sensitivity(self, x) -> jax.Array:
+        return self.term.sensitivity(self.of(x)) if self.function is None else super().sensitivity(x)
+
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         low = jnp.zeros_like(x) + low
         middle, kept = x + (low + 0.5 * d), jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
@@ -388,6 +401,9 @@ class Negative(Energy):
     def gradient(self, x) -> jax.Array:
         return -self.term.gradient(x)
 
+    def sensitivity(self, x) -> jax.Array:
+        return self.term.sensitivity(x)
+
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         return -self.term.discrete_gradient(scheme, x, d, low)
 
@@ -435,6 +451,9 @@ class Sum(Energy):
 
     def gradient(self, x) -> jax.Array:
         return sum((term.gradient(x) for term in self.summands[1:]), self.summands[0].gradient(x))
+
+    def sensitivity(self, x) -> jax.Array:
+        return sum((term.sensitivity(x) for term in self.summands[1:]), self.summands[0].sensitivity(x))
 
 
 def as_energy(function, role: str) -> Energy:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import equinox as eqx
@@ -16,10 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .audit import Audit, AuditRow, Tolerances
+from .audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
 from .engine import array, compiled
+from .engine.compiled import Form
+from .engine.interpret import at_points
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
+from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, spread
 from .family import Family, common_size
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
@@ -59,11 +63,16 @@ class Ensemble:
     residual : ndarray, shape (B,)
         ``h |k - slopes(k)| / |x|`` of the last step tried.
     energy_drift : ndarray, shape (B,)
-        ``max |H - H0| / |H0|`` over every step (over 1 where H0 = 0).
+        ``max |H - H0|`` over every step, relative to the size at which H is rounded: as for :class:`Audit`.
     largest_energy_increment, least_entropy_increment : ndarray, shape (B,)
         Of one step, over every step.
     entropy_scale : ndarray, shape (B,)
-        ``max(|S(0)|, |S(T)|)``, what rounding of the entropy is measured against.
+        ``max(|S(0)|, |S(T)|)``.
+    energy_sensitivity, entropy_sensitivity : ndarray, shape (B,)
+        Largest :meth:`liethermo.Energy.sensitivity` over every step: what rounding is measured against.
+    first_energy : ndarray, shape (B,)
+    entropy_change : ndarray, shape (B,)
+        ``S(T) - S(0)``.
     relaxation_time : ndarray, shape (B,)
         ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
         relaxation that is over by T. The energy takes the place of S under a double bracket. NaN where nothing relaxes.
@@ -91,6 +100,10 @@ class Ensemble:
     largest_energy_increment: np.ndarray
     least_entropy_increment: np.ndarray
     entropy_scale: np.ndarray
+    energy_sensitivity: np.ndarray
+    entropy_sensitivity: np.ndarray
+    first_energy: np.ndarray
+    entropy_change: np.ndarray
     relaxation_time: np.ndarray
     iterations: np.ndarray
     laws: Laws
@@ -98,6 +111,15 @@ class Ensemble:
     wall_time: float
     attitude: np.ndarray | None = None
     work: np.ndarray | None = None
+    witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        """What an audit needs besides the series: found when first asked for."""
+        return Evidence() if self.witness is None else self.witness()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
+        return {**vars(self), "evidence": self.evidence, "witness": None}
 
     def __len__(self) -> int:
         return len(self.status)
@@ -118,33 +140,48 @@ class Ensemble:
         lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
         return "\n".join(lines)
 
-    def audit(self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy) -> Audit:
+    def audit(
+        self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
+    ) -> Audit:
         """The laws at every step of every trajectory, each by the one that kept it worst; printing it gives a table.
+
+        The local error is estimated in the first step of at most 32 trajectories.
 
         Parameters
         ----------
-        energy, entropy : float
-            As for :class:`Solution.audit`: relative drift, and fall in one step relative to ``max |S|``.
+        energy, entropy, casimirs, residual, accuracy : float
+            What is accepted: see :class:`liethermo.audit.Tolerances`.
+
+        Raises
+        ------
+        InputError
+            If there is no tolerance of a name, or it is negative.
         """
-        allowed = Tolerances(energy=energy, entropy=entropy)
+        accepted = Tolerances.of(energy=energy, entropy=entropy, **tolerances)
         rows, moved, name = [], self.steps > 0, " minus ".join(["energy", *self.laws.balance])
 
-        def worst(law, values, tolerance):
-            values = np.where(moved, values, 0.0)
-            i = int(np.argmax(values))
-            rows.append(
-                AuditRow(law, float(values[i]), tolerance, bool(values[i] <= tolerance), f"worst is trajectory {i}")
-            )
+        def worst(law, values, allowed):
+            values, allowed = np.where(moved, values, 0.0), np.broadcast_to(allowed, len(self))
+            i = int(np.argmax(values - allowed))
+            passed = bool(values[i] <= allowed[i])
+            rows.append(AuditRow(law, float(values[i]), float(allowed[i]), passed, f"worst is trajectory {i}"))
 
+        rounding = Rounding(self.first_energy, self.energy_sensitivity)
         if self.laws.energy == "conserved":
-            worst(f"{name} drift", self.energy_drift, allowed.energy)
-        else:
-            scale = np.maximum(np.abs(self.energy.reshape(len(self), -1)[:, -1]), np.finfo(float).tiny)
-            worst(f"relative {name} increment", self.largest_energy_increment / scale, allowed.energy)
+            worst(f"{name} drift", self.energy_drift, rounding.allowed(accepted.energy))
+        elif self.laws.energy == "nonincreasing":
+            increment = self.largest_energy_increment / rounding.size
+            worst(f"relative {name} increment", increment, rounding.allowed(accepted.energy))
         if self.laws.entropy == "nondecreasing":
-            fall = -self.least_entropy_increment / np.where(self.entropy_scale > 0.0, self.entropy_scale, 1.0)
-            worst("relative fall of the entropy", fall, allowed.entropy)
-        worst("stage residual", np.where(self.ok, self.residual, 0.0), allowed.residual)
+            rounding = Rounding(self.entropy_scale, self.entropy_sensitivity)
+            fall = -self.least_entropy_increment / rounding.size
+            worst("relative fall of the entropy", fall, rounding.allowed(accepted.entropy))
+            in_all = -self.entropy_change / rounding.size
+            if (in_all > rounding.allowed(accepted.casimirs)).any():  # each step below what rounding hides
+                worst("the same in all", in_all, rounding.allowed(accepted.casimirs))
+        worst("stage residual", np.where(self.ok, self.residual, 0.0), accepted.residual)
+        if self.witness is not None or self.evidence.local_error is not None:
+            rows.append(accuracy_row(self.evidence, accepted))
         failed = int((~self.ok & (self.status != 3)).sum())
         rows.append(AuditRow("trajectories that failed", float(failed), 0.0, failed == 0))
         least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
@@ -232,7 +269,8 @@ def ensemble(
             chosen = "array"
     if chosen == "array":
         _run_array(family, method, states, times, record)
-    return record.result(laws_of(member, method, {}), chosen, time.perf_counter() - started)
+    witness = _Witness(family, member, method, states, times, record, chosen) if has_estimate(method) else None
+    return record.result(laws_of(member, method, {}), chosen, time.perf_counter() - started, witness)
 
 
 # -- the two engines --------------------------------------------------------------------------------------------------
@@ -244,7 +282,7 @@ class _Record:
     def __init__(self, size: int, system: System, times: Timetable, outputs: str):
         self.system, self.times, self.outputs, self.counts = system, times, outputs, times.counts
         names = "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale"
-        names += " relaxation_time residual"
+        names += " relaxation_time residual energy_sensitivity entropy_sensitivity first_energy entropy_change distance"
         self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in names.split()}
         self.status = np.full(size, STATUSES.index("interrupted"), dtype=np.int8)
         self.steps, self.iterations = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
@@ -261,8 +299,12 @@ class _Record:
         span = np.minimum(steps * self.times.h, self.times.end - self.times.start)
         energy, first = after["energy"], before["energy"]
         rows["energy"][chosen], rows["entropy"][chosen] = energy, after["entropy"]
-        spread = np.maximum(after["largest_energy"] - first, first - after["smallest_energy"])
-        rows["energy_drift"][chosen] = spread / np.where(first == 0.0, 1.0, np.abs(first))
+        drift = np.maximum(after["largest_energy"] - first, first - after["smallest_energy"])
+        rows["energy_drift"][chosen] = drift / Rounding(first, after["energy_sensitivity"]).size
+        for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy"):
+            rows[name][chosen] = after[name]
+        rows["entropy_change"][chosen] = after["entropy"] - before["entropy"]
+        rows["distance"][chosen] = np.abs(after["x"] - before["x"]).max(axis=1)
         rows["largest_energy_increment"][chosen] = after["largest_energy_increment"]
         rows["least_entropy_increment"][chosen] = after["least_entropy_increment"]
         rows["entropy_scale"][chosen] = np.maximum(np.abs(before["entropy"]), np.abs(after["entropy"]))
@@ -285,11 +327,12 @@ class _Record:
             reached = np.searchsorted(self.counts, steps, side="right")
             self.path[chosen][np.arange(len(self.counts)) >= reached[:, None]] = np.nan
 
-    def result(self, laws: Laws, engine: str, wall_time: float) -> Ensemble:
+    def result(self, laws: Laws, engine: str, wall_time: float, witness) -> Ensemble:
         x, energy, entropy, t = self.x, self.rows.pop("energy"), self.rows.pop("entropy"), self.times.times[-1:]
         if self.path is not None:
             x, energy, entropy, t = self.path[..., :-2], self.path[..., -2], self.path[..., -1], self.times.times
         attitude = work = None
+        self.rows.pop("distance")
         if isinstance(self.system, AttitudeSystem) and x is not None:
             x, attitude = map(np.asarray, self.system.split(x))
         if isinstance(self.system, DrivenSystem):
@@ -308,8 +351,53 @@ class _Record:
             wall_time=wall_time,
             attitude=attitude,
             work=work,
+            witness=witness,
             **self.rows,
         )
+
+
+class _Witness:
+    """Finds the local errors of first steps, when it is called."""
+
+    def __init__(self, family: Family, member: System, method, states: np.ndarray, times: Timetable, record, engine):
+        some = spread(len(states), STEPS_AGAIN)
+        self.family = Family(family.form, [value[some] if len(value) > 1 else value for value in family.values])
+        self.member, self.method, self.engine = member, method, engine
+        self.x, self.distance = np.ascontiguousarray(states[some]), record.rows["distance"][some]
+        self.h, self.start = times.h if times.full else times.last, times.start
+
+    def __call__(self) -> Evidence:
+        form, number = self.family.form, len(self.x)
+        own = self.family.flat(slice(None), number)
+        if self.engine == "compiled":
+            first = self.family.flat(slice(0, 1), 1)[0]
+            stepper = compiled.stepper_of(form, first, self.method, LANES, self.family.varies)
+            blocks = stepper.begin(own, self.x)
+            stepper.run(first, blocks, self.h, 1, 1)
+            after = {name: values[:number] for name, values in stepper.fields(blocks).items()}
+        else:
+            parameters, axes = self.family.batched(slice(None))
+            state = _begin_all(form, parameters, axes, self.method, jnp.asarray(self.x))
+            state, _ = _advance_all(form, parameters, axes, self.method, state, jnp.asarray(self.h), 1, jnp.asarray(1))
+            after = {name: np.asarray(value) for name, value in vars(state).items()}
+        moved = np.abs(self._seen(after["x"] + after["low"]) - self._seen(self.x)).max(axis=1)
+        told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
+        if not told.any():
+            return Evidence()
+        h = np.full((number, 1), self.h)
+        steps = np.concatenate([own, self.x, h, after["k"].reshape(number, -1)], axis=1)[told]
+        errors = at_points(_first_errors, (form, self.method, len(own[0])), steps)
+        relative = errors / np.fmax(moved, WHOLE * self.distance)[told]
+        return Evidence(local_error=float(np.nan_to_num(relative).max()), error_time=self.start)
+
+    def _seen(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(self.member.points(x)).reshape(len(x), -1)
+
+
+def _first_errors(model: tuple[Form, OneStepMethod, int], step):
+    form, method, p = model
+    system = form.build(step[:p])
+    return error_at(system, method, step[p:])
 
 
 def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, record: _Record) -> None:

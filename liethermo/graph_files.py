@@ -39,7 +39,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
 
     A ``.csv`` file has a line for each edge, each pair once, and column titles in its first line: ``source``,
     ``target`` and the weight. A ``.graphml`` file declares its nodes, and its edges carry the weight as an attribute;
-    networkx reads it (``pip install liethermo[graphs]``).
+    networkx reads it (``pip install networkx``, or ``pip install ".[graphs]"`` in the repository).
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def _graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
     try:
         import networkx
     except ImportError as error:
-        raise FileError(f"networkx, which reads {path}, is not installed: pip install liethermo[graphs]") from error
+        raise FileError(f"networkx, which reads {path}, is not installed: pip install networkx") from error
     try:
         graph = networkx.read_graphml(path)
         declared = _declared(path)

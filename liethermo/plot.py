@@ -20,7 +20,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
-from .audit import EPS, Audit, Tolerances
+from .audit import EPS, LAW_FAILS, Audit
 from .errors import FileError, InputError
 from .solution import Solution
 from .systems import System
@@ -366,20 +366,19 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
         If the file cannot be written.
     """
     path = _writable(path)
-    panels = 1 if solution.entropy is None else 3
+    panels, audit = 1 if solution.entropy is None else 3, solution.audit()
     figure, axes = plt.subplots(
         panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
     )
     _draw_energy(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
     if solution.entropy is not None:
         _draw_entropy(axes[1, 0], solution.t, solution.entropy)
-        _draw_production(axes[2, 0], solution.t, solution.entropy)
+        _draw_production(axes[2, 0], solution.t, solution.entropy, _rounding(audit))
     for ax in axes[:, 0]:
         ax.spines[["top", "right"]].set_visible(False)
         ax.margins(x=0.0)
     axes[-1, 0].set_xlabel("time")
     figure.align_ylabels()
-    audit = solution.audit()
     figure.suptitle(_verdict(audit), color="black" if audit.passed else RED, fontsize="medium")
     return _finished(figure, path)
 
@@ -412,9 +411,14 @@ def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
         ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), across, "offset points", **style)
 
 
-def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
+def _rounding(audit: Audit) -> float:
+    """Fall of the entropy in one step that the audit allows."""
+    return next((-row.tolerance for row in audit.rows if row.law == "least entropy increment" and row.tolerance), 0.0)
+
+
+def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) -> None:
     dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
-    rounding = Tolerances().entropy * float(np.abs(S).max())
+    rounding = rounding or 4 * EPS * float(np.abs(S).max())
     risen, fallen = dS > rounding, dS < -rounding
     still = ~(risen | fallen)
     ax.set_yscale("log")
@@ -434,7 +438,8 @@ def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
 def _verdict(audit: Audit) -> str:
     failing = [row for row in audit.rows if row.passed is False]
     if failing:
-        return "A law fails: " + "; ".join(
+        law = audit.verdict == LAW_FAILS
+        return ("A law fails: " if law else f"{audit.verdict.capitalize()}: ") + "; ".join(
             f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in failing
         )
     shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]

@@ -21,6 +21,7 @@ from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .engine.sparse import SparseEngine
 from .errors import InputError
+from .evidence import MEASURED, Witness, spread
 from .integrators import OneStepMethod, Reference, WithAttitude
 from .solution import Laws, Solution, Stats, Status
 from .stepwise import Adaptive, Dense, Event, stops_of
@@ -69,6 +70,8 @@ class Run:
         self.step: float | Adaptive = table.h
         self.event_time: float | None = None
         self.dense: Dense | None = None
+        self.longest: list[float] = []  # steps after each state that is kept
+        self.capacity: int | None = None
         wanted = SMALL_DIM if table.steps < COMPILED_STEPS else COMPILED_DIM
         self.engine = ("compiled" if is_small(system, wanted) else "array") if engine == "auto" else engine
         self.sparse: SparseEngine | None = None
@@ -104,6 +107,7 @@ class Run:
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
         if self.sparse is not None:
             capacity = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
+        self.capacity = capacity
         state, interrupted = None, False
         self.values = [self._energies(self.states[0])]
         try:
@@ -127,11 +131,15 @@ class Run:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
         start, end, every = self.table.start, self.table.end, self.table.every or 1
         stops, event = stops_of(save_at, start, end), None if until is None else Event(until, self.system)
-        self.step, pieces, last = step, [], None
+        self.step, pieces, last, kept = step, [], None, 0
 
         def keep(t, reached, h, before, after):
-            nonlocal last
+            nonlocal last, kept
             last = reached, after
+            if len(self.times) > kept:  # the first step after a state that is kept
+                self.longest.append(h)
+                kept = len(self.times)
+            self.longest[-1] = max(self.longest[-1], h)
             if dense:
                 pieces.append((t, h, np.asarray(before.x), np.asarray(after.k)))
             if reached in stops if save_at is not None else int(after.step) % every == 0:
@@ -338,8 +346,17 @@ class Run:
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
+            witness=self._witness(x, {name: f for name, (f, _) in invariants.items()}),
         )
         return system.presented(found)
+
+    def _witness(self, x: np.ndarray, functions: dict) -> Witness:
+        """What finds the evidence for an audit."""
+        some = spread(len(x), MEASURED)
+        same = [self.table.h if self.table.full else self.table.last] * (len(x) - 1)
+        h = np.array((self.longest or same)[: len(x) - 1])
+        again = _Again(self.system, self.method, self._driver, self.capacity)
+        return Witness(self.system, self.method, functions, x[some], np.array(self.times)[some], h[some[:-1]], again)
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:
@@ -363,6 +380,22 @@ class Run:
             "algebra": None if algebra is None else algebra.name,
             "dissipation": None if self.system.dissipation is None else type(self.system.dissipation).__name__,
         }
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Again:
+    """One step from any state, by the program that a run has compiled; ``capacity`` is None for single steps."""
+
+    system: System
+    method: Any
+    driver: Any
+    capacity: int | None
+
+    def __call__(self, x: np.ndarray, h: float):
+        state = self.driver.begin(self.system, self.method, jnp.asarray(x))
+        if self.capacity is None:
+            return self.driver.stepping(self.system, self.method)(state, h)
+        return self.driver.advance(self.system, self.method, state, h, 1, 1, self.capacity)[0]
 
 
 # -- helpers --------------------------------------------------------------------------------------------------------
@@ -411,11 +444,14 @@ def prepared(system: System, method) -> tuple[dict, Laws]:
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     keeps = method.keeps if isinstance(method, OneStepMethod) else lambda system, name: False
-    conserved = tuple(name for name, (_, kept) in invariants.items() if kept and keeps(system, name))
+    constants = [name for name, (_, kept) in invariants.items() if kept]
+    conserved = tuple(name for name in constants if keeps(system, name))
+    unpromised = tuple(name for name in constants if name not in conserved)
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
-    return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact, system.balance)
+    ledger = tuple(system.ledger)
+    return Laws(system.energy_law, system.entropy_law, conserved, ledger, inexact, system.balance, unpromised)
 
 
 def _value(function, x):

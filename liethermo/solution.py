@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,7 @@ import numpy as np
 
 from .audit import Audit, Tolerances, audit
 from .errors import FileError, InputError
+from .evidence import Evidence
 
 if TYPE_CHECKING:
     import xarray
@@ -95,9 +98,11 @@ class Stats:
 class Laws:
     """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
 
-    ``ledger`` names those of the recorded functions that say what comes from outside, ``balance`` those of them that
-    the energy of a solution contains and its law is stated without (``dH = work``), and ``inexact`` which of the two
-    laws ("energy", "entropy") the method makes no claim to keep: an audit judges them all the same, and says so.
+    ``conserved`` names those that the method promises to keep to rounding, ``unpromised`` those that it does not: an
+    audit shows how far these drift, without a verdict. ``ledger`` names those of the recorded functions that say what
+    comes from outside, ``balance`` those of them that the energy of a solution contains and its law is stated without
+    (``dH = work``), and ``inexact`` which of the two laws ("energy", "entropy") the method makes no claim to keep: an
+    audit judges them all the same, and says so.
     """
 
     energy: str | None = "conserved"
@@ -106,6 +111,7 @@ class Laws:
     ledger: tuple[str, ...] = ()
     inexact: tuple[str, ...] = ()
     balance: tuple[str, ...] = ()
+    unpromised: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,8 @@ class Solution:
         The polynomials between the steps (``integrate(dense=True)``); not written to files.
     attitude : ndarray, shape (times, m, m), or None
         Elements of the group of the system, where it has one.
+    evidence : Evidence
+        What an audit needs besides the series: found when first asked for, and written to files.
     """
 
     t: np.ndarray
@@ -145,6 +153,14 @@ class Solution:
     event_time: float | None = None
     dense: Dense | None = None
     attitude: np.ndarray | None = None
+    witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        return Evidence() if self.witness is None else self.witness()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
+        return {**vars(self), "evidence": self.evidence, "witness": None}
 
     def __call__(self, t) -> np.ndarray:
         """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.stepwise.Dense`.
@@ -164,8 +180,21 @@ class Solution:
         return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
     def audit(self, **tolerances: float) -> Audit:
-        """Whether the laws held, as a table; see :class:`liethermo.audit.Tolerances` for the keywords."""
-        return audit(self, Tolerances(**tolerances))
+        """Whether the laws held and the steps resolve the motion, as a table.
+
+        Some steps are taken again when this is first called, from at most 64 states of the run.
+
+        Parameters
+        ----------
+        energy, entropy, casimirs, residual, accuracy, consistency : float
+            What is accepted: see :class:`liethermo.audit.Tolerances`.
+
+        Raises
+        ------
+        InputError
+            If there is no tolerance of a name, or it is negative.
+        """
+        return audit(self, Tolerances.of(**tolerances))
 
     def with_provenance(self, **entries) -> Solution:
         """The same solution with more said about where it comes from."""
@@ -193,6 +222,7 @@ class Solution:
             "status": json.dumps(asdict(self.status)),
             "stats": json.dumps(asdict(self.stats)),
             "laws": json.dumps(asdict(self.laws)),
+            "evidence": json.dumps(asdict(self.evidence)),
             "provenance": json.dumps(self.provenance),
             "event_time": json.dumps(self.event_time),
         }
@@ -216,7 +246,7 @@ class Solution:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
 
 
-_LISTS = ("conserved", "ledger", "inexact", "balance")
+_LISTS = ("conserved", "ledger", "inexact", "balance", "unpromised")
 """The fields of :class:`Laws` that are tuples of names."""
 
 
@@ -253,6 +283,7 @@ def load(path: str | os.PathLike) -> Solution:
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
         stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in _LISTS}
+        evidence = Evidence(**json.loads(dataset.attrs.get("evidence", "{}")))
         return Solution(
             t=t,
             x=x,
@@ -265,6 +296,7 @@ def load(path: str | os.PathLike) -> Solution:
             provenance=stored["provenance"],
             event_time=json.loads(dataset.attrs.get("event_time", "null")),
             attitude=_attitude(dataset["attitude"].values) if "attitude" in dataset else None,
+            witness=lambda: evidence,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error

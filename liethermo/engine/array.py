@@ -247,6 +247,8 @@ class State(eqx.Module):
     largest_energy_increment: jax.Array
     integral: jax.Array  # over time, of what relaxes: see relaxing()
     first_energy: jax.Array
+    energy_sensitivity: jax.Array  # the largest over all steps: the size at which the function is rounded
+    entropy_sensitivity: jax.Array
 
 
 @eqx.filter_jit
@@ -254,6 +256,7 @@ def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
     energy, entropy = values(system, x)
+    sizes = sensitivities(system, x)
     zero, count = jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
     return State(
         x=x,
@@ -275,6 +278,8 @@ def begin(system: System, method: OneStepMethod, x) -> State:
         largest_energy_increment=jnp.asarray(-jnp.inf),
         integral=zero,
         first_energy=energy,
+        energy_sensitivity=sizes[0],
+        entropy_sensitivity=sizes[1],
     )
 
 
@@ -305,7 +310,7 @@ def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[C
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
     """The state after a step whose equations are solved, or as it was, with a status, where they are not."""
     x, low = state.x, state.low
-    new, new_low, energy, entropy, check = finish(system, method, x, low, h, solved.k, state.first_energy)
+    new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
     size = jnp.maximum(jnp.max(jnp.abs(x)), h * solved.noise)
@@ -333,6 +338,8 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         largest_energy_increment=jnp.maximum(state.largest_energy_increment, energy - state.energy),
         integral=state.integral + h * mean,
         first_energy=state.first_energy,
+        energy_sensitivity=jnp.fmax(state.energy_sensitivity, sizes[0]),
+        entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, sizes[1]),
     )
     failed = eqx.tree_at(lambda s: (s.status, s.residual), state, (failure, residual))
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
@@ -464,12 +471,15 @@ STEERED = 4 * EPS
 
 
 def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
-    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are."""
+    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are.
+
+    And the sizes at which energy and entropy are rounded there.
+    """
     new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
     if system.energy_law == "conserved" and "energy" in method.preserves:
         new_low = new_low + _steering(system, new, new_low, energy, first_energy)
-    return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy
+    return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy, *sensitivities(system, new)
 
 
 def _steering(system: System, x, low, energy, first_energy):
@@ -480,7 +490,7 @@ def _steering(system: System, x, low, energy, first_energy):
     """
     gradient = system.energy.gradient(x)
     error = (energy - first_energy) + jnp.dot(gradient, low)
-    size = jnp.dot(jnp.abs(gradient), jnp.abs(x))
+    size = system.energy.sensitivity(x)
     most = 0.25 * EPS * size
     amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
     direction = system.raised(x, gradient)
@@ -492,6 +502,12 @@ def values(system: System, x) -> tuple[jax.Array, jax.Array]:
     """Energy and entropy at one state, shape (n,); zero in place of an entropy that the system does not have."""
     entropy = jnp.zeros(()) if system.entropy is None else system.entropy.value(x)
     return system.energy.value(x), entropy
+
+
+def sensitivities(system: System, x) -> tuple[jax.Array, jax.Array]:
+    """The sizes at which energy and entropy are rounded at a state: see :meth:`liethermo.Energy.sensitivity`."""
+    entropy = jnp.zeros(()) if system.entropy is None else system.entropy.sensitivity(x)
+    return system.energy.sensitivity(x), entropy
 
 
 def relaxing(system: System, energy, entropy):

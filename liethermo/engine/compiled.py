@@ -52,10 +52,13 @@ NUMBERS = {
     "largest_energy_increment": "LARGEST_GAIN",
     "integral": "INTEGRAL",
     "first_energy": "FIRST_ENERGY",
+    "energy_sensitivity": "ENERGY_SIZE",
+    "entropy_sensitivity": "ENTROPY_SIZE",
 }
 """The fields of :class:`.array.State`, and the rows that hold them in the step loop."""
 
-WORK = "AFTER_ENERGY AFTER_ENTROPY CHECK H SIZE UPDATE SLOPE PREVIOUS BEST STALLED PHASE CHANGE TRIES CORRECTIONS NOISE"
+WORK = """AFTER_ENERGY AFTER_ENTROPY CHECK AFTER_ENERGY_SIZE AFTER_ENTROPY_SIZE H SIZE UPDATE SLOPE PREVIOUS BEST
+STALLED PHASE CHANGE TRIES CORRECTIONS NOISE"""
 """The other rows of one number."""
 
 OF_NEWTON = ("DIRECTION", "CHANGES", "LINEAR")
@@ -145,7 +148,7 @@ class Stepper:
             return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])
 
         def start(p, x):
-            return method.start(rebuilt(p), x), *array.values(rebuilt(p), x)
+            return method.start(rebuilt(p), x), *array.values(rebuilt(p), x), *array.sensitivities(rebuilt(p), x)
 
         n = system.dim
         self._shapes: dict[str, tuple[int, ...]] = dict.fromkeys([*NUMBERS.values(), *WORK.split()], (1,))
@@ -154,6 +157,7 @@ class Stepper:
         self._shapes |= {"P": parameters.shape}
 
         step, end = "P X LOW H GUESS", "P X LOW H GUESS FIRST_ENERGY"
+        after = "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK AFTER_ENERGY_SIZE AFTER_ENTROPY_SIZE"
         # What an iteration needs and does not change is computed once a step.
         fixed, changing = self._traced(iterate, step).split([step.split().index("GUESS")])
         self._shapes["FIXED"] = fixed.shapes[0]
@@ -163,7 +167,7 @@ class Stepper:
                 _Piece(fixed, step, "FIXED"),
             ],
             "iterate": [_Piece(changing, f"{step} FIXED", "NEW UPDATE SLOPE")],
-            "finish": [_Piece(self._traced(finish, end), end, "AFTER AFTER_LOW AFTER_ENERGY AFTER_ENTROPY CHECK")],
+            "finish": [_Piece(self._traced(finish, end), end, after)],
         }
         self._start = self._traced(start, "P X")
         # Of a derivative, what is the same in every direction is computed once a Jacobian.
@@ -195,10 +199,10 @@ class Stepper:
         ``parameters`` has shape (p,), or (trajectories, p) where some vary.
         """
         own = np.broadcast_to(parameters, (len(x), len(self._varies)))
-        k, energy, entropy = self._start.evaluate(own, x, batch=True)
+        k, energy, entropy, *sizes = self._start.evaluate(own, x, batch=True)
         fields: dict[str, Any] = dict.fromkeys(NUMBERS, 0.0) | {"x": x, "low": 0.0, "k": k, "before": k}
         fields |= dict.fromkeys(("energy", "first_energy", "smallest_energy", "largest_energy"), energy)
-        fields |= {"entropy": entropy}
+        fields |= {"entropy": entropy, "energy_sensitivity": sizes[0], "entropy_sensitivity": sizes[1]}
         fields |= {"least_entropy_increment": np.inf, "largest_energy_increment": -np.inf}
         return self.blocks(fields, own)
 

@@ -37,6 +37,7 @@ X = LOW = K = BEFORE = GUESS = NEW = AFTER = AFTER_LOW = AFTER_ENERGY = AFTER_EN
 H = SIZE = UPDATE = SLOPE = PREVIOUS = BEST = STALLED = PHASE = CHANGE = TRIES = CORRECTIONS = 0
 STATUS = STEP = FIXED_POINT = NEWTONS = MOST = ENERGY = ENTROPY = RESIDUAL = WORST = 0
 HIGHEST = LOWEST = LEAST_RISE = LARGEST_GAIN = INTEGRAL = RELAXING = NOISE = 0
+ENERGY_SIZE = ENTROPY_SIZE = AFTER_ENERGY_SIZE = AFTER_ENTROPY_SIZE = 0
 """Offsets of the rows in w. ENTROPY follows ENERGY; RELAXING is the distance to the one whose relaxation is timed."""
 
 
@@ -61,7 +62,10 @@ def along(p, w, l, v):
 
 
 def finish(p, w, first, last):
-    """AFTER and AFTER_LOW, the state that GUESS leads to, its energy and entropy; CHECK, finite if they all are."""
+    """AFTER and AFTER_LOW, the state that GUESS leads to, its energy and entropy; CHECK, finite if they all are.
+
+    And the sizes at which energy and entropy are rounded there.
+    """
 
 
 def njit(function):
@@ -292,6 +296,9 @@ def take_step(p, w, matrix, order, b, v):
         w[LOWEST + l] = energy if good and energy < w[LOWEST + l] else w[LOWEST + l]
         w[LEAST_RISE + l] = rise if good and rise < w[LEAST_RISE + l] else w[LEAST_RISE + l]
         w[LARGEST_GAIN + l] = gain if good and gain > w[LARGEST_GAIN + l] else w[LARGEST_GAIN + l]
+        energy_size, entropy_size = w[AFTER_ENERGY_SIZE + l], w[AFTER_ENTROPY_SIZE + l]
+        w[ENERGY_SIZE + l] = energy_size if good and energy_size > w[ENERGY_SIZE + l] else w[ENERGY_SIZE + l]
+        w[ENTROPY_SIZE + l] = entropy_size if good and entropy_size > w[ENTROPY_SIZE + l] else w[ENTROPY_SIZE + l]
         w[ENERGY + l] = energy if good else w[ENERGY + l]
         w[ENTROPY + l] = entropy if good else w[ENTROPY + l]
     for i in range(0, N * LANES, LANES):

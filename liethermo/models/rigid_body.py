@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import jax
@@ -14,6 +15,13 @@ from ..energy import Quadratic
 from ..errors import InputError
 from ..systems import LiePoissonSystem
 
+PUBLISHED = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
+"""Inertias of published examples, the first of them the paper's, though no body has them."""
+
+
+class InertiaWarning(UserWarning):
+    """Moments of inertia that no rigid body has."""
+
 
 def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -> LiePoissonSystem:
     """A rigid body whose internal friction keeps its energy and lets it settle on its axis of greatest inertia.
@@ -24,10 +32,17 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     Parameters
     ----------
     inertia : three positive numbers
-        Principal moments of inertia (mass * length**2).
+        Principal moments of inertia (mass * length**2). Those of a body obey ``I_i <= I_j + I_k``, since each is a sum
+        of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
+        so(3)* they are as good as any, but no rigid body has them.
     rate : float, >= 0
         1 is the equation as printed in the paper, where 𝒦 is the dot product: ``KillingDissipation(rate / 2)``,
         since the Killing form of so(3) is -2 times it.
+
+    Warns
+    -----
+    InertiaWarning
+        Where no body has the inertias, other than the paper's.
     """
     return LiePoissonSystem(
         mf.so(3),
@@ -38,7 +53,10 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
 
 
 def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePoissonSystem:
-    """The free rigid body ``Pi' = Pi × Omega``: energy and ``|Pi|^2 / 2`` both conserved."""
+    """The free rigid body ``Pi' = Pi × Omega``: energy and ``|Pi|^2 / 2`` both conserved.
+
+    The default inertias are those of a published check, which no body has: see :func:`rigid_body`.
+    """
     return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / _inertia(inertia)), entropy=Quadratic(np.ones(3)))
 
 
@@ -48,4 +66,13 @@ def _inertia(inertia) -> np.ndarray | jax.Array:
         raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
     if not isinstance(moments, jax.core.Tracer) and not (np.all(moments > 0.0) and np.isfinite(moments).all()):
         raise InputError(f"moments of inertia are positive and finite, not {moments.tolist()}")
+    if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
+        largest, others = float(moments.max()), float(moments.sum() - moments.max())
+        if largest > others * (1 + 1e-12):
+            warnings.warn(
+                f"no rigid body has the moments of inertia {moments.tolist()}: the largest, {largest:g}, is more than "
+                f"the sum of the others, {others:g}. The equations hold all the same",
+                InertiaWarning,
+                stacklevel=3,
+            )
     return moments

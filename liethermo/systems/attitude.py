@@ -36,6 +36,9 @@ class OfMomentum(Energy):
         rest = jnp.zeros(x.shape[0] - self.dim)
         return jnp.concatenate([self.energy.gradient(x[: self.dim]), rest])
 
+    def sensitivity(self, x) -> jax.Array:
+        return self.energy.sensitivity(x[: self.dim])
+
 
 class AttitudeSystem(System):
     """A Lie-Poisson system for mu, and ``g' = g hat(grad H(mu))`` beside it [EQUATIONS §4, "Group reconstruction"].

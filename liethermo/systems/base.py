@@ -20,6 +20,9 @@ from ..engine.interpret import at_points
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 
+SCALES = (1.0, 1e-4, 1e4)
+"""Of the random points at which the system is asked which functions it conserves."""
+
 
 class System(eqx.Module):
     """A metriplectic system on R^n or on a manifold [BFM §2.3]; see the subclasses for how to build one.
@@ -295,16 +298,20 @@ class System(eqx.Module):
         return {name: (function, name in kept) for name, function in self.functions().items()}
 
     def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
-        """Whether each function is constant along the vector field, at random points inside its domain."""
+        """Whether each function is constant along the vector field, at random points inside its domain.
+
+        The motion and each dissipation have to keep it, each judged by its own size: a friction 1e12 times as slow as
+        the motion is a friction still. Or else what one makes of it, another takes back. Points are of several scales.
+        """
         if not functions:
             return []
-        points = self.samples(8)
-        rates, sizes = at_points(_rates_of_change, (self, functions), points)
-        inside = np.isfinite(rates)
-        return [
-            bool(use.any() and (np.abs(rate) <= AXIOM_TOLERANCE * size)[use].all())
-            for rate, size, use in zip(rates.T, sizes.T, inside.T, strict=True)
-        ]
+        points = np.concatenate([self.samples(4, seed, scale) for seed, scale in enumerate(SCALES)])
+        rates, sizes = at_points(_rates_of_change, (self, functions), points)  # shape (points, parts, functions)
+        inside = np.isfinite(rates).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            each = (np.abs(rates) <= AXIOM_TOLERANCE * sizes).all(axis=1)
+            together = np.abs(rates.sum(axis=1)) <= AXIOM_TOLERANCE * np.abs(rates).max(axis=1)
+        return [bool(use.any() and kept[use].all()) for use, kept in zip(inside.T, (each | together).T, strict=True)]
 
     @property
     def ledger(self) -> dict[str, Energy]:
@@ -409,12 +416,31 @@ class System(eqx.Module):
 
 
 def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
-    """The rate of change of each function along the vector field, and the size of what cancels in it."""
+    """The rates of change of each function along the motion and along each dissipation, and their sizes.
+
+    Shapes (parts, functions). The size of a dissipation is that of its force, or of what it makes of other gradients
+    of the same size where that is more: the force itself may be the rounding of zero.
+    """
     system, functions = model
-    velocity, gradients = system.vector_field(x), jnp.stack([f.gradient(x) for f in functions])
-    speed = jnp.linalg.norm(velocity)
-    speed += jnp.linalg.norm(system.poisson.tensor(x) @ jnp.abs(system.energy.gradient(x)))
-    return gradients @ velocity, jnp.linalg.norm(gradients, axis=1) * speed
+    gradients = jnp.stack([f.gradient(x) for f in functions])
+    dH = _seen(system, x, system.energy.gradient(x))
+    dS = jnp.zeros_like(x) if system.entropy is None else _seen(system, x, system.entropy.gradient(x))
+    others = np.random.default_rng(0).standard_normal((2, system.dim)) / np.sqrt(system.dim)
+    motion = system.poisson.sharp(x, dH)
+    parts = [motion]
+    speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.tensor(x) @ jnp.abs(dH))]
+    for part in () if system.dissipation is None else system.dissipation.terms:
+        dL = tuple(_seen(system, x, L.gradient(x)) for L in part.preserve)
+        a, b = (_seen(system, x, other * jnp.linalg.norm(d)) for other, d in zip(others, (dH, dS), strict=True))
+        parts.append(part.force(system, x, dH, dS, dL))
+        speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
+    sizes = jnp.linalg.norm(gradients, axis=1)
+    return jnp.stack(parts) @ gradients.T, jnp.stack(speeds)[:, None] * sizes
+
+
+def _seen(system: System, x, alpha):
+    """What a covector is to tangent vectors: itself on R^n."""
+    return alpha if system.space is None else system.lowered(x, system.raised(x, alpha))
 
 
 def square_field(function: Callable, dim: int, what: str) -> None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation import KERNEL
 from ..engine.interpret import at_points
 from ..errors import InputError
 
@@ -101,6 +102,11 @@ _AXIOMS = {
         "Pi grad S = 0",
         "The entropy is not a Casimir function; on a Lie algebra g, g.casimirs(degree) lists polynomial ones",
     ),
+    KERNEL: (
+        KERNEL,
+        "the friction operator does not have grad H in its kernel, and only its projection off grad H would act: give "
+        "project=True if that is meant",
+    ),
     "symmetric": ("K symmetric", "the friction matrix must be symmetric"),
     "kernel": ("K grad H = 0", "the dissipation would change the energy"),
     "semidefinite": ("K >= 0", "the friction matrix has a negative eigenvalue, so entropy could fall"),
@@ -140,7 +146,7 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
         return _residuals(system.at_time(x[-1]), x[:-1])
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
-    found = {}
+    found = _of_dissipations(system, x)
     given = around = system
     if system.space is not None:
         velocity = system.vector_field(x)
@@ -173,6 +179,15 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
         dJ = J.gradient(x)
         found[f"momentum map {name}"] = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
     return found | system.own_residuals(x)
+
+
+def _of_dissipations(system: System, x) -> dict[str, jax.Array]:
+    """Residuals of what the dissipations were given, the largest of each name."""
+    found: dict[str, jax.Array] = {}
+    for part in () if system.dissipation is None else system.dissipation.terms:
+        for name, residual in part.own_residuals(system, x).items():
+            found[name] = jnp.maximum(found.get(name, 0.0), residual)
+    return found
 
 
 def _matrix_residuals(system: System, around: System | None, x, dH, dS):

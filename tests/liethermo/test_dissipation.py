@@ -230,6 +230,57 @@ def test_a_wrong_dissipation_fails_its_axioms_and_only_those(dissipation, failin
         lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), lt.Quadratic(np.ones(3)), dissipation)
 
 
+TILTED = lt.Quadratic(np.array([1.0, 2.0, 5.0]))
+
+
+@pytest.mark.parametrize(
+    "K",
+    [
+        np.eye(3),
+        lambda x: jnp.diag(x**2),
+        lambda x: jnp.outer(TILTED.gradient(x), jnp.cross(jnp.ones(3), TILTED.gradient(x))),  # K grad H = 0 alone
+    ],
+    ids=["constant", "function", "one side"],
+)
+def test_a_friction_operator_is_not_repaired_unasked(K):
+    """K grad H is not zero: the projection of K off grad H would run, which nobody wrote."""
+    arguments = mf.so(3), TILTED, lt.Quadratic(np.ones(3))
+    with pytest.raises(lt.AxiomError, match=r"as given fails.*project=True") as caught:
+        lt.LiePoissonSystem(*arguments, lt.FrictionOperator(K))
+    assert caught.value.residual > 0.05
+    report = lt.LiePoissonSystem(*arguments, lt.FrictionOperator(K), validate=False).check()
+    assert "K grad H = 0, as given" in [row.axiom for row in report.rows if row.passed is False]
+
+
+def test_a_friction_operator_that_is_to_be_projected():
+    system = lt.LiePoissonSystem(mf.so(3), TILTED, lt.Quadratic(np.ones(3)), lt.FrictionOperator(np.eye(3), 0.3, True))
+    assert system.check().passed
+    normalized = lt.ProjectedMetric(normalized=True, rate=0.3)
+    same = lt.LiePoissonSystem(mf.so(3), TILTED, lt.Quadratic(np.ones(3)), normalized)
+    x = points(mf.so(3))
+    assert np.abs(system.vector_field(x) - same.vector_field(x)).max() <= 1e-14
+
+
+SKEWED, SIGNED = (lambda x: jnp.eye(3).at[0, 1].set(x[2])), (lambda x: jnp.diag(jnp.array([1.0, -1.0, 1.0])))
+
+
+@pytest.mark.parametrize(
+    ("dissipation", "words"),
+    [
+        (lt.ProjectedMetric(SKEWED), "K symmetric"),
+        (lt.ProjectedMetric(SKEWED, normalized=True), "K symmetric"),
+        (lt.ProjectedMetric(SIGNED), "K >= 0"),
+        (lt.FourBracket.kulkarni_nomizu(SKEWED, np.eye(3)), "K symmetric"),
+        (lt.FourBracket.kulkarni_nomizu(SIGNED, SIGNED), "K >= 0"),
+        (lt.FourBracket(lambda x: x[0] * jnp.ones((3, 3, 3, 3))), "K grad H = 0"),
+    ],
+    ids=["cometric", "normalized", "signed cometric", "form", "signed forms", "four-bracket"],
+)
+def test_functions_of_the_state_are_not_repaired_either(dissipation, words):
+    with pytest.raises(lt.AxiomError, match=words):
+        lt.LiePoissonSystem(mf.so(3), TILTED, lt.Quadratic(np.ones(3)), dissipation)
+
+
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [

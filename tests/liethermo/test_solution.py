@@ -124,7 +124,7 @@ def test_audit_tolerances_are_the_users(solution):
     assert not solution.audit(energy=0.0, residual=0.0).passed
     with pytest.raises(lt.InputError, match=">= 0"):
         solution.audit(energy=-1.0)
-    with pytest.raises(TypeError):
+    with pytest.raises(lt.InputError, match="'enthalpy'"):
         solution.audit(enthalpy=1.0)
 
 

@@ -1,5 +1,7 @@
 """Systems: the Euler-Poincaré side, the axioms' report, and input that is refused."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -210,6 +212,24 @@ def test_unusable_energies(energy, error, words):
 def test_unusable_arguments(make, words):
     with pytest.raises(lt.InputError, match=words):
         make()
+
+
+def test_inertias_that_no_body_has():
+    """Said where they are given, except for the paper's own."""
+    for make in (lt.models.rigid_body, lt.models.free_rigid_body):
+        with pytest.warns(UserWarning, match="no rigid body has.*largest, 9, is more than the sum of the others, 6"):
+            make((2.0, 9.0, 4.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            make()
+            make((10, 5, 1))
+            make((3.0, 2.0, 1.0))  # a plate
+
+
+def test_a_quadratic_energy_is_symmetric_to_the_last_bit():
+    """Its gradient is A x: of a matrix that rounding has left askew the energy would drift."""
+    A = np.array([[2.0, 0.3 + 2e-13], [0.3, 1.0]])
+    assert np.array_equal(lt.Quadratic(A).A, lt.Quadratic(A).A.T)
 
 
 def test_functions_outside_their_domain_everywhere():

@@ -1,0 +1,260 @@
+"""The audit: sizes that rounding is judged by, how accurate a run is, whether it is one of its system; its controls."""
+
+import dataclasses
+import pickle
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.cli import app
+
+BODY = lt.models.rigid_body()
+X0 = [0.001, 1.0, 0.001]
+
+
+def rows(audit, law):
+    return [row for row in audit.rows if row.law.startswith(law)]
+
+
+def the_row(audit, law):
+    (row,) = rows(audit, law)
+    return row
+
+
+# -- what starts at zero ----------------------------------------------------------------------------------------------
+
+
+def heavy_top():
+    """Pi . Gamma = 0 at the start, a Casimir of se(3)*."""
+    energy = lt.Quadratic(np.diag([1.0, 1.0, 0.5, 0.0, 0.0, 0.0]), b=[0.0, 0.0, 0.0, 0.3, 0.0, 1.0])
+    return lt.LiePoissonSystem(mf.se(3), energy), [0.3, -0.4, 1.1, 0.8, 0.6, 0.0]
+
+
+def three_particles():
+    """Joined by springs in a row, their centre of mass at rest."""
+    q, p = np.eye(6)[:3], np.eye(6)[3:]
+    springs = sum(np.outer(q[i] - q[j], q[i] - q[j]) for i, j in ((0, 1), (1, 2)))
+    momentum = lt.Quadratic(np.zeros((6, 6)), b=p.sum(axis=0))
+    system = lt.MetriplecticSystem(
+        mf.Canonical(3), lt.Quadratic(springs + p.T @ p), momentum_maps={"momentum": momentum}
+    )
+    return system, [0.1, 1.3, 2.2, 0.1, 0.2, -0.3]
+
+
+def pendulum():
+    """Let go at 90 degrees, where its energy is zero."""
+    return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 - jnp.cos(x[0])), [np.pi / 2, 0.0]
+
+
+def separatrix():
+    """On the way up to the unstable equilibrium, at its energy, which is zero."""
+    q = 1.0
+    return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.cos(x[0]) - 1.0), [
+        q,
+        -2.0 * np.sin(q / 2),
+    ]
+
+
+@pytest.mark.parametrize("case", [heavy_top, three_particles, pendulum, separatrix])
+def test_laws_of_what_starts_at_zero(case, tmp_path):
+    system, x0 = case()
+    solution = lt.integrate(system, x0, (0.0, 15.0), 0.05)
+    starts = [solution.energy[0], *(series[0] for series in solution.casimirs.values())]
+    assert np.abs(starts).min() < 1e-15
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    assert solution.audit().energy_drift < 1e-14
+    loaded = lt.load(solution.save(tmp_path / "run.nc"))
+    assert str(loaded.audit()) == str(solution.audit())
+    broken = dataclasses.replace(solution, energy=solution.energy + np.linspace(0.0, 1e-11, len(solution.t)))
+    assert the_row(broken.audit(), "energy drift").passed is False
+    if case is pendulum:
+        result = CliRunner().invoke(app, ["audit", str(tmp_path / "run.nc")])
+        assert result.exit_code == 0, result.output
+        many = lt.ensemble(system, [x0, [1.0, 0.5]], (0.0, 15.0), 0.05)
+        assert many.audit().passed, f"\n{many.audit()}"
+        assert many.energy_drift[0] < 1e-14
+
+
+@pytest.mark.parametrize(
+    "entropy",
+    [
+        pytest.param(lambda m: jnp.log(m @ m), id="log"),
+        pytest.param(lambda m: m @ m - 1.0, id="difference", marks=pytest.mark.slow),
+        pytest.param(lambda m: jnp.tanh(m @ m), id="tanh", marks=pytest.mark.slow),
+        pytest.param(lambda m: 0.5 * m @ m + 1e12, id="constant", marks=pytest.mark.slow),
+    ],
+)
+def test_entropies_fall_by_the_rounding_of_what_they_are_computed_from(entropy):
+    """Gauss keeps the law exactly; what is left is rounding, whatever the value of S is there."""
+    system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 1 / 2, 1 / 3]), entropy, lt.ProjectedMetric(rate=0.3))
+    x0s = np.random.default_rng(0).standard_normal((64, 3))
+    x0s /= np.linalg.norm(x0s, axis=1)[:, None]
+    many = lt.ensemble(system, x0s, (0.0, 60.0), 0.2, lt.MetriplecticGauss(1))
+    assert many.audit().passed, f"\n{many.audit()}"
+    fall = np.full(64, 1e-11) + 16 * np.spacing(many.entropy_scale)
+    damaged = dataclasses.replace(many, least_entropy_increment=-fall)
+    assert the_row(damaged.audit(), "relative fall").passed is False
+    in_all = dataclasses.replace(many, entropy_change=-fall)
+    assert the_row(in_all.audit(), "the same in all").passed is False
+
+
+def test_a_constant_does_not_hide_a_drift():
+    """What can be seen beside a constant of 1e10 is seen: a drift of 1e-4, eight orders above what is promised."""
+    moments = jnp.array([3.0, 2.0, 1.0])
+    high = lt.LiePoissonSystem(
+        mf.so(3), lambda m: 1e10 + 0.5 * jnp.sum(m * m / moments), lambda m: 0.5 * m @ m + 1e12, lt.ProjectedMetric()
+    )
+    kept = lt.integrate(high, [0.3, 1.0, 0.2], (0.0, 10.0), 0.1)
+    assert kept.audit().passed, f"\n{kept.audit()}"
+    drifting = dataclasses.replace(kept, energy=kept.energy + np.linspace(0.0, 1e-4, len(kept.t)))
+    assert the_row(drifting.audit(), "energy drift").passed is False
+    assert drifting.audit().energy_drift == pytest.approx(1e-14, rel=0.1)  # relative to the value, as it is defined
+    falling = dataclasses.replace(kept, entropy=1e12 - 4e-4 * np.arange(len(kept.t)))  # each step as rounding might
+    row = the_row(falling.audit(), "least entropy increment")
+    assert (row.passed, "in all it falls by 0.04" in row.note) == (False, True)
+
+
+def test_the_size_of_a_function():
+    x = np.array([3.0, 4.0])
+    norm = lt.Function(lambda x: jnp.log(x @ x) - jnp.log(25.0) + 1e10)
+    assert norm.sensitivity(x) == pytest.approx(2.0)
+    assert (-norm).sensitivity(x) == pytest.approx(2.0)
+    assert (norm + lt.Quadratic([1.0, 1.0])).sensitivity(x) == pytest.approx(27.0)
+    assert lt.Quadratic([1.0]).on([1]).sensitivity(x) == pytest.approx(16.0)
+
+
+# -- how accurate the run is ------------------------------------------------------------------------------------------
+
+
+def test_steps_that_do_not_resolve_the_motion(tmp_path):
+    """One step of 300 over the paper's figure keeps every law."""
+    solution = lt.integrate(BODY, X0, (0.0, 300.0), 300.0)
+    audit = solution.audit()
+    assert the_row(audit, "accuracy").passed is False
+    assert not audit.passed
+    assert "try suggest_step" in the_row(audit, "accuracy").note
+    assert "DO NOT RESOLVE" in str(audit).splitlines()[-1]
+    assert [row.law for row in audit.rows if row.passed is False] == ["accuracy"]
+    assert solution.audit(accuracy=np.inf).passed
+    result = CliRunner().invoke(app, ["audit", str(solution.save(tmp_path / "run.nc"))])
+    assert (result.exit_code, "DO NOT RESOLVE" in result.output) == (1, True)
+    assert not lt.ensemble(BODY, [X0, X0], (0.0, 300.0), 300.0).audit().passed
+
+
+def test_the_estimate_is_of_the_order_of_the_method():
+    found = [
+        the_row(lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), h).audit(), "accuracy").value for h in (0.8, 0.4, 0.2)
+    ]
+    assert np.abs(np.log2(np.divide(found[:-1], found[1:])) - 2.0).max() < 0.2  # a step is of its length to h^2
+    assert the_row(lt.ensemble(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), 0.2).audit(), "accuracy").passed
+
+
+def test_long_steps_at_rest_are_no_fault():
+    """A body that has relaxed is at rest, and adaptive steps are long there."""
+    solution = lt.integrate(BODY, [0.1, 1.0, 0.1], (0.0, 300.0), lt.Adaptive(1e-6))
+    assert np.diff(solution.t).max() > 3.0
+    assert solution.audit().passed, f"\n{solution.audit()}"
+
+
+def test_methods_without_an_estimate_say_so():
+    row = the_row(lt.integrate(BODY, X0, (0.0, 5.0), 0.5, lt.Reference(rtol=1e-6)).audit(), "accuracy")
+    assert (row.passed, row.tolerance, "not estimated" in row.note) == (None, None, True)
+
+
+def test_a_copy_knows_the_evidence():
+    solution = lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
+    assert str(pickle.loads(pickle.dumps(solution)).audit()) == str(solution.audit())
+
+
+# -- whether it is a run of the system --------------------------------------------------------------------------------
+
+
+def test_a_method_that_follows_another_field():
+    """An entropy that is no Casimir, let through: Gauss holds it by force, and integrates something else."""
+    system = lt.MetriplecticSystem(
+        mf.LiePoisson(mf.so(3)),
+        lt.Quadratic([1.0, 1 / 2, 1 / 3]),
+        lambda m: jnp.exp(m[0]) + m[1],
+        lt.ProjectedMetric(rate=0.1),
+        validate=False,
+    )
+    solution = lt.integrate(system, [0.6, 0.5, -0.7], (0.0, 5.0), 0.02, lt.MetriplecticGauss(1))
+    row = the_row(solution.audit(), "consistency")
+    assert row.passed is False
+    assert row.value > 0.05
+    assert not solution.audit().passed
+    assert "NOT THE MOTION" in str(solution.audit()) or "A LAW FAILS" in str(solution.audit())
+
+
+class Late(lt.MetriplecticMidpoint):
+    """Control: consistent, but of first order only."""
+
+    def slopes(self, system, x, low, h, k):
+        return system.vector_field(x + h * k[0])[None]
+
+
+class Slow(lt.MetriplecticMidpoint):
+    """Control: a thousandth too slow, which no law sees."""
+
+    def slopes(self, system, x, low, h, k):
+        return 0.999 * super().slopes(system, x, low, h, k)
+
+
+@pytest.mark.parametrize(("method", "passed"), [(Late(), True), (Slow(), False)], ids=["late", "slow"])
+def test_consistency_is_judged_by_short_steps(method, passed):
+    solution = lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 4.0), 0.4, method)
+    row = the_row(solution.audit(), "consistency")
+    assert row.passed is passed, row
+    assert passed or row.value == pytest.approx(1e-3, rel=0.01)
+
+
+# -- what is conserved ------------------------------------------------------------------------------------------------
+
+
+def test_what_the_method_does_not_promise():
+    """A cubic momentum map: a constant of the system, and not of the method; and a function that is neither."""
+    H = lt.Quadratic([1.0, 1.0, 0.5])
+    system = lt.LiePoissonSystem(mf.so(3), H, momentum_maps={"cube": lambda m: m[2] ** 3 + jnp.sin(m[2])})
+    assert system.check().passed
+    solution = lt.integrate(system, [0.4, -0.8, 1.2], (0.0, 5.0), 0.1)
+    (row,) = rows(solution.audit(), "drift of cube")
+    assert (row.passed, row.tolerance, "does not promise" in row.note) == (None, None, True)
+    assert row.value < 1e-14
+    relaxed = lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
+    (row,) = rows(relaxed.audit(), "change of mu1**2")
+    assert row.note == "not a constant of this system"
+    assert solution.laws.unpromised == ("cube",)
+
+
+@pytest.mark.parametrize("rate", [1e-13, 1.0, 1e13])
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_slow_friction_is_friction_still(rate, scale):
+    """Which Casimirs a system conserves does not depend on its units."""
+    quadratic = lt.Quadratic(np.ones(3))
+    for dissipation in (lt.KillingDissipation(rate), lt.ProjectedMetric(rate=rate)):
+        system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale), quadratic, dissipation)
+        assert system.conserves((quadratic, system.energy)) == [False, True]
+    free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale))
+    assert free.conserves((quadratic, lt.Quadratic(np.zeros(3), b=[0.0, 0.0, 1.0]))) == [True, False]
+
+
+def test_large_states_of_a_slow_body():
+    """At states of 1e12 the Casimir grows, and the audit does not ask that it stays."""
+    system = lt.models.rigid_body((3e12, 2e12, 1e12), rate=1e-12)
+    solution = lt.integrate(system, [1e10, 1e12, 3e11], (0.0, 20.0), 0.1)
+    assert solution.entropy[-1] > solution.entropy[0]
+    assert solution.audit().passed, f"\n{solution.audit()}"
+
+
+# -- the keywords -----------------------------------------------------------------------------------------------------
+
+
+def test_unknown_tolerances_are_named():
+    solution, many = lt.integrate(BODY, X0, (0.0, 1.0), 0.1), lt.ensemble(BODY, X0, (0.0, 1.0), 0.1)
+    for run in (solution, many):
+        with pytest.raises(lt.InputError, match=r"'energy_drift'.*energy, entropy, casimirs, residual, accuracy"):
+            run.audit(energy_drift=1e-10)
