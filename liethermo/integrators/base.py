@@ -35,8 +35,7 @@ class OneStepMethod(eqx.Module):
     preserves : frozenset of str
         Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"``
         (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"casimirs"`` (those known to be
-        conserved), ``"quadratic_invariants"`` (all quadratic first integrals) and ``"quadratic_casimirs"`` (those that
-        the dissipation keeps by construction; where H is quadratic, all quadratic first integrals).
+        conserved) and ``"quadratic_casimirs"`` (quadratic ones, where the dissipation keeps them by construction).
     stages : int
     """
 
@@ -94,10 +93,13 @@ class OneStepMethod(eqx.Module):
 
     def keeps(self, system: System, name: str) -> bool:
         """Whether it keeps, to rounding, the function of the system with this name, which the system conserves."""
-        if "quadratic_casimirs" not in self.preserves or not system.functions()[name].is_quadratic:
-            return False
-        by_force = system.dissipation is None or system.dissipation.keeps_casimirs
-        return system.energy.is_quadratic or (by_force and name in system.casimirs())
+        casimir, quadratic = name in system.casimirs(), system.functions()[name].is_quadratic
+        if quadratic and system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic):
+            return bool(self.preserves & {"casimirs", "quadratic_casimirs"})  # no gradient is corrected: collocation
+        if "quadratic_casimirs" in self.preserves:
+            by_force = system.dissipation is None or system.dissipation.keeps_casimirs
+            return casimir and quadratic and by_force
+        return casimir and "casimirs" in self.preserves
 
     def explain(self, system: System, x, k, h) -> str:
         """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""

@@ -52,9 +52,6 @@ class InCharts(OneStepMethod):
     def preserves(self) -> frozenset[str]:
         return self.method.preserves & {"energy", "entropy_law"}
 
-    def keeps(self, system: System, name: str) -> bool:
-        return self.method.keeps(system, name)
-
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         step = self._step(system, x, low, h, k)
         return step.back(step.method.slopes(step.system, step.start, step.low, h, step.k))

@@ -30,8 +30,8 @@ class MetriplecticGauss(GaussMethod):
 
     The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
     ``h sum_i b_i gH_i . k_i = H(x') - H(x)``. Likewise gS, and gC of every first integral C that is held: the Casimirs
-    and momentum maps that the system is known to conserve, and those of ``preserve``. K_d is the dissipation rebuilt
-    with gH_i and the gC_i in its kernel. Hence
+    that the system is known to conserve, and the functions of ``preserve``. K_d is the dissipation rebuilt with gH_i and
+    the gC_i in its kernel. Hence
 
         H(x') = H(x),    S(x') - S(x) = h sum b_i gS_i . K_d gS_i >= 0,    C(x') = C(x),
 
@@ -46,6 +46,9 @@ class MetriplecticGauss(GaussMethod):
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 
+    Momentum maps are held on request alone. Nearer to a relative equilibrium than O(h^{2s}), such as a circular orbit,
+    the levels of H and J may leave a step nowhere to go; it then ends with a status.
+
     One implicit equation of s times the size of the state. An iteration costs s gradients of H and S; for each that is
     not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
     s is 1 or 2.
@@ -59,11 +62,12 @@ class MetriplecticGauss(GaussMethod):
         1 to 8; the order is twice that. One stage is the midpoint scheme with the Gonzalez gradient, the entropy law
         made exact too.
     preserve : sequence of functions or energies
-        Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
+        Further first integrals to hold exactly, such as momentum maps. The system has to conserve them (checked when a
+        run starts).
     retraction : str or manifolds.Retraction, optional
         On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
     held : tuple of str
-        Names of the functions of the system to hold. A run fills it in with all that the system conserves.
+        Names of the functions of the system to hold. A run fills it in with the Casimirs that the system conserves.
     """
 
     functions: tuple[Energy, ...]
@@ -84,13 +88,8 @@ class MetriplecticGauss(GaussMethod):
         self.held = held
 
     def on(self, system: System) -> OneStepMethod:
-        functions, casimirs = system.functions(), system.casimirs()
-        held = [name for name in system.first_integrals() if name in casimirs or functions[name].is_quadratic]
-        method = self._with(lambda C: _seen_on(system, C), tuple(sorted(held)))
-        return in_charts(method, system, self.retraction, "exp")
-
-    def keeps(self, system: System, name: str) -> bool:
-        return name in self.held
+        held = tuple(sorted(system.first_integrals() & system.casimirs().keys()))
+        return in_charts(self._with(lambda C: _seen_on(system, C), held), system, self.retraction, "exp")
 
     def pulled(self, local: ChartSystem) -> OneStepMethod:
         return self._with(local.pulled, self.held)
@@ -101,7 +100,7 @@ class MetriplecticGauss(GaussMethod):
 
     @property
     def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law", "casimirs", "quadratic_invariants"})
+        return frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system conserves what is to be preserved, and room is left for it to move."""
