@@ -23,7 +23,7 @@ from .engine.sparse import SparseEngine
 from .errors import InputError
 from .integrators import OneStepMethod, Reference, WithAttitude
 from .solution import Laws, Solution, Stats, Status
-from .stepwise import Adaptive, Dense, Event, stops_of
+from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
@@ -45,6 +45,9 @@ COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
 
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+
+SHORTER = (2.0, 8.0, 64.0)
+"""Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
@@ -121,7 +124,7 @@ class Run:
             return
         step = int(state.step)
         now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
-        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted)
+        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted, capacity)
 
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
@@ -148,8 +151,18 @@ class Run:
             self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
+        numbers = self.system.dim * ((1 if save_at is None else 0) / every + (self._stages + 1 if dense else 0))
         outcome = run_stepwise(
-            self.system, self.method, self._stepping(), state, (start, end), step, stops, event, keep
+            self.system,
+            self.method,
+            self._stepping(),
+            state,
+            (start, end),
+            step,
+            stops,
+            event,
+            keep,
+            most_kept=MOST_KEPT / max(numbers, 1e-9),
         )
         if last is not None:
             self._append(*last)
@@ -161,12 +174,24 @@ class Run:
         self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
         steps = int(state.step)
         if outcome.underflow is not None:
-            text = (
-                f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and the error is still too "
-                "large: the tolerance may be below what rounding allows, or the functions not smooth there. "
-                f"Try a larger tolerance than {step}"
+            solved = int(state.status) == array.RUNNING
+            text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and " + (
+                "the error is still too large: the tolerance may be below what rounding allows, or the functions "
+                f"not smooth there. Try a larger tolerance than {step}"
+                if solved
+                else "its equations are still not solved, so no step size helps: check that the functions are "
+                "smooth and finite near that state"
             )
             self.status = Status("step_underflow", text, steps, now, float(state.residual))
+        elif outcome.limit:
+            wanted = f"{step.most_steps} steps were tried" if outcome.limit == "steps" else f"{steps} steps fill memory"
+            advice = (
+                "Adaptive(most_steps=...) allows more; a larger tolerance takes fewer"
+                if outcome.limit == "steps"
+                else "save_every or save_at keeps fewer states"
+            )
+            text = f"{wanted} and t = {now:g} of {end:g} is reached: {advice}"
+            self.status = Status("step_limit", text, steps, now, float(state.residual))
         elif event is not None and outcome.event_time is not None:
             text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
             self.status = Status("event", text, steps, now, float(state.residual))
@@ -203,6 +228,10 @@ class Run:
             raise error
         warn_of_fallback(error, stacklevel=7)
         self.engine = "array"
+
+    @property
+    def _stages(self) -> int:
+        return self.method.stages
 
     def _attempt(self, call: Callable, state):
         """What ``call(engine, state)`` gives; by the array engine where only Newton's method cannot be compiled.
@@ -250,7 +279,7 @@ class Run:
         self.times.extend(self.table.time(int(n)) for n in steps)
         return state
 
-    def _status(self, state, now: float, h: float, interrupted: bool) -> Status:
+    def _status(self, state, now: float, h: float, interrupted: bool, capacity: int = 1) -> Status:
         code, step, residual = int(state.status), int(state.step), float(state.residual)
         if interrupted:
             return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
@@ -260,8 +289,7 @@ class Run:
         if code == array.NOT_CONVERGED:
             message = (
                 f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
-                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). "
-                f"Try a smaller step, for example {h / 2:g}"
+                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). {self._advice(state, h, capacity)}"
             )
             return Status("not_converged", message, step, now, residual)
         message = (
@@ -269,6 +297,21 @@ class Run:
             f"({self._culprit(state)}). Check the domain of your functions along the trajectory, or try a smaller step"
         )
         return Status("non_finite", message, step, now, residual)
+
+    def _advice(self, state, h: float, capacity: int) -> str:
+        """What helps where a step of size h could not be solved: shorter ones are tried."""
+        state = dataclasses.replace(state, status=jnp.zeros_like(jnp.asarray(state.status)))
+        for part in SHORTER:
+            new, _ = self._attempt(
+                lambda driver, state: driver.advance(self.system, self.method, state, h / part, 1, 1, capacity),
+                state,
+            )
+            if int(new.status) == array.RUNNING:
+                return f"Try a smaller step, for example {h / part:g}"
+        return (
+            f"Steps down to {h / SHORTER[-1]:g} were tried and do not help: the functions may not be smooth there, or "
+            "lose more digits than the iteration expects, as differences of large terms do"
+        )
 
     def _culprit(self, state) -> str:
         """Which function is not finite just ahead of the last good state."""

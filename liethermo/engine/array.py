@@ -237,7 +237,9 @@ class State(eqx.Module):
     fixed_point: jax.Array
     newton: jax.Array
     most_iterations: jax.Array
-    residual: jax.Array  # of the last step tried, as h |k - slopes(k)| / |x|, or h times the noise of the slopes for |x|
+    residual: (
+        jax.Array
+    )  # of the last step tried, as h |k - slopes(k)| / |x|, or h times the noise of the slopes for |x|
     worst_residual: jax.Array  # of the steps taken
     largest_energy: jax.Array  # over all steps, relative to the first: for laws between the saved states
     smallest_energy: jax.Array

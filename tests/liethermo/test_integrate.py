@@ -124,6 +124,17 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
     assert isinstance(caught.value, ArithmeticError)
 
 
+def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
+    """The message says what was tried: with too few iterations steps down to a 64th cannot be solved either."""
+    monkeypatch.setattr(array, "FIXED_POINT_LIMIT", 1)
+    monkeypatch.setattr(array, "NEWTON_LIMIT", 1)
+    system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
+    solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.25, on_failure="return", engine="array")
+    assert solution.status.code == "not_converged"
+    assert "Try a smaller step" not in solution.status.message
+    assert "do not help" in solution.status.message
+
+
 @pytest.mark.parametrize("x0", [[1.0, 20.0, 0.1], [5.0, 100.0, 5.0]])
 @pytest.mark.parametrize("h", [1.0, 20.0, 50.0, 1e3])
 def test_huge_steps_either_keep_the_laws_or_fail(h, x0):
