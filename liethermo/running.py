@@ -46,7 +46,7 @@ COMPILED_STEPS = 20_000
 
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
 
-SHORTER = (2.0, 8.0, 64.0)
+SHORTER = (2.0, 8.0, 64.0, 1024.0, 16384.0)
 """Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
 
 CHECKPOINT_SECONDS = 60.0
@@ -173,25 +173,8 @@ class Run:
         state, now = outcome.state, self.times[-1]
         self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
         steps = int(state.step)
-        if outcome.underflow is not None:
-            solved = int(state.status) == array.RUNNING
-            text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and " + (
-                "the error is still too large: the tolerance may be below what rounding allows, or the functions "
-                f"not smooth there. Try a larger tolerance than {step}"
-                if solved
-                else "its equations are still not solved, so no step size helps: check that the functions are "
-                "smooth and finite near that state"
-            )
-            self.status = Status("step_underflow", text, steps, now, float(state.residual))
-        elif outcome.limit:
-            wanted = f"{step.most_steps} steps were tried" if outcome.limit == "steps" else f"{steps} steps fill memory"
-            advice = (
-                "Adaptive(most_steps=...) allows more; a larger tolerance takes fewer"
-                if outcome.limit == "steps"
-                else "save_every or save_at keeps fewer states"
-            )
-            text = f"{wanted} and t = {now:g} of {end:g} is reached: {advice}"
-            self.status = Status("step_limit", text, steps, now, float(state.residual))
+        if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit):
+            self.status = _given_up(outcome, step, end, now)
         elif event is not None and outcome.event_time is not None:
             text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
             self.status = Status("event", text, steps, now, float(state.residual))
@@ -289,7 +272,8 @@ class Run:
         if code == array.NOT_CONVERGED:
             message = (
                 f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
-                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). {self._advice(state, h, capacity)}"
+                f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). "
+                + self._advice(state, h, capacity)
             )
             return Status("not_converged", message, step, now, residual)
         message = (
@@ -302,9 +286,9 @@ class Run:
         """What helps where a step of size h could not be solved: shorter ones are tried."""
         state = dataclasses.replace(state, status=jnp.zeros_like(jnp.asarray(state.status)))
         for part in SHORTER:
+            one = h / part, 1, 1, capacity
             new, _ = self._attempt(
-                lambda driver, state: driver.advance(self.system, self.method, state, h / part, 1, 1, capacity),
-                state,
+                lambda driver, state, one=one: driver.advance(self.system, self.method, state, *one), state
             )
             if int(new.status) == array.RUNNING:
                 return f"Try a smaller step, for example {h / part:g}"
@@ -475,6 +459,26 @@ def _stats(state: array.State) -> Stats:
         least_entropy_increment=float(state.least_entropy_increment) if followed else None,
         largest_energy_increment=float(state.largest_energy_increment) if followed else None,
     )
+
+
+def _given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
+    """How adaptive steps ended before the end, where none of them failed for good."""
+    steps, residual = int(outcome.state.step), float(outcome.state.residual)
+    if outcome.limit == "steps":
+        text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
+        text += "Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer"
+        return Status("step_limit", text, steps, now, residual)
+    if outcome.limit:
+        text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "
+        return Status("step_limit", text + "save_every or save_at keeps fewer states", steps, now, residual)
+    text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and "
+    if int(outcome.state.status) == array.RUNNING:
+        text += "the error is still too large: the tolerance may be below what rounding allows, or the functions not "
+        text += f"smooth there. Try a larger tolerance than {step}"
+    else:
+        text += "its equations are still not solved, so no step size helps: check that the functions are smooth and "
+        text += "finite near that state"
+    return Status("step_underflow", text, steps, now, residual)
 
 
 def _power_of_two(n: int) -> int:

@@ -195,7 +195,7 @@ class Solution:
             "event_time": json.dumps(self.event_time),
         }
         dataset = xarray.Dataset(variables, coordinates, attributes)
-        content = {name: values.to_numpy() for name, values in dataset.variables.items()}
+        content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
         return dataset.assign_attrs(sha256=_checksum(content, attributes))
 
     def save(self, path: str | os.PathLike) -> Path:
