@@ -24,7 +24,7 @@ from .errors import InputError
 from .evidence import MEASURED, Witness, spread
 from .integrators import OneStepMethod, Reference, WithAttitude
 from .solution import Laws, Solution, Stats, Status
-from .stepwise import Adaptive, Dense, Event, stops_of
+from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System, driven
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
@@ -46,6 +46,9 @@ COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
 
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+
+SHORTER = (2.0, 8.0, 64.0, 1024.0, 16384.0)
+"""Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
@@ -125,7 +128,7 @@ class Run:
             return
         step = int(state.step)
         now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
-        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted)
+        self.stats, self.status = _stats(state), self._status(state, now, h, interrupted, capacity)
 
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
@@ -156,8 +159,18 @@ class Run:
             self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
+        numbers = self.system.dim * ((1 if save_at is None else 0) / every + (self._stages + 1 if dense else 0))
         outcome = run_stepwise(
-            self.system, self.method, self._stepping(), state, (start, end), step, stops, event, keep
+            self.system,
+            self.method,
+            self._stepping(),
+            state,
+            (start, end),
+            step,
+            stops,
+            event,
+            keep,
+            most_kept=MOST_KEPT / max(numbers, 1e-9),
         )
         if last is not None:
             self._append(*last)
@@ -168,13 +181,8 @@ class Run:
         state, now = outcome.state, self.times[-1]
         self.stats = dataclasses.replace(_stats(state), rejected=outcome.rejected)
         steps = int(state.step)
-        if outcome.underflow is not None:
-            text = (
-                f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and the error is still too "
-                "large: the tolerance may be below what rounding allows, or the functions not smooth there. "
-                f"Try a larger tolerance than {step}"
-            )
-            self.status = Status("step_underflow", text, steps, now, float(state.residual))
+        if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit):
+            self.status = _given_up(outcome, step, end, now)
         elif event is not None and outcome.event_time is not None:
             text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
             self.status = Status("event", text, steps, now, float(state.residual))
@@ -211,6 +219,10 @@ class Run:
             raise error
         warn_of_fallback(error, stacklevel=7)
         self.engine = "array"
+
+    @property
+    def _stages(self) -> int:
+        return self.method.stages
 
     def _attempt(self, call: Callable, state):
         """What ``call(engine, state)`` gives; by the array engine where only Newton's method cannot be compiled.
@@ -258,7 +270,7 @@ class Run:
         self.times.extend(self.table.time(int(n)) for n in steps)
         return state
 
-    def _status(self, state, now: float, h: float, interrupted: bool) -> Status:
+    def _status(self, state, now: float, h: float, interrupted: bool, capacity: int = 1) -> Status:
         code, step, residual = int(state.status), int(state.step), float(state.residual)
         if interrupted:
             return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
@@ -269,7 +281,7 @@ class Run:
             message = (
                 f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
                 f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). "
-                f"Try a smaller step, for example {h / 2:g}"
+                + self._advice(state, h, capacity)
             )
             return Status("not_converged", message, step, now, residual)
         message = (
@@ -277,6 +289,21 @@ class Run:
             f"({self._culprit(state)}). Check the domain of your functions along the trajectory, or try a smaller step"
         )
         return Status("non_finite", message, step, now, residual)
+
+    def _advice(self, state, h: float, capacity: int) -> str:
+        """What helps where a step of size h could not be solved: shorter ones are tried."""
+        state = dataclasses.replace(state, status=jnp.zeros_like(jnp.asarray(state.status)))
+        for part in SHORTER:
+            one = h / part, 1, 1, capacity
+            new, _ = self._attempt(
+                lambda driver, state, one=one: driver.advance(self.system, self.method, state, *one), state
+            )
+            if int(new.status) == array.RUNNING:
+                return f"Try a smaller step, for example {h / part:g}"
+        return (
+            f"Steps down to {h / SHORTER[-1]:g} were tried and do not help: the functions may not be smooth there, or "
+            "lose more digits than the iteration expects, as differences of large terms do"
+        )
 
     def _culprit(self, state) -> str:
         """Which function is not finite just ahead of the last good state."""
@@ -470,6 +497,26 @@ def _stats(state: array.State) -> Stats:
         least_entropy_increment=float(state.least_entropy_increment) if followed else None,
         largest_energy_increment=float(state.largest_energy_increment) if followed else None,
     )
+
+
+def _given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
+    """How adaptive steps ended before the end, where none of them failed for good."""
+    steps, residual = int(outcome.state.step), float(outcome.state.residual)
+    if outcome.limit == "steps":
+        text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
+        text += "Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer"
+        return Status("step_limit", text, steps, now, residual)
+    if outcome.limit:
+        text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "
+        return Status("step_limit", text + "save_every or save_at keeps fewer states", steps, now, residual)
+    text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and "
+    if int(outcome.state.status) == array.RUNNING:
+        text += "the error is still too large: the tolerance may be below what rounding allows, or the functions not "
+        text += f"smooth there. Try a larger tolerance than {step}"
+    else:
+        text += "its equations are still not solved, so no step size helps: check that the functions are smooth and "
+        text += "finite near that state"
+    return Status("step_underflow", text, steps, now, residual)
 
 
 def _power_of_two(n: int) -> int:

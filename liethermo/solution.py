@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +23,11 @@ if TYPE_CHECKING:
 
     from .stepwise import Dense
 
-FORMAT = "liethermo-solution-1"
+FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
+
+VARIABLES = ("time", "x", "energy", "entropy", "attitude", "invariant_name", "invariant")
+ATTRIBUTES = ("format", "times", "status", "stats", "laws", "provenance", "event_time", "sha256")
+"""What a file has."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,8 @@ class Status:
 
     Attributes
     ----------
-    code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "interrupted", "reference_failed"}
+    code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted",
+        "reference_failed"}
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
@@ -226,7 +233,9 @@ class Solution:
             "provenance": json.dumps(self.provenance),
             "event_time": json.dumps(self.event_time),
         }
-        return xarray.Dataset(variables, coordinates, attributes)
+        dataset = xarray.Dataset(variables, coordinates, attributes)
+        content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
+        return dataset.assign_attrs(sha256=_checksum(content, attributes))
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write a NetCDF file; it appears whole or not at all."""
@@ -234,7 +243,10 @@ class Solution:
         temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.to_xarray().to_netcdf(temporary, engine="h5netcdf")
+            dataset = self.to_xarray()
+            numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
+            checked = {name: {"fletcher32": True} for name in numbers}
+            dataset.to_netcdf(temporary, engine="h5netcdf", encoding=checked)
             os.replace(temporary, path)
         except OSError as error:
             raise FileError(f"cannot write {path}: {error}") from error
@@ -256,50 +268,83 @@ def load(path: str | os.PathLike) -> Solution:
     Raises
     ------
     FileError
-        If the file is missing, cut short, or not a result of this library.
-    """
-    import xarray
+        If the file is missing, cut short, damaged, or not a result of this library.
 
+    Warns
+    -----
+    UserWarning
+        If the file is one of version 0.1, which has no checksum: damage may show in nothing.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileError(f"there is no file {path}")
     try:
-        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
-            dataset.load()
+        series, attributes = _content(path)
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
         raise FileError(
             f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
         ) from error
-    if dataset.attrs.get("format") != FORMAT:
+    if attributes.get("format") not in (FORMAT, *WITHOUT_CHECKSUM):
         raise FileError(
-            f"{path} is a NetCDF file, but not a liethermo result (its format is {dataset.attrs.get('format')!r})"
+            f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
         )
+    if attributes["format"] in WITHOUT_CHECKSUM:
+        warnings.warn(f"{path} has no checksum, as it was written by version 0.1: damage would not show", stacklevel=2)
+    elif attributes.get("sha256") != _checksum(series, attributes):
+        raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     try:
-        stored = {name: json.loads(dataset.attrs[name]) for name in ("status", "stats", "laws", "provenance")}
-        t, x = dataset["time"].values, dataset["x"].values
-        if len(t) != int(dataset.attrs["times"]):
-            raise ValueError(f"{len(t)} times of {dataset.attrs['times']}")
-        names = [str(name) for name in dataset["invariant_name"].values]
+        stored = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
+        t, x = series["time"], series["x"]
+        if len(t) != int(attributes["times"]):
+            raise ValueError(f"{len(t)} times of {attributes['times']}")
+        names = [str(name) for name in series["invariant_name"]]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
         stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in _LISTS}
-        evidence = Evidence(**json.loads(dataset.attrs.get("evidence", "{}")))
+        evidence = Evidence(**json.loads(attributes.get("evidence", "{}")))
         return Solution(
             t=t,
             x=x,
-            energy=dataset["energy"].values,
-            entropy=dataset["entropy"].values if "entropy" in dataset else None,
-            casimirs=dict(zip(names, dataset["invariant"].values, strict=True)),
+            energy=series["energy"],
+            entropy=series.get("entropy"),
+            casimirs=dict(zip(names, series["invariant"], strict=True)),
             status=Status(**stored["status"]),
             stats=Stats(**stored["stats"]),
             laws=Laws(**stored["laws"]),
             provenance=stored["provenance"],
-            event_time=json.loads(dataset.attrs.get("event_time", "null")),
-            attitude=_attitude(dataset["attitude"].values) if "attitude" in dataset else None,
+            event_time=json.loads(attributes.get("event_time", "null")),
+            attitude=_attitude(series["attitude"]) if "attitude" in series else None,
             witness=lambda: evidence,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
+
+
+def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The variables of a file by name, and its attributes."""
+    import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
+
+    with h5py.File(path) as file:
+        found = {name: file[name] for name in VARIABLES if name in file}
+        series = {
+            name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
+        }
+        said = {name: np.asarray(file.attrs[name]).item() for name in ATTRIBUTES if name in file.attrs}
+        return series, said
+
+
+def _checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:
+    """SHA-256 of the names, types, shapes and bytes of all variables, and of the attributes."""
+    found = hashlib.sha256()
+    for name in sorted(series):
+        values = np.asarray(series[name])
+        text = values.dtype.kind in "OUS"
+        kind = "text" if text else values.dtype.newbyteorder("<").str
+        found.update(json.dumps([name, kind, values.shape]).encode())
+        found.update(json.dumps(values.tolist()).encode() if text else values.astype(kind, order="C").tobytes())
+    said = [[name, str(attributes[name])] for name in ATTRIBUTES[:-1] if name in attributes]
+    found.update(json.dumps(said).encode())
+    return found.hexdigest()
 
 
 def _attitude(parts: np.ndarray) -> np.ndarray:

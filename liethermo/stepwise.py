@@ -43,8 +43,8 @@ GROWTH_ERROR = 2e-3
 time, to a few thousandths. The error of the state does not show it, as the deviation is no part of the state yet."""
 
 TURNING = 0.01
-"""Rate of growth of an oscillation, relative to its frequency, from which it counts: the derivative of a motion that goes
-on varies, and gives oscillations that nothing excites small rates of either sign."""
+"""Rate of growth of an oscillation, relative to its frequency, from which it counts: the derivative of a motion that
+goes on varies, and gives oscillations that nothing excites small rates of either sign."""
 
 CHANGED = 0.05
 """Change of the derivative of the motion, relative to it, below which what grows is not looked for again."""
@@ -278,7 +278,7 @@ class Outcome:
     event_time: float | None = None
     underflow: float | None = None
     interrupted: bool = False
-    limit: str = ""
+    limit: str = ""  # what an adaptive run has used up, "steps" or "memory"
 
 
 def run(
@@ -291,7 +291,7 @@ def run(
     stops: np.ndarray,
     event: Event | None,
     keep: Callable,
-    most_kept: int = MOST_KEPT,
+    most_kept: float = MOST_KEPT,
 ) -> Outcome:
     """Step from the start of the span to its end, an event, a failure or Ctrl-C.
 
@@ -305,22 +305,22 @@ def run(
         Times at which steps have to end, increasing; the last is the end of the span.
     keep : function of (t, end, h, state before, state after)
         Told of every step taken, between the times t and its end.
-    most_kept : int
+    most_kept : float
         Adaptive steps after which there is no room for more.
     """
     t, end = span
-    adaptive, shortest = isinstance(step, Adaptive), UNDERFLOW * (end - t)
+    adaptive, shortest = step if isinstance(step, Adaptive) else None, UNDERFLOW * (end - t)
     control, growth = Control(step, method.order, _first_step(state, end - t)), Growth(system, method)
     value = event(np.asarray(state.x)) if event else 0.0
     outcome, stop, table, tried = Outcome(state), -1, None, 0
     try:
-        if adaptive:
+        if adaptive is not None:
             control.h = min(control.h, _judged(growth, system, method, state, state, control.h)[1])
         while t < end:
             if stop < 0 or stops[stop] <= t:
                 stop += 1
                 continue
-            if not adaptive:
+            if adaptive is None:
                 if table is None or table.end <= t:
                     table, since = Timetable((t, float(stops[stop])), step, None), int(state.step)
                 n = int(state.step) - since
@@ -328,16 +328,16 @@ def run(
             else:
                 h, arrives = _fitted(control, t, stops[stop])
                 reached = float(stops[stop]) if arrives else t + h
-                if tried >= step.most_steps or int(state.step) >= most_kept:
-                    outcome.limit = "steps" if tried >= step.most_steps else "memory"
+                if tried >= adaptive.most_steps or int(state.step) >= most_kept:
+                    outcome.limit = "steps" if tried >= adaptive.most_steps else "memory"
                     return outcome
             new = advance(state, h)
             tried += 1
-            if adaptive:
+            if adaptive is not None:
                 error, longest = math.inf, math.inf
                 if int(new.status) == array.RUNNING:
                     found, longest = _judged(growth, system, method, state, new, h)
-                    error = found / _allowed(step, state, new)
+                    error = found / _allowed(adaptive, state, new)
                 if not error <= 1.0 or h > 1.1 * longest:
                     outcome.rejected += 1
                     if not error <= 1.0:

@@ -122,7 +122,7 @@ def integrate(
     solution = run.solution()
     if save_to is not None:
         solution.save(save_to)
-    if on_failure == "raise" and solution.status.code in ("not_converged", "step_underflow"):
+    if on_failure == "raise" and solution.status.code in ("not_converged", "step_underflow", "step_limit"):
         raise ConvergenceError(solution.status.message, solution)
     if on_failure == "raise" and solution.status.code in ("non_finite", "reference_failed"):
         raise NonFiniteError(solution.status.message, solution)

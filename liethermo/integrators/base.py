@@ -164,8 +164,8 @@ def collocation_error(system: System, x, low, h, k) -> jax.Array:
     order 2s, the error of a step h|k| is its square, relative to the speed; over 2s + 1, which makes it right to a
     factor that tends to 1 for a linear oscillation, of whatever amplitude.
 
-    What rounding alone may make of the defect is no error of the step: it does not shrink with h, and near a rest at the
-    origin it is all there is.
+    What rounding alone may make of the defect is no error of the step: it does not shrink with h, and near a rest at
+    the origin it is all there is.
     """
     s, weights = len(k), at_start(len(k))
     field, size = with_rounding(system.vector_field, x + low)

@@ -30,8 +30,8 @@ class MetriplecticGauss(GaussMethod):
 
     The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
     ``h sum_i b_i gH_i . k_i = H(x') - H(x)``. Likewise gS, and gC of every first integral C that is held: the Casimirs
-    that the system is known to conserve, and the functions of ``preserve``. K_d is the dissipation rebuilt with gH_i and
-    the gC_i in its kernel. Hence
+    that the system is known to conserve, and the functions of ``preserve``. K_d is the dissipation rebuilt with gH_i
+    and the gC_i in its kernel. Hence
 
         H(x') = H(x),    S(x') - S(x) = h sum b_i gS_i . K_d gS_i >= 0,    C(x') = C(x),
 

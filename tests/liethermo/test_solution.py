@@ -59,6 +59,62 @@ def test_a_file_cut_short(solution, tmp_path, keep):
         lt.load(path)
 
 
+def same(a, b) -> bool:
+    arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "energy", "entropy"))
+    casimirs = a.casimirs.keys() == b.casimirs.keys()
+    casimirs = casimirs and all(np.array_equal(a.casimirs[name], b.casimirs[name]) for name in a.casimirs)
+    rest = ("status", "stats", "laws", "provenance", "event_time")
+    return arrays and casimirs and all(getattr(a, name) == getattr(b, name) for name in rest)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_damaged_file_is_refused_or_loads_unharmed(solution, tmp_path, capfd):
+    """One bit of a file is flipped, at places all over it: never another trajectory, nor a word on the terminal."""
+    path, other = solution.save(tmp_path / "run.nc"), tmp_path / "damaged.nc"
+    content, random, refused = path.read_bytes(), np.random.default_rng(12), 0
+    for place in random.integers(len(content), size=300):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << random.integers(8)
+        other.write_bytes(damaged)
+        try:
+            assert same(lt.load(other), solution), place
+        except lt.FileError:
+            refused += 1
+    assert 50 < refused < 280  # the rest is padding
+    assert capfd.readouterr().err == ""
+
+
+def test_a_changed_number_and_a_changed_word(solution, tmp_path):
+    import h5py
+
+    for change in ("number", "word"):
+        path = solution.save(tmp_path / f"{change}.nc")
+        with h5py.File(path, "r+") as file:
+            if change == "number":
+                file["x"][3, 1] += 1e-15
+            else:
+                file.attrs["status"] = file.attrs["status"].replace("completed", "event")
+        with pytest.raises(lt.FileError, match="checksum"):
+            lt.load(path)
+
+
+def test_a_file_of_version_0_1(solution, tmp_path):
+    """It has no checksum, loads, and says so."""
+    import h5py
+
+    path = solution.save(tmp_path / "old.nc")
+    with h5py.File(path, "r+") as file:
+        del file.attrs["sha256"]
+        with_checksum = path.with_name("half.nc")
+        file.flush()
+        with_checksum.write_bytes(path.read_bytes())
+        file.attrs["format"] = "liethermo-solution-1"
+    with pytest.warns(UserWarning, match="no checksum"):
+        assert same(lt.load(path), solution)
+    with pytest.raises(lt.FileError, match="checksum"):
+        lt.load(with_checksum)
+
+
 def test_other_files(tmp_path):
     import xarray
 

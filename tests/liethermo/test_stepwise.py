@@ -1,8 +1,10 @@
 """Adaptive steps, events, outputs at given times and dense output: where a run steps is free, the laws are not."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
@@ -139,7 +141,7 @@ def test_largest_and_first():
 
 
 def test_a_tolerance_that_cannot_be_met():
-    """A kink in the energy: the error estimate cannot fall below it, and the step underflows with a clear status."""
+    """A jump in the energy, which no step size gets over: the step underflows, and the status says why."""
     kinked = lt.LiePoissonSystem(
         mf.so(3),
         lambda p: 0.5 * jnp.sum(p**2 / jnp.array([3.0, 2.0, 1.0])) + jnp.where(p[0] > 0.5, 1.0, 0.0) * p[1],
@@ -148,7 +150,7 @@ def test_a_tolerance_that_cannot_be_met():
     options = {"method": lt.MetriplecticGauss(2), "on_failure": "return"}
     solution = lt.integrate(kinked, [0.8, 0.5, 0.9], (0.0, 10.0), lt.Adaptive(1e-9), **options)
     assert solution.status.code == "step_underflow"
-    assert "Try a larger tolerance" in solution.status.message
+    assert "equations are still not solved, so no step size helps" in solution.status.message
     assert solution.stats.steps > 3
     assert np.isfinite(solution.x).all()
     assert solution.x[-1, 0] == pytest.approx(0.5, abs=1e-6)
@@ -164,6 +166,88 @@ def test_suggest_step(exact):
         assert solution.stats.steps < 2000
     with pytest.raises(lt.InputError, match="nothing moves"):
         lt.suggest_step(BODY, [1.0, 0.0, 0.0])
+
+
+# -- what grows -------------------------------------------------------------------------------------------------------
+
+
+def falls(field, x0, event, end):
+    """The time of an event by an independent program, the small components resolved."""
+    event.terminal = True
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-30, "events": event}
+    return solve_ivp(lambda t, x: field(x), (0.0, end), x0, **options).t_events[0][0]
+
+
+def relaxed_body(m):
+    rates = m / np.array([10.0, 5.0, 1.0])
+    return np.cross(m, rates) + (rates @ rates) * m - (rates @ m) * rates
+
+
+@pytest.mark.parametrize(
+    ("p", "rtol", "stages"), [(1e-6, 1e-4, 2), (1e-7, 1e-4, 3), (1e-10, 1e-6, 3), (1e-13, 1e-8, 4), (1e-15, 1e-6, 2)]
+)
+def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages):
+    """However near it starts, and however large the tolerance is beside that."""
+    x0 = [p, 1.0, p]
+    exact = falls(relaxed_body, x0, lambda t, x: x[0] - 0.5, 600.0)
+    method = lt.MetriplecticGauss(stages)
+    found = lt.integrate(BODY, x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
+    assert found.event_time == pytest.approx(exact, rel=0.005)
+    assert found.stats.steps < 80
+
+
+@pytest.mark.parametrize("name", ["pendulum", pytest.param("double well", marks=pytest.mark.slow)])
+def test_other_unstable_rests(name):
+    """The top of a pendulum and of a double well; linear and cubic forces against each other."""
+    energy, force = {
+        "pendulum": (lambda x: 0.5 * x[1] ** 2 + jnp.cos(x[0]), np.sin),
+        "double well": (lambda x: 0.5 * x[1] ** 2 - 0.5 * x[0] ** 2 + 0.25 * x[0] ** 4, lambda q: q - q**3),
+    }[name]
+    exact = falls(lambda x: np.array([x[1], force(x[0])]), [1e-12, 0.0], lambda t, x: x[0] - 0.5, 100.0)
+    system = lt.MetriplecticSystem(mf.Canonical(1), energy)
+    options = {"method": lt.MetriplecticGauss(2), "until": lambda x: x[0] - 0.5}
+    found = lt.integrate(system, [1e-12, 0.0], (0.0, 100.0), lt.Adaptive(1e-6), **options)
+    assert found.event_time == pytest.approx(exact, rel=0.01)
+
+
+def test_what_grows_in_a_larger_system():
+    """Six wells in a row, coupled: the rates of growth from a Krylov space are those of the whole matrix."""
+    system = wells(6)
+    x = np.concatenate([[0.0, 0.1, 0.0, 0.7, 0.0, 0.2], np.zeros(6)])
+    matrix = np.asarray(jax.jacfwd(system.vector_field)(jnp.asarray(x)))
+    found = np.linalg.eigvals(np.asarray(array.growing(system, lt.MetriplecticMidpoint(), jnp.asarray(x))))
+    assert np.sort(found.real) == pytest.approx(np.sort(np.linalg.eigvals(matrix).real), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_row_of_wells_leaves_its_rest():
+    system, x0 = wells(20), np.zeros(40)
+    x0[3] = 1e-11
+    springs = np.diag(np.r_[1.0, np.full(18, 2.0), 1.0]) - np.eye(20, k=1) - np.eye(20, k=-1)
+
+    def field(x):
+        return np.concatenate([x[20:], x[:20] - x[:20] ** 3 - 0.6 * springs @ x[:20]])
+
+    exact = falls(field, x0, lambda t, x: np.abs(x[:20]).max() - 0.3, 100.0)
+    options = {"method": lt.MetriplecticGauss(2), "until": lambda x: jnp.max(jnp.abs(x[:20])) - 0.3}
+    assert lt.integrate(system, x0, (0.0, 100.0), lt.Adaptive(1e-6), **options).event_time == pytest.approx(
+        exact, rel=0.01
+    )
+
+
+def wells(n):
+    def energy(x):
+        q, p = x[:n], x[n:]
+        return 0.5 * p @ p + jnp.sum(0.25 * q**4 - 0.5 * q**2) + 0.3 * jnp.sum((q[1:] - q[:-1]) ** 2)
+
+    return lt.MetriplecticSystem(mf.Canonical(n), energy)
+
+
+def test_suggested_steps_resolve_what_grows():
+    """At the top of a saddle nothing seems to move, and any step would do for the estimate of the error."""
+    h = lt.suggest_step(BODY, [1e-10, 1.0, 1e-10], 1e-6, lt.MetriplecticGauss(2))
+    rate = np.linalg.eigvals(np.asarray(jax.jacfwd(BODY.vector_field)(jnp.array([0.0, 1.0, 0.0])))).real.max()
+    assert 0.05 < h * rate < 1.2
 
 
 # -- events -----------------------------------------------------------------------------------------------------------
@@ -190,6 +274,17 @@ def test_an_event_is_located_to_rounding():
     solution = lt.integrate(free, [0.1, 0.2, 0.9], (0.0, 100.0), 0.05, lt.MetriplecticGauss(6), until=lambda x: x[0])
     assert abs(solution.x[-1, 0]) < 1e-13
     assert solution.audit().passed
+
+
+def test_steps_that_are_looked_at_are_those_of_the_timetable():
+    """A thousand steps of 0.1 to t = 100, and at the same times."""
+    plain = lt.integrate(BODY, X0, (0.0, 100.0), 0.1)
+    seen = lt.integrate(BODY, X0, (0.0, 100.0), 0.1, until=lambda x: x[0] - 5.0)
+    assert seen.stats.steps == plain.stats.steps == 1000
+    assert np.array_equal(seen.t, plain.t)
+    assert np.array_equal(seen.x, plain.x)
+    stops = lt.integrate(BODY, X0, (0.0, 1.05), 0.1, save_at=[0.3, 0.75])
+    assert stops.stats.steps == 3 + 5 + 3
 
 
 def test_an_event_that_never_happens():
