@@ -11,13 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .audit import Audit, AuditRow, Tolerances
 from .engine import array, compiled
+from .engine.programs import program
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .family import Family, common_size
@@ -357,12 +357,12 @@ def _run_array(family: Family, method, states: np.ndarray, times: Timetable, rec
             return
 
 
-@eqx.filter_jit
+@program
 def _begin_all(form, parameters, axes, method, x):
     return jax.vmap(lambda p, x: array.begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
 
 
-@eqx.filter_jit
+@program
 def _advance_all(form, parameters, axes, method, state, h, saves: int, every):
     def one(p, state):
         return array.advance(form.rebuild(p), method, state, h, saves, every, saves)

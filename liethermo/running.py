@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .energy import traced_energies
 from .engine import array, compiled
 from .engine.interpret import at_points
+from .engine.programs import program
 from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .engine.sparse import SparseEngine
@@ -178,7 +180,7 @@ class Run:
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _along(self, x, v) -> np.ndarray:
-        return np.asarray(jax.jit(jax.vmap(lambda x, v: self.method.along(self.system, x, v)))(x, v))
+        return np.asarray(_along(self.system, self.method, x, v))
 
     def _append(self, t: float, state) -> None:
         self.times.append(t)
@@ -387,7 +389,7 @@ def as_run(system: System, method) -> tuple[System, Any]:
     """The system and the method as they are run: with attitudes where there is a group, in charts on a manifold."""
     if not isinstance(method, OneStepMethod):
         return system, method
-    method = method.on(system)
+    method = traced_energies(method.on(system), system.dim, "a preserved function")
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method
@@ -409,6 +411,11 @@ def laws_of(system: System, method, invariants) -> Laws:
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     return Laws(system.energy_law, system.entropy_law, conserved, tuple(system.ledger), inexact)
+
+
+@program
+def _along(system: System, method: OneStepMethod, x, v):
+    return jax.vmap(lambda x, v: method.along(system, x, v))(x, v)
 
 
 def _value(function, x):

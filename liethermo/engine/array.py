@@ -20,6 +20,7 @@ from manifolds import matrix_functions
 
 from ..integrators import OneStepMethod
 from ..systems import System
+from .programs import program
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -222,7 +223,7 @@ class State(eqx.Module):
     first_energy: jax.Array
 
 
-@eqx.filter_jit
+@program
 def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
@@ -317,7 +318,7 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves, every
     return _advance(system, method, state, h, saves, every, capacity)
 
 
-@eqx.filter_jit
+@program
 def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     def one_save(state: State, index):
         target = state.step + every
@@ -337,7 +338,7 @@ def stepping(system: System, method: OneStepMethod) -> Callable:
     return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
 
 
-@eqx.filter_jit
+@program
 def _one_step(system, method, state, h):
     return take_step(system, method, state, h)
 
@@ -347,7 +348,7 @@ def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
     return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
 
 
-@eqx.filter_jit
+@program
 def _error(system, method, x, low, h, k):
     return method.error(system, x, low, h, k)
 

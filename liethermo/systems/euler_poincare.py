@@ -82,8 +82,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
     ):
-        self.lagrangian = as_energy(lagrangian, "the Lagrangian")
-        check_scalar(self.lagrangian, algebra.dim, "the Lagrangian")
+        self.lagrangian = check_scalar(as_energy(lagrangian, "the Lagrangian"), algebra.dim, "the Lagrangian")
         if force is not None:
             forced = EulerPoincareForce(force)
             dissipation = forced if dissipation is None else dissipation + forced

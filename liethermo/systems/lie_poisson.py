@@ -13,7 +13,7 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, as_energy
+from ..energy import Energy, as_energy, check_scalar
 from ..errors import InputError
 from .base import System
 
@@ -101,7 +101,7 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
     return reconstruction
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
     found: dict[str, Energy] = {}
     count = algebra.casimir_count()
@@ -114,5 +114,5 @@ def _recorded_casimirs(algebra: mf.LieAlgebra) -> dict[str, Energy]:
         for i, casimir in enumerate(casimirs):
             text = str(casimir)
             name = text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}"
-            found[name] = as_energy(casimir, "a Casimir")
+            found[name] = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
     return found
