@@ -304,15 +304,17 @@ def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, 
     cores, stop = len(os.sched_getaffinity(0)), threading.Event()
     size = len(states)
     portion = min(BATCH, LANES * math.ceil(size / (LANES * 4 * cores)))
-    form, first_member, varies = family.form, family.flat(slice(0, 1), 1)[0], family.varies
-    stepper = compiled.stepper_of(form, first_member, method, LANES, varies)
+    own = compiled.numbers_of(method)
+    first_member = np.append(family.flat(slice(0, 1), 1)[0], own)
+    varies = np.append(family.varies, np.zeros(len(own), dtype=bool))
+    stepper = compiled.stepper_of(family.form, first_member, method, LANES, varies)
 
     def work(first: int) -> None:
         chosen = slice(first, min(first + portion, size))
         if stop.is_set():
             return
         number = chosen.stop - first
-        parameters = family.flat(chosen, number)
+        parameters = np.hstack([family.flat(chosen, number), np.broadcast_to(own, (number, len(own)))])
         blocks = stepper.begin(parameters, states[chosen])
         before = {name: value[:number].copy() for name, value in stepper.fields(blocks).items()}
         saved = []

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .programs import program
-from .remembered import fingerprint, remembered
+from .remembered import Latest, fingerprint, remembered
 from .scalarize import UnsupportedPrimitive, scalarize
 from .traced import settled
 
@@ -98,27 +98,20 @@ def _is_parameter(leaf) -> bool:
     return eqx.is_inexact_array(leaf) and leaf.dtype == np.float64
 
 
-_found: dict[Any, Any] = {}
-
-KNOWN = 256
-"""Unrolled functions held in memory."""
+_unrolled: Latest[Any] = Latest(128)
 
 
 def _known(what: str, key: tuple, find: Callable) -> Any:
     """What is found for a function and models of one form, once; None where it cannot be unrolled."""
+
+    def found():
+        try:
+            return find()
+        except UnsupportedPrimitive:
+            return None
+
     _, form, *_ = key
-    forgettable = form[0] is None
-    if not forgettable and (what, key) in _found:
-        return _found[what, key]
-    try:
-        found = find()
-    except UnsupportedPrimitive:
-        found = None
-    if not forgettable:
-        while len(_found) >= KNOWN:
-            del _found[next(iter(_found))]
-        _found[what, key] = found
-    return found
+    return found() if form[0] is None else _unrolled.find((what, key), found)
 
 
 def _by_compiler(function: Callable, model: Any, points: np.ndarray) -> Any:

@@ -6,22 +6,21 @@ One takes some hundred memory maps of the 65,530 that Linux grants a process, an
 from __future__ import annotations
 
 import functools
-import threading
-from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+
+from .remembered import Latest
 
 KEPT = 48
 """Programs held in memory, those last used: of 500 maps each at most."""
 
 Function = TypeVar("Function", bound=Callable)
 
-_programs: OrderedDict[Any, Callable] = OrderedDict()
-_lock = threading.Lock()
+_programs: Latest[Callable] = Latest(KEPT)
 
 
 def program(function: Function) -> Function:
@@ -34,15 +33,7 @@ def program(function: Function) -> Function:
         static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
         shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
         key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
-        with _lock:
-            compiled = _programs.get(key)
-            if compiled is None:
-                compiled = _programs[key] = jax.jit(_Whole(function, structure, static))
-                while len(_programs) > KEPT:
-                    _programs.popitem(last=False)
-            else:
-                _programs.move_to_end(key)
-        return compiled(dynamic)
+        return _programs.find(key, lambda: jax.jit(_Whole(function, structure, static)))(dynamic)
 
     return call  # type: ignore[return-value]
 

@@ -123,6 +123,7 @@ def _forwards(function: Callable) -> Callable:
 
     @called.defjvp
     def rule(values, tangents):
+        values, tangents = tuple(map(jnp.asarray, values)), tuple(map(jnp.asarray, tangents))
         real = [i for i, v in enumerate(values) if jnp.issubdtype(v.dtype, jnp.inexact)]
 
         def of_real(*moving):
@@ -140,7 +141,7 @@ def _forwards(function: Callable) -> Callable:
         jacobians = _forwards(
             lambda *moving: jax.tree_util.tree_leaves(jax.jacfwd(of_real, tuple(range(len(real))))(*moving))
         )(*(values[i] for i in real))
-        found = function(*values)
+        found = called(*values)
         columns = [jacobians[k * len(real) : (k + 1) * len(real)] for k in range(len(found))]
         return found, [tangent(f, c) for f, c in zip(found, columns, strict=True)]
 
