@@ -12,6 +12,7 @@ import scipy.sparse
 
 from .energy import Energy, Function, check_scalar, recognised
 from .engine.interpret import polynomial_degree
+from .engine.traced import settled
 from .errors import FunctionError, InputError
 from .indices import Indices, cliques
 
@@ -54,16 +55,15 @@ class Each(Energy):
         if isinstance(phi, Energy):
             if parameters:
                 raise InputError("an Energy is the same at every place: parameters are for a function")
-            check_scalar(phi, r, "the energy at a place")
-            self.phi = recognised(phi, r)
+            self.phi = recognised(check_scalar(phi, r, "the energy at a place"), r)
             self.quadratic = self.phi.is_quadratic
             return
         if not callable(phi):
             raise FunctionError(f"phi is a function or an Energy, not {type(phi).__name__}")
-        self.phi = phi
         first = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
         check_scalar(Function(lambda y: phi(y, *first)), r, "the function at a place")
-        self.quadratic = polynomial_degree(_value_at, (phi, first), r) <= 2
+        self.phi = settled(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in first))
+        self.quadratic = polynomial_degree(_value_at, (self.phi, first), r) <= 2
 
     @property
     def terms(self) -> tuple[Energy, ...]:

@@ -22,6 +22,7 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from .engine.interpret import at_points, polynomial_degree
+from .engine.traced import converted
 from .errors import FunctionError, InputError
 from .indices import cliques, pattern, union
 
@@ -556,43 +557,64 @@ def _value(energy: Energy, x):
     return energy.value(x)
 
 
-def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> None:
-    """Raise unless the energy maps a state of this dimension to one real number, each term in coordinates it has.
+def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> Energy:
+    """The energy with its plain functions traced, so that closures with other numbers are alike.
 
     With ``timed`` it may depend on the time too.
+
+    Raises
+    ------
+    FunctionError, InputError
+        Unless it maps a state of this dimension to one real number, each term in coordinates that it has.
     """
     if energy.depends_on_time and not timed:
         raise InputError(
             f"{role} depends on time, or is a function of two arguments, which only the energy of a system may be "
             "(and the Lagrangian of an EulerPoincareSystem, and couplings of a ComposedSystem)"
         )
-    for term in energy.terms:
-        term.check_places(dim, role)
-    state, time = jax.ShapeDtypeStruct((dim,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
     try:
-        result = jax.eval_shape(lambda x, t: energy.at_time(t).value(x), state, time)
+        energy, result = converted(energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ())
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         raise FunctionError(
             f"{role} could not be evaluated on a state of shape ({dim},): {type(error).__name__}: {error}. "
             "It must be written with jax.numpy and accept one array"
         ) from error
+    for term in energy.terms:
+        term.check_places(dim, role)
     if result.shape != ():
         raise FunctionError(
             f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?"
         )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
+    return energy
 
 
-def check_shape(function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str):
-    """Raise FunctionError unless a function of arrays of these shapes gives one of ``shape``; ``at`` names them."""
-    given = [jax.ShapeDtypeStruct(a, jnp.float64) for a in arguments]
+def traced_energies(tree, dim: int, role: str):
+    """A pytree with the energies in it checked as :func:`check_scalar` does; one that occurs twice stays one object."""
+    found: dict[int, Energy] = {}
+
+    def checked(part):
+        if not isinstance(part, Energy):
+            return part
+        if id(part) not in found:
+            found[id(part)] = check_scalar(part, dim, role)
+        return found[id(part)]
+
+    return jax.tree_util.tree_map(checked, tree, is_leaf=lambda part: isinstance(part, Energy))
+
+
+def check_shape(
+    function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str
+) -> Callable:
+    """A function of arrays of these shapes, traced; FunctionError unless it gives ``shape``; ``at`` names them."""
     try:
-        found = jax.eval_shape(lambda *a: jnp.asarray(function(*a)), *given).shape
+        function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
     except (TypeError, ValueError, IndexError) as error:
         raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
-    if found != shape:
-        raise FunctionError(f"{what} has shape {shape}, not {found}")
+    if found.shape != shape:
+        raise FunctionError(f"{what} has shape {shape}, not {found.shape}")
+    return function
 
 
 def is_traced(tree) -> bool:

@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from .audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
 from .engine import array, compiled
 from .engine.compiled import Form
 from .engine.interpret import at_points
+from .engine.programs import program
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, spread
@@ -405,15 +405,17 @@ def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, 
     cores, stop = len(os.sched_getaffinity(0)), threading.Event()
     size = len(states)
     portion = min(BATCH, LANES * math.ceil(size / (LANES * 4 * cores)))
-    form, first_member, varies = family.form, family.flat(slice(0, 1), 1)[0], family.varies
-    stepper = compiled.stepper_of(form, first_member, method, LANES, varies)
+    own = compiled.numbers_of(method)
+    first_member = np.append(family.flat(slice(0, 1), 1)[0], own)
+    varies = np.append(family.varies, np.zeros(len(own), dtype=bool))
+    stepper = compiled.stepper_of(family.form, first_member, method, LANES, varies)
 
     def work(first: int) -> None:
         chosen = slice(first, min(first + portion, size))
         if stop.is_set():
             return
         number = chosen.stop - first
-        parameters = family.flat(chosen, number)
+        parameters = np.hstack([family.flat(chosen, number), np.broadcast_to(own, (number, len(own)))])
         blocks = stepper.begin(parameters, states[chosen])
         before = {name: value[:number].copy() for name, value in stepper.fields(blocks).items()}
         saved = []
@@ -458,12 +460,12 @@ def _run_array(family: Family, method, states: np.ndarray, times: Timetable, rec
             return
 
 
-@eqx.filter_jit
+@program
 def _begin_all(form, parameters, axes, method, x):
     return jax.vmap(lambda p, x: array.begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
 
 
-@eqx.filter_jit
+@program
 def _advance_all(form, parameters, axes, method, state, h, saves: int, every):
     def one(p, state):
         return array.advance(form.rebuild(p), method, state, h, saves, every, saves)

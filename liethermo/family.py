@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .engine.compiled import Form
+from .engine.remembered import fingerprint
+from .engine.traced import Traced, traced
 from .errors import InputError
 from .systems import System
 
@@ -77,16 +79,37 @@ class Family:
                 raise InputError(f"the function must return a system, not {type(system).__name__}")
             return system
 
-        family = cls(Form((build, structure), tuple(value.shape[1:] for value in values), rebuild), values)
+        shapes = tuple(value.shape[1:] for value in values)
+        family = cls(Form((build, structure), shapes, rebuild), values)
         for i in family.extremes():  # the constructors of systems check what they are given
             family.member(i)
+        rest = None
+
+        def arrays_of(*arrays):
+            nonlocal rest
+            arrays, rest = eqx.partition(rebuild(arrays), eqx.is_array)
+            return arrays
+
         try:
-            jax.eval_shape(lambda arrays: eqx.filter(rebuild(arrays), eqx.is_array), family.arrays(0))
+            program = traced(arrays_of, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes))
         except jax.errors.ConcretizationTypeError as error:
             raise InputError(
                 f"the function that builds systems must accept traced JAX arrays, as under jax.vmap: {error}"
             ) from error
-        return family
+        return family if fingerprint(rest) is None else cls._of_program(program, rest, values)
+
+    @classmethod
+    def _of_program(cls, program: Traced, rest, values: list[np.ndarray]) -> Family:
+        """From a program that makes the arrays of a system; the numbers in it are parameters that all members share."""
+        given = len(values)
+
+        def rebuild(arrays):
+            return eqx.combine(Traced(tuple(arrays[given:]), program.content, program.label)(*arrays[:given]), rest)
+
+        values = [*values, *(np.asarray(number)[None] for number in program.numbers)]
+        return cls(
+            Form((program.content, fingerprint(rest)), tuple(value.shape[1:] for value in values), rebuild), values
+        )
 
     def through(self, change: Callable[..., System]) -> Family:
         """The family of what a function, one that has an identity, makes of the members."""

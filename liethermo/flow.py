@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from manifolds import matrix_functions
-
-from .engine import array
+from .energy import traced_energies
+from .engine import array, implicit
+from .engine.programs import program
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .systems import DrivenSystem, System, driven
 from .timetable import Timetable
@@ -54,17 +56,25 @@ def flow(
     n, system = system.dim, driven(system)
     x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
     method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
-    k = method.start(system, x)
-    carry = (x, jnp.zeros_like(x), k, k)
-    states = [x[None]]
-    for h, saves, every in table.calls(limit=table.steps, saves=table.steps):
-        carry, kept = _steps(system, method, carry, h, saves, every)
-        states.append(kept)
-    path = jnp.concatenate(states)[:, :n]
+    method = traced_energies(method, system.dim, "a preserved function")
+    calls = tuple(table.calls(limit=table.steps, saves=table.steps))
+    sizes = np.array([h for h, _, _ in calls])
+    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))[:, :n]
     return path[-1] if save_every is None else path
 
 
-def _steps(system: System, method: OneStepMethod, carry, h: float, saves: int, every: int):
+@program
+def _path(system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[int, int], ...]) -> jax.Array:
+    """The states kept, the first among them: a program of its own, in which all numbers are arguments."""
+    k = method.start(system, x)
+    carry, states = (x, jnp.zeros_like(x), k, k), [x[None]]
+    for i, (saves, every) in enumerate(counts):
+        carry, kept = _steps(system, method, carry, sizes[i], saves, every)
+        states.append(kept)
+    return jnp.concatenate(states)
+
+
+def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
     def one_step(carry, _):
         x, low, k, before = carry
         new = _stages(system, method, x, low, h, method.predict(k, before))
@@ -78,16 +88,19 @@ def _steps(system: System, method: OneStepMethod, carry, h: float, saves: int, e
     return jax.lax.scan(one_save, carry, length=saves)
 
 
-def _stages(system: System, method: OneStepMethod, x, low, h: float, guess) -> jax.Array:
+def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Array:
     """The solution of the stage equations, differentiated as the implicit function that it is."""
-    size = jax.lax.stop_gradient(jnp.max(jnp.abs(x)))
+    dynamic, static = eqx.partition((system, method, x, low, h), eqx.is_array)
 
-    def misfit(k):
-        return method.slopes(system, x, low, h, k) - k
+    def slopes(dynamic, k):
+        system, method, x, low, h = eqx.combine(dynamic, static)
+        return method.slopes(system, x, low, h, k)
 
-    def solve(misfit, guess):
+    def solve(dynamic, guess):
+        system, method, x, low, h = eqx.combine(dynamic, static)
+        size = jnp.max(jnp.abs(x))
         solved = array.solve_stages(
-            lambda k: misfit(k) + k,
+            lambda k: slopes(dynamic, k),
             guess,
             lambda k: size / h + jnp.max(jnp.abs(k)) + array.VANISHED,
             lambda k: method.jacobian(system, x, low, h, k),
@@ -95,8 +108,4 @@ def _stages(system: System, method: OneStepMethod, x, low, h: float, guess) -> j
         )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 
-    def solve_linear(linear, y):
-        matrix = jax.jacobian(lambda v: linear(v.reshape(y.shape)).ravel())(jnp.zeros(y.size))
-        return matrix_functions.solve(matrix, y.reshape(-1, 1)).reshape(y.shape)
-
-    return jax.lax.custom_root(misfit, jax.lax.stop_gradient(guess), solve, solve_linear)
+    return implicit.solution(solve, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)

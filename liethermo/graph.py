@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,8 @@ def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
         first, second = np.triu_indices(nodes, 1)
         return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
     first, second, weight = _listed(graph, nodes, what)
+    if isinstance(weight, jax.Array):  # some are tracers
+        return Edges(first, second, weight)
     for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
         raise InputError(f"{what} of {names[first[e]]} with itself is {weight[e]:g}: leave the diagonal zero")
     for e in np.flatnonzero(~((weight >= 0.0) & np.isfinite(weight)))[:1]:
@@ -66,18 +68,18 @@ def parts(graph: Edges, nodes: int) -> np.ndarray:
     return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
 
 
-def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | jax.Array]:
     if scipy.sparse.issparse(graph) or _is_matrix(graph):
         return _of_matrix(scipy.sparse.coo_array(graph), nodes, what)
-    if np.ndim(graph) == 0:
+    if not _is_edge_list(graph) and np.ndim(graph) == 0:
         if nodes != 2:
             raise InputError(f"{what} as one number is meant for two parts, not {nodes}: give a matrix or edges")
         graph = [(0, 1, graph)]
-    found: dict[tuple[int, int], float] = {}
+    found: dict[tuple[int, int], Any] = {}
     for edge in graph:
         try:
             i, j, k = edge
-            i, j, k = int(i), int(j), float(k)
+            i, j, k = int(i), int(j), k if isinstance(k, jax.core.Tracer) else float(k)
         except (TypeError, ValueError):
             raise InputError(f"{what}: an edge is (i, j, weight), not {edge!r}") from None
         if not (0 <= i < nodes and 0 <= j < nodes):
@@ -86,7 +88,9 @@ def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.nd
             raise InputError(f"{what}: the edge between {i} and {j} is given twice")
         found[min(i, j), max(i, j)] = k
     ends = np.array(list(found), dtype=int).reshape(-1, 2)
-    return ends[:, 0], ends[:, 1], np.array(list(found.values()))
+    weights = list(found.values())
+    traced = any(isinstance(k, jax.core.Tracer) for k in weights)
+    return ends[:, 0], ends[:, 1], jnp.stack([jnp.asarray(k) for k in weights]) if traced else np.array(weights)
 
 
 def _of_matrix(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

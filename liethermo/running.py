@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .energy import traced_energies
 from .engine import array, compiled
 from .engine.interpret import at_points
+from .engine.programs import program
 from .engine.remembered import remembered
 from .engine.scalarize import UnsupportedPrimitive
 from .engine.sparse import SparseEngine
@@ -194,7 +196,7 @@ class Run:
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _along(self, x, v) -> np.ndarray:
-        return np.asarray(jax.jit(jax.vmap(lambda x, v: self.method.along(self.system, x, v)))(x, v))
+        return np.asarray(_along(self.system, self.method, x, v))
 
     def _append(self, t: float, state) -> None:
         self.times.append(t)
@@ -453,7 +455,7 @@ def as_run(system: System, method) -> tuple[System, Any]:
     if not isinstance(method, OneStepMethod):
         return driven(system, unit=1.0), method  # its errors are measured component by component
     system = driven(system)
-    method = method.pulled(system).on(system)
+    method = traced_energies(method.pulled(system).on(system), system.dim, "a preserved function")
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method
@@ -479,6 +481,11 @@ def laws_of(system: System, method, invariants) -> Laws:
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     ledger = tuple(system.ledger)
     return Laws(system.energy_law, system.entropy_law, conserved, ledger, inexact, system.balance, unpromised)
+
+
+@program
+def _along(system: System, method: OneStepMethod, x, v):
+    return jax.vmap(lambda x, v: method.along(system, x, v))(x, v)
 
 
 def _value(function, x):

@@ -64,4 +64,6 @@ def real_array(value) -> jax.Array:
     """``value`` as a JAX array of doubles, by NumPy where it is a plain number: XLA would compile a conversion."""
     if isinstance(value, jax.Array):
         return value if value.dtype == jnp.float64 else value.astype(jnp.float64)
+    if is_traced(value):  # some of its entries
+        return jnp.asarray(value, dtype=jnp.float64)
     return jnp.asarray(np.asarray(value, dtype=np.float64))

@@ -20,6 +20,7 @@ from manifolds import matrix_functions
 
 from ..integrators import OneStepMethod
 from ..systems import System
+from .programs import program
 from .rounding import with_rounding
 
 EPS = float(np.finfo(np.float64).eps)
@@ -251,7 +252,7 @@ class State(eqx.Module):
     entropy_sensitivity: jax.Array
 
 
-@eqx.filter_jit
+@program
 def begin(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
@@ -354,7 +355,7 @@ def advance(system: System, method: OneStepMethod, state: State, h, saves, every
     return _advance(system, method, state, h, saves, every, capacity)
 
 
-@eqx.filter_jit
+@program
 def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
     def one_save(state: State, index):
         target = state.step + every
@@ -374,7 +375,7 @@ def stepping(system: System, method: OneStepMethod) -> Callable:
     return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
 
 
-@eqx.filter_jit
+@program
 def _one_step(system, method, state, h):
     return take_step(system, method, state, h)
 
@@ -384,7 +385,7 @@ def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
     return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
 
 
-@eqx.filter_jit
+@program
 def _error(system, method, x, low, h, k):
     return method.error(system, x, low, h, k)
 
@@ -406,7 +407,7 @@ def error_and_stretch(system: System, method: OneStepMethod, x, low, h, k):
     return _error_and_stretch(system, method, *(jnp.asarray(a) for a in (x, low, h, k)))
 
 
-@eqx.filter_jit
+@program
 def _error_and_stretch(system, method, x, low, h, k):
     return method.error(system, x, low, h, k), _stretch(*method.judged(system, x))
 
@@ -423,7 +424,7 @@ def _stretch(system: System, x):
     return jax.lax.scan(power, _unit(_uneven(n)), length=POWERS)[1]
 
 
-@eqx.filter_jit
+@program
 def growing(system, method, x):
     """The matrix of the Jacobian in a Krylov space, shape (m, m): its eigenvalues lie near the outer ones [Arnoldi]."""
     system, x = method.judged(system, x)

@@ -30,7 +30,7 @@ from . import array, step_loop
 from . import straight_line as straight_line_module
 from .array import State
 from .module_cache import load
-from .remembered import fingerprint, remembered
+from .remembered import Latest, remembered
 from .scalarize import Program, scalarize
 from .straight_line import is_plain
 
@@ -110,9 +110,10 @@ class Stepper:
 
     Parameters
     ----------
-    form : Form
+    form, own : Form
+        Of the system and of the method.
     parameters : array, shape (p,)
-        Those of one system of that form. Zeros among them hold for all, unless they vary.
+        Those of one system and method of these forms. Zeros among them hold for all, unless they vary.
     method : OneStepMethod
     lanes : int
         Trajectories that advance together, a block.
@@ -120,9 +121,15 @@ class Stepper:
         Which parameters are each trajectory's own.
     """
 
-    def __init__(self, form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int, varies: np.ndarray):
+    def __init__(
+        self, form: Form, own: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int, varies: np.ndarray
+    ):
         self.lanes = lanes
-        system, rebuilt = form.build(parameters), form.build
+        system, size = form.build(parameters), form.size
+
+        def both(p) -> tuple[System, OneStepMethod]:
+            return form.build(p[:size]), own.build(p[size:])
+
         self._hard_steps = 0  # that have asked for Newton's method
         self._loops: dict[bool, Callable] = {}
         self._slow: ModuleType | None = None
@@ -135,20 +142,23 @@ class Stepper:
             return method.predict(k, before), jnp.max(jnp.abs(x))
 
         def iterate(p, x, low, h, k):
-            new = method.slopes(rebuilt(p), x, low, h[0], k)
+            system, method = both(p)
+            new = method.slopes(system, x, low, h[0], k)
             return new, jnp.max(jnp.abs(new - k)), jnp.max(jnp.abs(new))
 
         def sound(p, x):
-            return array.noise_of(rebuilt(p), x)
+            return array.noise_of(both(p)[0], x)
 
         def along(p, x, low, h, k, direction):
-            return method.change(rebuilt(p), x, low, h[0], k, direction)
+            system, method = both(p)
+            return method.change(system, x, low, h[0], k, direction)
 
         def finish(p, x, low, h, k, first_energy):
-            return array.finish(rebuilt(p), method, x, low, h[0], k, first_energy[0])
+            return array.finish(*both(p), x, low, h[0], k, first_energy[0])
 
         def start(p, x):
-            return method.start(rebuilt(p), x), *array.values(rebuilt(p), x), *array.sensitivities(rebuilt(p), x)
+            system, method = both(p)
+            return method.start(system, x), *array.values(system, x), *array.sensitivities(system, x)
 
         n = system.dim
         self._shapes: dict[str, tuple[int, ...]] = dict.fromkeys([*NUMBERS.values(), *WORK.split()], (1,))
@@ -352,7 +362,7 @@ EMPTY = 9.0
 
 @dataclass(frozen=True)
 class Form:
-    """What systems have in common that differ in their parameters.
+    """What systems, or methods, have in common that differ in their parameters.
 
     Attributes
     ----------
@@ -360,16 +370,16 @@ class Form:
         The same for the same form.
     shapes : tuple of shapes
         Of the parameters, which are arrays.
-    rebuild : function from a list of arrays to a System
+    rebuild : function from a list of arrays to one of them
     """
 
     key: Any
     shapes: tuple[tuple[int, ...], ...]
-    rebuild: Callable[[list], System] = field(compare=False)
+    rebuild: Callable[[list], Any] = field(compare=False)
 
     @classmethod
-    def of(cls, system: System) -> Form:
-        """The form of a system, its parameters being the arrays among its leaves: its functions count by identity."""
+    def of(cls, system: System | OneStepMethod) -> Form:
+        """The form of a system or method, its parameters being the arrays among its leaves."""
         dynamic, static = eqx.partition(system, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         functions, outline = jax.tree_util.tree_flatten(static)
@@ -379,44 +389,52 @@ class Form:
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
         )
 
-    def build(self, p) -> System:
-        """The system with the parameters p, shape (p,), all arrays one after another."""
+    @property
+    def size(self) -> int:
+        """How many numbers the parameters are."""
+        return sum(map(math.prod, self.shapes))
+
+    def build(self, p) -> Any:
+        """The one with the parameters p, shape (size,), all arrays one after another."""
         ends = list(itertools.accumulate(map(math.prod, self.shapes)))
         arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
         return self.rebuild(arrays)
 
 
-_steppers: dict[Any, Stepper] = {}
-
-STEPPERS = 256
+STEPPERS = 128
 """Forms whose loops are held in memory."""
+
+_steppers: Latest[Stepper] = Latest(STEPPERS)
 
 
 def stepper_of(
     form: Form, parameters: np.ndarray, method: OneStepMethod, lanes: int = 1, varies: np.ndarray | None = None
 ) -> Stepper:
-    """The stepper for systems of a form.
+    """The stepper for systems of a form, and a method.
 
     Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
+
+    Parameters
+    ----------
+    parameters : array, shape (p,)
+        Of a system of that form, then of the method: see :func:`numbers_of`.
     """
-    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    own, varies = Form.of(method), np.zeros(len(parameters), dtype=bool) if varies is None else varies
     known = (parameters == 0.0) & ~varies
-    method_key = fingerprint(method)
-    if method_key is None:
-        return Stepper(form, parameters, method, lanes, varies)
-    key = (form.key, form.shapes, known.tobytes(), method_key, lanes, varies.tobytes())
-    if key not in _steppers:
-        while len(_steppers) >= STEPPERS:
-            del _steppers[next(iter(_steppers))]
-        _steppers[key] = Stepper(form, parameters, method, lanes, varies)
-    return _steppers[key]
+    key = (form.key, form.shapes, own.key, own.shapes, known.tobytes(), lanes, varies.tobytes())
+    return _steppers.find(key, lambda: Stepper(form, own, parameters, method, lanes, varies))
+
+
+def numbers_of(tree: System | OneStepMethod) -> np.ndarray:
+    """The parameters of a system or a method, shape (p,)."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
+    return np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
 
 
 @remembered
 def stepper_for(system: System, method: OneStepMethod) -> tuple[Stepper, np.ndarray]:
-    """The stepper for one trajectory of a system, and the system's parameters."""
-    leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
-    parameters = np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
+    """The stepper for one trajectory of a system, and the parameters of both."""
+    parameters = np.concatenate([numbers_of(system), numbers_of(method)])
     return stepper_of(Form.of(system), parameters, method), parameters
 
 

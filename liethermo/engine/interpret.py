@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .remembered import fingerprint, remembered
-from .scalarize import Program, UnsupportedPrimitive, scalarize
+from .programs import program
+from .remembered import Latest, fingerprint, remembered
+from .scalarize import UnsupportedPrimitive, scalarize
+from .traced import settled
 
 LIMIT = 8_000
 """Instructions up to which interpreting is faster than compiling."""
@@ -38,11 +40,29 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
 @remembered
 def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
     """The map from points, shape (m, dim), to :func:`at_points` there, unrolled once."""
-    try:
-        program, structure = _unrolled(function, model, (dim,))
-    except UnsupportedPrimitive:
-        return lambda points: jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
-    return lambda points: jax.tree_util.tree_unflatten(structure, program.evaluate(points, batch=True))
+    model = settled(model, function, (dim,))
+    leaves, form, rebuild = _parts(model)
+    values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
+    known = tuple((value == 0.0).tobytes() for value in values)  # what vanishes makes a program shorter
+
+    def unrolled():
+        shapes = [jax.ShapeDtypeStruct(value.shape, np.float64) for value in values]
+        closed, found = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x), return_shape=True)(
+            shapes, jax.ShapeDtypeStruct((dim,), np.float64)
+        )
+        zeros = [np.where(value == 0.0, 0.0, np.nan) for value in values]
+        return scalarize(closed, [*zeros, None], limit=LIMIT), jax.tree_util.tree_structure(found)
+
+    found = _known("program", (function, form, known, dim), unrolled)
+    if found is None:
+        return lambda points: _by_compiler(function, model, points)
+    program, structure = found
+
+    def interpreted(points):
+        own = [np.broadcast_to(value, (len(points), *value.shape)) for value in values]
+        return jax.tree_util.tree_unflatten(structure, program.evaluate(*own, points, batch=True))
+
+    return interpreted
 
 
 def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
@@ -50,44 +70,55 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
 
     Infinity where it is not written as a polynomial. The arrays of the model are the parameters.
     """
-    dynamic, static = eqx.partition(model, eqx.is_inexact_array)
-    leaves, structure = jax.tree_util.tree_flatten(dynamic)
-    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
-    closed = jax.make_jaxpr(
-        lambda arrays, x: function(eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static), x)
-    )(shapes, jax.ShapeDtypeStruct((dim,), np.float64))
-    if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
-        return math.inf  # a function that closes over what is being traced
-    try:
+    leaves, form, rebuild = _parts(model)
+
+    def degree() -> float:
+        shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
+        closed = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x))(
+            shapes, jax.ShapeDtypeStruct((dim,), np.float64)
+        )
+        if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
+            return math.inf  # a function that closes over what is being traced
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
             return scalarize(closed, limit=LIMIT).degree(len(leaves))
-    except UnsupportedPrimitive:
-        return math.inf
+
+    found = _known("degree", (function, form, dim), degree)
+    return math.inf if found is None else found
 
 
-_known: dict[Any, tuple[Program, Any]] = {}
-
-KNOWN = 256
-"""Unrolled functions held in memory."""
-
-
-def _unrolled(function: Callable, model: Any, shape: tuple[int, ...]) -> tuple[Program, Any]:
-    """The program, and the structure of its results; the same model, array by array, is unrolled once."""
-    model_key = fingerprint((function, model))
-    key = None if model_key is None else (model_key, shape)
-    if key is not None and key in _known:
-        return _known[key]
-    closed, found = jax.make_jaxpr(lambda x: function(model, x), return_shape=True)(
-        jax.ShapeDtypeStruct(shape, np.float64)
-    )
-    unrolled = scalarize(closed, limit=LIMIT), jax.tree_util.tree_structure(found)
-    if key is not None:
-        while len(_known) >= KNOWN:
-            del _known[next(iter(_known))]
-        _known[key] = unrolled
-    return unrolled
+def _parts(model: Any) -> tuple[list, Any, Callable]:
+    """The parameters of a model, which are real arrays; a key of its form; and how it is put together again."""
+    dynamic, static = eqx.partition(model, _is_parameter)
+    leaves, structure = jax.tree_util.tree_flatten(dynamic)
+    form = fingerprint(static), structure, tuple(np.shape(leaf) for leaf in leaves)
+    return leaves, form, lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
 
 
-@eqx.filter_jit
+def _is_parameter(leaf) -> bool:
+    return eqx.is_inexact_array(leaf) and leaf.dtype == np.float64
+
+
+_unrolled: Latest[Any] = Latest(128)
+
+
+def _known(what: str, key: tuple, find: Callable) -> Any:
+    """What is found for a function and models of one form, once; None where it cannot be unrolled."""
+
+    def found():
+        try:
+            return find()
+        except UnsupportedPrimitive:
+            return None
+
+    _, form, *_ = key
+    return found() if form[0] is None else _unrolled.find((what, key), found)
+
+
+def _by_compiler(function: Callable, model: Any, points: np.ndarray) -> Any:
+    with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+        return jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
+
+
+@program
 def _compiled(function, model, points):
     return jax.vmap(lambda x: function(model, x))(points)

@@ -1,18 +1,59 @@
-"""Results kept for the objects they were found for: systems and methods never change."""
+"""Results kept for what they were found for: systems and methods never change."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, TypeVar
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Any, Generic, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
 
 Found = TypeVar("Found")
 
-KEPT = 128
-"""Results of one function that are held in memory, the latest ones."""
+KEPT = 64
+"""Results of one function that are held in memory, those last used."""
+
+BYTES = 2**28
+"""Largest size of the arrays that they were found for, together."""
+
+
+class Latest(Generic[Found]):
+    """Results by their keys, those last used.
+
+    Parameters
+    ----------
+    kept : int
+        How many.
+    size : int, optional
+        Of all together.
+    """
+
+    def __init__(self, kept: int, size: float = float("inf")):
+        self.kept, self.size = kept, size
+        self._found: OrderedDict[Hashable, tuple[Found, int]] = OrderedDict()
+        self._total, self._lock = 0, threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def find(self, key: Hashable, make: Callable[[], Found], size: int = 0) -> Found:
+        """What is known by a key; made, and kept, where nothing is."""
+        with self._lock:
+            if key in self._found:
+                self._found.move_to_end(key)
+                return self._found[key][0]
+        found = make()
+        with self._lock:
+            if key not in self._found:
+                self._total += size
+            self._found[key] = found, size
+            while len(self._found) > self.kept or (self._total > self.size and len(self._found) > 1):
+                self._total -= self._found.popitem(last=False)[1][1]
+        return found
 
 
 def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
@@ -20,19 +61,16 @@ def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
 
     Objects with leaves that could change in place, as NumPy arrays can, or that are being traced, are not remembered.
     """
-    known: dict[tuple[int, ...], tuple[tuple, Found]] = {}
+    known: Latest[tuple[tuple, Found]] = Latest(KEPT, BYTES)
 
     @functools.wraps(function)
     def call(*arguments) -> Found:
-        key = tuple(map(id, arguments))
-        if key in known:
-            return known[key][1]
-        found = function(*arguments)
-        if not any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(arguments)):
-            while len(known) >= KEPT:
-                del known[next(iter(known))]
-            known[key] = arguments, found  # held on to, so that no other object takes its identity
-        return found
+        leaves = jax.tree_util.tree_leaves(arguments)
+        if any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in leaves):
+            return function(*arguments)
+        size = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
+        # the arguments are held on to, so that no other object takes their identity
+        return known.find(tuple(map(id, arguments)), lambda: (arguments, function(*arguments)), size)[1]
 
     return call
 

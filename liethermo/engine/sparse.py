@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from . import array
 from .linear import Compression, Inverse
+from .programs import program
 from .rounding import with_rounding
 
 LIMIT = 80
@@ -161,12 +161,12 @@ class SparseEngine:
 # -- on the device ----------------------------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
+@program
 def _fixed_point(system: System, method: OneStepMethod, state: array.State, h) -> array.Solved:
     return array.fixed_point(*array.equations(system, method, state, h))
 
 
-@eqx.filter_jit
+@program
 def _conclude(system: System, method: OneStepMethod, state: array.State, h, solved: array.Solved) -> array.State:
     return array.conclude(system, method, state, h, solved)
 
@@ -185,19 +185,19 @@ def _equations(system: System, method: OneStepMethod, state: array.State, h):
     return misfit, guess, scale
 
 
-@eqx.filter_jit
+@program
 def _misfit(system: System, method: OneStepMethod, state: array.State, h, k) -> tuple[Any, Any]:
     misfit, _, scale = _equations(system, method, state, h)
     return misfit(k), scale(k)
 
 
-@eqx.filter_jit
+@program
 def _noise(system: System, x) -> Any:
     """The size at which the misfit is rounded."""
     return jnp.max(with_rounding(lambda x: system.weights(x) * system.vector_field(x), x)[1])
 
 
-@eqx.filter_jit
+@program
 def _better_start(system: System, method: OneStepMethod, state: array.State, h):
     """The predicted slopes, or a step of nothing where that solves the equations better; with misfit and scale."""
     misfit, guess, scale = _equations(system, method, state, h)
@@ -205,13 +205,13 @@ def _better_start(system: System, method: OneStepMethod, state: array.State, h):
     return k, found, scale(k)
 
 
-@eqx.filter_jit
+@program
 def _pushed(system: System, method: OneStepMethod, state: array.State, h, k, seed):
     misfit = _equations(system, method, state, h)[0]
     return jax.jvp(misfit, (k,), (jnp.asarray(seed),))[1]
 
 
-@eqx.filter_jit
+@program
 def _pulled(system: System, method: OneStepMethod, state: array.State, h, k, seed):
     misfit = _equations(system, method, state, h)[0]
     return jax.vjp(misfit, k)[1](jnp.asarray(seed))[0]

@@ -238,8 +238,7 @@ def _projector(gradients: list[Gradients]) -> Callable:
 
 def _seen_on(system: System, C: Energy) -> Energy:
     """A preserved function as one of the state vectors of a system."""
-    C = on_points(C, system.space)
-    check_scalar(C, system.dim, "a preserved function")
+    C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
     return recognised(C, system.dim) if system.space is None else C
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import equinox as eqx
 import numpy as np
 
+from ..engine.programs import program
 from ..errors import InputError
 from ..systems import System
 
@@ -42,10 +42,9 @@ class Reference:
         """States at the times reached, shape (reached, n), the number of field evaluations, a message on failure."""
         from scipy.integrate import solve_ivp
 
-        field = eqx.filter_jit(lambda system, x: system.vector_field(x))
         atol = self.rtol * 1e-2 if self.atol is None else self.atol
         result = solve_ivp(
-            lambda _, x: np.asarray(field(system, x)),
+            lambda _, x: np.asarray(_field(system, x)),
             (times[0], times[-1]),
             x0,
             method=self.scheme,
@@ -61,3 +60,8 @@ class Reference:
 
     def __str__(self) -> str:
         return f"Reference(rtol={self.rtol:g}, scheme={self.scheme})"
+
+
+@program
+def _field(system: System, x):
+    return system.vector_field(x)

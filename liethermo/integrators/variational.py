@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from manifolds.matrix_functions import solve
 
 from ..engine.interpret import polynomial_degree
+from ..engine.programs import program
 from ..errors import InputError
 from ..systems import SimpleClosedSystem, System
 from .base import OneStepMethod
@@ -291,7 +291,7 @@ def _is_symmetric(maps: tuple[FiniteDifference, ...]) -> bool:
     return Counter(maps) == Counter(map.mirrored() for map in maps)
 
 
-@eqx.filter_jit
+@program
 def _misfit(discrete: DiscreteSystem, q0, q1, S0, S1):
     """``h |P_d|``, and the heat and work between which it is one."""
     pair = discrete.pair(q0, q1, S0, S1)
@@ -300,7 +300,7 @@ def _misfit(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.h * jnp.abs(misfit), discrete.h * (heat + jnp.abs(misfit - slope * pair.s)) + 1e-300
 
 
-@eqx.filter_jit
+@program
 def _velocity(system: SimpleClosedSystem, q, S, p, v):
     """v with ``L_v(q, v, S) = p``, near a guess; NaN where Newton's method finds none."""
 
@@ -313,7 +313,7 @@ def _velocity(system: SimpleClosedSystem, q, S, p, v):
     return jnp.where(missed <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
 
 
-@eqx.filter_jit
+@program
 def _energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, before, after):
     def one(x, y):
         (q0, _, S0, t), (q1, _, S1, _) = system.parts(x), system.parts(y)
@@ -323,6 +323,6 @@ def _energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, befo
     return jax.vmap(one)(before, after)
 
 
-@eqx.filter_jit
+@program
 def _regularity(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.regularity_matrix(q0, q1, S0, S1)

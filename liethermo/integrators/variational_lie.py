@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import manifolds as mf
 from manifolds import matrix_functions
 from manifolds.matrix_functions import solve
 
+from ..engine.programs import program
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem, System
 from .base import OneStepMethod
@@ -132,7 +132,7 @@ def _production(system: EulerPoincareClosedSystem, S0, h, y) -> jax.Array:
     return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + jnp.dot(system.friction_force(xi, S), xi)
 
 
-@eqx.filter_jit
+@program
 def _turns(system: EulerPoincareClosedSystem, x, h):
     """``tau(h xi_k)`` of every step, xi_k from the momentum before it."""
 

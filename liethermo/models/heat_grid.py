@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from ..energy import is_traced
 from ..errors import InputError
 from ..systems import ComposedSystem, Copies
 from .parameters import positive, whole
@@ -34,9 +35,13 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
     sizes = _sizes(shape)
     c, k = positive(capacity, "capacity"), positive(conductance, "conductance")
     nodes = math.prod(sizes)
-    return ComposedSystem(
-        Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=float(k) * grid_graph(sizes)
-    )
+    graph = grid_graph(sizes)
+    if is_traced(k):
+        pairs = scipy.sparse.triu(graph).tocoo()
+        conductance = [(i, j, k) for i, j in zip(pairs.row, pairs.col, strict=True)]
+    else:
+        conductance = float(k) * graph
+    return ComposedSystem(Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=conductance)
 
 
 def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:

@@ -6,12 +6,13 @@ import warnings
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
 
 from ..dissipation import KillingDissipation, checked_rate
-from ..energy import Quadratic
+from ..energy import Quadratic, is_traced
 from ..errors import InputError
 from ..systems import LiePoissonSystem
 
@@ -61,10 +62,10 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
 
 def _inertia(inertia) -> np.ndarray | jax.Array:
-    moments = inertia if isinstance(inertia, jax.core.Tracer) else np.asarray(inertia, dtype=np.float64)
+    moments = jnp.asarray(inertia, dtype=jnp.float64) if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
     if moments.shape != (3,):
         raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
-    if not isinstance(moments, jax.core.Tracer) and not (np.all(moments > 0.0) and np.isfinite(moments).all()):
+    if not is_traced(moments) and not (np.all(moments > 0.0) and np.isfinite(moments).all()):
         raise InputError(f"moments of inertia are positive and finite, not {moments.tolist()}")
     if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())

@@ -15,8 +15,9 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar, on_points, recognised
+from ..energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
 from ..engine.interpret import at_points
+from ..engine.traced import settled
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 
@@ -62,19 +63,19 @@ class System(eqx.Module):
 
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
-        self.poisson, self.dim, self.space = poisson, dim, space
-        self.energy = on_points(as_energy(energy, "the energy"), space)
-        self.entropy = None if entropy is None else on_points(as_energy(entropy, "the entropy"), space)
+        self.dim, self.space = dim, space
+        self.poisson = settled(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
+        self.energy = check_scalar(on_points(as_energy(energy, "the energy"), space), dim, "the energy", timed=True)
+        self.entropy = None
+        if entropy is not None:
+            self.entropy = check_scalar(on_points(as_energy(entropy, "the entropy"), space), dim, "the entropy")
         if not isinstance(momentum_maps, Mapping):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
+        roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: on_points(as_energy(J, f"momentum map {name!r}"), space) for name, J in momentum_maps.items()
+            name: check_scalar(on_points(as_energy(J, roles[name]), space), dim, roles[name])
+            for name, J in momentum_maps.items()
         }
-        check_scalar(self.energy, dim, "the energy", timed=True)
-        if self.entropy is not None:
-            check_scalar(self.entropy, dim, "the entropy")
-        for name, J in self.momentum_maps.items():
-            check_scalar(J, dim, f"momentum map {name!r}")
         if space is None:  # in a chart no function is quadratic
             self.energy = recognised(self.energy, dim)
             self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
@@ -87,11 +88,18 @@ class System(eqx.Module):
             raise InputError(f"{type(dissipation).__name__} drives the entropy up, so the system needs an entropy")
         self.dissipation = None
         if dissipation is not None:
-            for L in dissipation.preserve:
-                check_scalar(L, dim, "a preserved function")
-            self.dissipation = dissipation.prepared(self)
-        if validate and not _has_tracers(self):
+            dissipation = traced_energies(dissipation, dim, "a preserved function")
+            self.dissipation = self._traced_dissipation(dissipation.prepared(self))
+        if validate and not is_traced(self):
             self._validate()
+
+    def _traced_dissipation(self, dissipation: Dissipation) -> Dissipation:
+        """The dissipation with its plain functions traced for the arguments that its force gives them."""
+
+        def force(dissipation, x):
+            return dissipation.force(self, x, x, x, (x,) * len(dissipation.preserve))
+
+        return settled(dissipation, force, (self.dim,), is_leaf=lambda part: isinstance(part, Energy))
 
     @property
     def kind(self) -> str:
@@ -277,7 +285,7 @@ class System(eqx.Module):
             claimed |= set(casimirs)
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            kept = [False] * len(others) if _has_tracers(self) else self.conserves(tuple(others.values()))
+            kept = [False] * len(others) if is_traced(self) else self.conserves(tuple(others.values()))
         return frozenset(claimed | {name for name, constant in zip(others, kept, strict=True) if constant})
 
     @property
@@ -451,10 +459,6 @@ def square_field(function: Callable, dim: int, what: str) -> None:
         raise FunctionError(f"{what} could not be evaluated on a state of shape ({dim},): {error}") from error
     if shape != (dim, dim):
         raise FunctionError(f"{what} must return a ({dim}, {dim}) matrix, but it returns shape {shape}")
-
-
-def _has_tracers(tree) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
 
 
 __all__ = ["AXIOM_TOLERANCE", "System", "square_field"]

@@ -12,6 +12,7 @@ import numpy as np
 from ..dissipation import semidefinite
 from ..each import Each
 from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..engine.traced import converted
 from ..errors import InputError
 
 
@@ -41,8 +42,7 @@ class Subsystem(eqx.Module):
         _check_dim(dim)
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
-        check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}")
-        self.energy = recognised(energy, dim)
+        self.energy = recognised(check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
         self.friction = _checked_friction(friction, dim, name or "a subsystem")
 
     @property
@@ -147,9 +147,9 @@ def _checked_friction(friction, dim: int, name: str):
             raise InputError(f"friction of {name} is a coefficient or 'contact', not {friction!r}")
         return friction
     if callable(friction):
-        shape = jax.eval_shape(lambda x: jnp.asarray(friction(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-        if shape not in ((), (n,), (n, n)):
-            raise InputError(f"friction of {name} must return shape (), ({n},) or ({n}, {n}), not {shape}")
+        friction, found = converted(friction, lambda friction, x: jnp.asarray(friction(x)), (dim,))
+        if found.shape not in ((), (n,), (n, n)):
+            raise InputError(f"friction of {name} must return shape (), ({n},) or ({n}, {n}), not {found.shape}")
         return friction
     R = jnp.asarray(friction, dtype=jnp.float64)
     if R.ndim == 0:

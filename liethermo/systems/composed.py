@@ -92,8 +92,7 @@ class ComposedSystem(System):
         structure = mf.ExtendedPhaseSpace(
             tuple(n for body in self.subsystems for n in (body.degrees_of_freedom,) * body.count)
         )
-        energy = self._energy(structure, coupling)
-        check_scalar(energy, structure.dim, "the energy", timed=True)
+        energy = check_scalar(self._energy(structure, coupling), structure.dim, "the energy", timed=True)
         entropy = entropy_component(structure.dim, structure.places.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected)
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)

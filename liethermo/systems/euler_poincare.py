@@ -82,8 +82,8 @@ class EulerPoincareSystem(LiePoissonSystem):
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
     ):
-        self.lagrangian = as_energy(lagrangian, "the Lagrangian")
-        check_scalar(self.lagrangian, algebra.dim, "the Lagrangian", timed=True)
+        energy = as_energy(lagrangian, "the Lagrangian")
+        self.lagrangian = check_scalar(energy, algebra.dim, "the Lagrangian", timed=True)
         if force is not None:
             forced = EulerPoincareForce(force)
             dissipation = forced if dissipation is None else dissipation + forced

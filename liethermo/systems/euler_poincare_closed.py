@@ -15,6 +15,7 @@ from manifolds.matrix_functions import solve
 from ..dissipation import Law, SkewFriction
 from ..energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
 from ..engine.interpret import at_points
+from ..engine.traced import settled
 from ..errors import InputError
 from .base import System
 from .euler_poincare import singular_everywhere
@@ -59,10 +60,11 @@ class EulerPoincareClosedSystem(System):
 
     def __init__(self, algebra: mf.LieAlgebra, lagrangian, friction=None, momentum_maps=(), validate: bool = True):
         n = algebra.dim
-        self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
         check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
+        lagrangian = settled(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         if friction is not None:
-            check_shape(friction, ((n,), ()), (n,), "the friction", "(xi, S)")
+            friction = check_shape(friction, ((n,), ()), (n,), "the friction", "(xi, S)")
+        self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
         structure = OnAlgebra(algebra, lagrangian)
         if not is_traced(lagrangian):
             hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))

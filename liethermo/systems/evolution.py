@@ -94,8 +94,8 @@ class EvolutionSystem(OnContactManifold):
     production_name: ClassVar[str] = "Delta_Q H"
 
     def __init__(self, energy, dim: int, momentum_maps=(), validate: bool = True):
-        energy, structure = as_energy(energy, "the energy"), canonical(dim)
-        check_scalar(energy, dim, "the energy", timed=True)
+        structure = canonical(dim)
+        energy = check_scalar(as_energy(energy, "the energy"), dim, "the energy", timed=True)
         friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim))
         self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
 

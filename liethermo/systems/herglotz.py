@@ -15,6 +15,7 @@ from manifolds.matrix_functions import inverse
 
 from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
 from ..engine.interpret import at_points
+from ..engine.programs import program
 from ..errors import InputError
 from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
 from .euler_poincare import inverse_gradient, singular_everywhere
@@ -49,8 +50,7 @@ class OnVelocities(OnContactManifold):
         if dim is None:
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
         n = degrees_of_freedom(dim)
-        check_scalar(L, dim, "the Lagrangian")
-        self.lagrangian = L = recognised(L, dim)
+        self.lagrangian = L = recognised(check_scalar(L, dim, "the Lagrangian"), dim)
         contact = mf.LagrangianContact(L.value, n)
         _need_regular(contact)
         return mf.Cosymplectic(contact), dim, _energy(L, dim)
@@ -177,7 +177,7 @@ def _hamiltonian(L: Energy, dim: int) -> Energy:
     return LegendreTransform(L)
 
 
-@eqx.filter_jit
+@program
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
     """``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
     dim = L.A.shape[0]

@@ -14,7 +14,7 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, as_energy
+from ..energy import Energy, as_energy, check_scalar
 from ..errors import InputError
 from .base import System
 
@@ -122,7 +122,7 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
     return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._stays(map_))
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
     del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
     found: dict[str, Energy] = {}
@@ -137,11 +137,11 @@ def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) ->
             for i, casimir in enumerate(casimirs):
                 text = str(casimir)
                 name = text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}"
-                found[name] = as_energy(casimir, "a Casimir")
+                found[name] = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
     return found
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
     """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
     found, x = (

@@ -315,5 +315,4 @@ def _force(friction, n: int, what: str) -> Callable | None:
 def _field(function, n: int, shape: tuple[int, ...], what: str) -> Callable:
     """As a function of (q, v, S, t), whose shape has been checked."""
     found = timed(function) if callable(function) else _Constant(jnp.asarray(function, dtype=jnp.float64))
-    check_shape(found, ((n,), (n,), (), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")
-    return found
+    return check_shape(found, ((n,), (n,), (), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")

@@ -13,6 +13,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engine import compiled, step_loop
+from liethermo.engine.remembered import Latest
 from tests.cases import DISSIPATIONS, build, state_of
 
 BODY = lt.models.rigid_body()
@@ -77,7 +78,7 @@ def test_save_every(every):
 def test_newton_on_demand(spelled_out, monkeypatch):
     """Run by Python at first, compiled where steps go on asking for it, in the middle of a save interval too."""
     monkeypatch.setattr(compiled, "SPELLED_OUT", spelled_out)
-    monkeypatch.setattr(compiled, "_steppers", {})
+    monkeypatch.setattr(compiled, "_steppers", Latest(10))
     stiff = lt.models.rigid_body(rate=200.0)
     a, b = both(stiff, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, save_every=3)
     assert b.stats.newton_iterations > 0

@@ -1,12 +1,16 @@
 """The flow as a differentiable function: its derivatives are those of the discrete flow."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.engine import implicit
 
 X0 = jnp.array([0.3, 1.0, 0.2])
 PARAMETERS = jnp.array([10.0, 5.0, 1.0, 1.0])
@@ -80,3 +84,189 @@ def test_a_step_that_cannot_be_solved_gives_nan():
     assert np.isnan(lt.flow(system, [0.3, 1.0, -0.2], (0.0, 500.0), 50.0)).all()
     with pytest.raises(lt.InputError, match="positive"):
         lt.flow(system, X0, (0.0, 1.0), -0.1)
+
+
+# -- parameters in closures ------------------------------------------------------------------------------------------
+
+
+def closed(p, entropy=True):
+    """p stands in closures alone, the energy's and, where there is one, the entropy's and the dissipation's."""
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda x: 0.5 * jnp.sum(x * x / jnp.array([3.0, 2.0, 1.0])) + p[0] * x[0] ** 4,
+        (lambda x: p[1] * x @ x) if entropy else None,
+        lt.ProjectedMetric(cometric=lambda x: p[1] * jnp.eye(3)) if entropy else None,
+        momentum_maps={"square": lambda x: p[0] * x @ x} if not entropy else {},
+    )
+
+
+@pytest.mark.parametrize("entropy", [True, False], ids=["relaxing", "conservative"])
+def test_a_system_that_closes_over_tracers(entropy):
+    """It is built under every transformation, and is what it is with numbers in their place."""
+
+    def speed(p):
+        return closed(p, entropy).vector_field(X0)
+
+    p, d = jnp.array([0.3, 0.5]), jnp.array([1e-4, -2e-4])
+    difference = 0.5 * (speed(p + d) - speed(p - d))
+    for found in (
+        jax.jacfwd(speed)(p) @ d,
+        jax.jacrev(speed)(p) @ d,
+        jax.jit(jax.jacfwd(speed))(p) @ d,
+        0.5 * jnp.array([1.0, -1.0]) @ jax.vmap(speed)(jnp.stack([p + d, p - d])),
+    ):
+        assert np.abs(found - difference).max() < 1e-10
+    seen = []
+    jax.eval_shape(lambda p: seen.append(closed(p, entropy).energy.is_quadratic), p)
+    assert seen == [False]
+
+
+@pytest.mark.parametrize("entropy", [pytest.param(True, marks=pytest.mark.slow), False], ids=["relaxing", "free"])
+def test_derivatives_by_parameters_in_a_closure(entropy):
+    """Outside of jit, backwards; against differences of the flow."""
+
+    def end(p):
+        return lt.flow(closed(p, entropy), X0, (0.0, 0.5), 0.1)[0]
+
+    p, d = jnp.array([0.3, 0.5]), jnp.array([1e-5, -2e-5])
+    difference = 0.5 * (end(p + d) - end(p - d))
+    assert np.abs(jax.grad(end)(p) @ d - difference) < 1e-6 * np.abs(difference)
+
+
+@pytest.mark.slow
+def test_closures_in_a_batch_and_in_jit():
+    def end(p):
+        return lt.flow(closed(p), X0, (0.0, 0.5), 0.1)
+
+    p = jnp.array([[0.3, 0.5], [0.4, 0.6]])
+    alone = jnp.stack([end(p[0]), end(p[1])])
+    assert np.abs(jax.vmap(end)(p) - alone).max() < 1e-15
+    assert np.abs(jax.jit(end)(p[0]) - alone[0]).max() < 1e-15
+
+
+def test_a_body_of_traced_numbers():
+    """In a tuple, as in an array."""
+
+    def rates(build):
+        return jax.jacfwd(lambda p: build(p).vector_field(X0))(10.0)
+
+    one = rates(lambda p: lt.models.rigid_body((p, 5.0, 1.0), p / 10.0))
+    assert np.array_equal(one, rates(lambda p: body(jnp.stack([p, 5.0, 1.0, p / 10.0]))))
+    assert np.abs(one).max() > 0.0
+
+
+MODELS = {
+    "rigid_body": lambda p: lt.models.rigid_body((p, 5.0, 1.0), p),
+    "free_rigid_body": lambda p: lt.models.free_rigid_body((p, 5.0, 1.0)),
+    "damped_oscillator": lambda p: lt.models.damped_oscillator(p, p, p),
+    "gas_piston": lambda p: lt.models.gas_piston(mass=p),
+    "mass_spring_gas": lambda p: lt.models.mass_spring_gas(mass=p, friction=p),
+    "cylinder": lambda p: lt.models.cylinder(mass=p, friction=p, pressure=p, heat_power=p),
+    "heat_grid": lambda p: lt.models.heat_grid((2, 2), p, p),
+    "body_with_wheels": lambda p: lt.models.body_with_wheels((p, 2.0, 1.0), (p, p, p), p),
+    "thermoelastic_chain": lambda p: lt.models.thermoelastic_chain(stiffness=p, conductance=p, gravity=p),
+}
+
+
+HEAVY = ("body_with_wheels", "gas_piston", "cylinder", "mass_spring_gas")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in MODELS]
+)
+def test_models_of_traced_numbers(name):
+    """Every parameter may be a tracer, and the field is the one with the number in its place."""
+    p = 1.2
+    system = MODELS[name](p)
+    x = 0.5 + 0.05 * np.arange(system.dim)
+    expected = system.vector_field(x)
+    traced = jax.jit(lambda p: MODELS[name](p).vector_field(x))(p)
+    assert np.abs(traced - expected).max() < 1e-14 * np.abs(expected).max()
+
+
+# -- derivatives of derivatives --------------------------------------------------------------------------------------
+
+
+def root(p, x):
+    """y with ``y + p sin(y) / 2 = x``, three times over in a loop."""
+
+    def solve(parameters, guess):
+        p, x = parameters
+        return jax.lax.while_loop(lambda c: c[0] < 60, lambda c: (c[0] + 1, x - 0.5 * p * jnp.sin(c[1])), (0, guess))[1]
+
+    def misfit(parameters, y):
+        p, x = parameters
+        return y + 0.5 * p * jnp.sin(y) - x
+
+    return jax.lax.scan(lambda x, _: (implicit.solution(solve, misfit, (p, x), x), None), x[None], length=3)[0][0]
+
+
+def test_implicit_functions_have_derivatives_of_derivatives():
+    """In every combination of modes, through a loop and in a batch."""
+    p, x = 0.7, np.array([0.3, 1.0])
+    y, first, second = x, np.ones(2), np.zeros(2)
+    for _ in range(3):
+        y = np.array([scipy.optimize.brentq(lambda y, x=x: y + 0.5 * p * np.sin(y) - x, -2.0, 2.0) for x in y])
+        slope = 1.0 / (1.0 + 0.5 * p * np.cos(y))
+        first, second = slope * first, 0.5 * p * np.sin(y) * slope**3 * first**2 + slope * second
+    modes = jax.jacfwd, jax.jacrev
+    for outer, inner in itertools.product(modes, modes):
+        found = jax.jit(jax.vmap(lambda x, f=inner(root, 1), g=outer(inner(root, 1), 1): (f(p, x), g(p, x))))(x)
+        assert np.abs(found[0] - first).max() < 1e-12
+        assert np.abs(found[1] - second).max() < 1e-12
+    both = jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]), jax.jit(jax.jacfwd(jax.jacfwd(root, 0), 0))(p, x[0])
+    assert np.abs(both[0] - both[1]) < 1e-12
+
+
+@pytest.mark.slow
+def test_second_derivatives():
+    """In every combination of modes, by state and by a parameter in a closure."""
+
+    def end(y):
+        return lt.flow(closed(jnp.stack([y[3], 0.5])), y[:3], (0.0, 0.3), 0.1)[0]
+
+    y = jnp.append(X0, 0.3)
+    forwards, backwards = jax.jacfwd, jax.jacrev
+    found = [a(b(end))(y) for a in (forwards, backwards) for b in (forwards, backwards)]
+    for hessian in found:
+        assert np.abs(hessian - found[0]).max() < 1e-12 * np.abs(found[0]).max()
+    gradient, size = jax.jit(jax.grad(end)), 1e-5
+    differences = np.stack([(gradient(y + size * e) - gradient(y - size * e)) / (2 * size) for e in np.eye(4)])
+    assert np.abs(differences - found[0]).max() < 1e-8 * np.abs(found[0]).max()
+
+
+# -- loops of unknown length ------------------------------------------------------------------------------------------
+
+
+def looping(p):
+    """``p**3 x_0^2 / 2 + cos(x_1)``, by a loop of unknown length."""
+
+    def energy(x):
+        tripled = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * p), (0, 0.5 * x[0] ** 2))[1]
+        return tripled + jnp.cos(x[1])
+
+    return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
+
+
+def unrolled(p):
+    energy = lambda x: 0.5 * p**3 * x[0] ** 2 + jnp.cos(x[1])  # noqa: E731
+    return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
+
+
+def test_a_loop_of_unknown_length_in_an_energy():
+    """It has no derivative backwards in JAX; here its derivatives are taken forwards, whatever is asked for."""
+    modes = jax.jacfwd, jax.jacrev
+    for derivative in (lambda f: f, *modes, *(lambda f, a=a, b=b: a(b(f)) for a in modes for b in modes)):
+        a, b = (derivative(lambda p, build=build: build(p).vector_field(X0))(1.2) for build in (looping, unrolled))
+        assert np.abs(a - b).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_a_flow_with_a_loop_of_unknown_length():
+    a, b = (
+        jax.value_and_grad(lambda p, build=build: lt.flow(build(p), X0, (0.0, 0.3), 0.1)[0])(1.2)
+        for build in (looping, unrolled)
+    )
+    assert np.abs(np.subtract(a, b)).max() < 1e-13
+    solution = lt.integrate(looping(1.2), X0, (0.0, 0.3), 0.1, engine="array")
+    assert np.abs(solution.x[-1, 0] - a[0]) < 1e-14

@@ -1,0 +1,104 @@
+"""Solutions of equations as functions of what the equations depend on, with derivatives of any order in both modes.
+
+A primitive of its own: of ``jax.custom_jvp`` and ``jax.lax.custom_root``, a ``lax.scan`` that is differentiated
+backwards forgets the rule (jax 0.10), so that the second derivative meets the loop inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from manifolds import matrix_functions
+
+
+def solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
+    """The k with ``misfit(parameters, k) = 0`` that ``solve(parameters, guess)`` finds.
+
+    Its derivative is ``-(D_k misfit)^-1 D misfit``, whatever ``solve`` does. Neither function may close over tracers.
+
+    Parameters
+    ----------
+    solve, misfit : function
+    parameters : pytree of arrays
+    guess : array, of the shape of k
+    """
+    leaves, structure = jax.tree_util.tree_flatten(parameters)
+    return _solution.bind(*leaves, guess, solve=solve, misfit=misfit, structure=structure, axes=())
+
+
+_solution = Primitive("solution")
+
+
+def _found(*arguments, solve: Callable, misfit: Callable, structure, axes: tuple) -> jax.Array:
+    """``axes`` has those of the arguments for each ``vmap`` that the primitive is under, the innermost first."""
+    del misfit
+
+    def one(*arguments):
+        *leaves, guess = arguments
+        return solve(jax.tree_util.tree_unflatten(structure, leaves), guess)
+
+    return _mapped(one, axes)(*arguments)
+
+
+def _mapped(function: Callable, axes: Sequence[tuple]) -> Callable:
+    for level in axes:
+        function = jax.vmap(function, in_axes=level)
+    return function
+
+
+def _shape(*arguments, axes: tuple, **_):
+    shape, guess = arguments[-1].shape, arguments[-1]
+    sizes = []
+    for level in reversed(axes):
+        sizes.append(next(a.shape[axis] for a, axis in zip(arguments, level, strict=True) if axis is not None))
+        arguments = tuple(_without(a, axis) for a, axis in zip(arguments, level, strict=True))
+        shape = arguments[-1].shape
+    return jax.core.ShapedArray((*sizes, *shape), guess.dtype)
+
+
+def _without(a, axis: int | None):
+    """The shape that a function under ``vmap`` sees."""
+    if axis is None:
+        return a
+    return jax.ShapeDtypeStruct(a.shape[:axis] + a.shape[axis + 1 :], a.dtype)
+
+
+def _batched(arguments, dims, *, axes: tuple, **rest):
+    return _solution.bind(*arguments, axes=(*axes, tuple(dims)), **rest), 0
+
+
+def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **rest):
+    k = _solution.bind(*primals, misfit=misfit, structure=structure, axes=axes, **rest)
+    moving = [i for i, tangent in enumerate(tangents[:-1]) if type(tangent) is not ad.Zero]
+    if not moving:
+        return k, ad.Zero.from_primal_value(k)
+    leaves, dots = primals[:-1], [tangents[i] for i in moving]
+
+    def one(k, *given):
+        leaves, dots = list(given[: -len(moving)]), given[-len(moving) :]
+
+        def of_moving(*values):
+            whole = list(leaves)
+            for i, value in zip(moving, values, strict=True):
+                whole[i] = value
+            return misfit(jax.tree_util.tree_unflatten(structure, whole), k)
+
+        moved = jax.jvp(of_moving, tuple(leaves[i] for i in moving), tuple(dots))[1]
+        matrix = jax.jacfwd(lambda k: misfit(jax.tree_util.tree_unflatten(structure, leaves), k))(k)
+        step = matrix_functions.solve(matrix.reshape(k.size, k.size), moved.reshape(-1, 1))
+        return -step.reshape(k.shape)
+
+    levels = [(0, *level[:-1], *(level[i] for i in moving)) for level in axes]
+    return k, _mapped(one, levels)(k, *leaves, *dots)
+
+
+_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _found(*a, **rest))(*arguments))
+_solution.def_abstract_eval(_shape)
+batching.primitive_batchers[_solution] = _batched
+ad.primitive_jvps[_solution] = _tangent
+mlir.register_lowering(_solution, mlir.lower_fun(_found, multiple_results=False))

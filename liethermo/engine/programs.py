@@ -1,0 +1,50 @@
+"""Programs that XLA compiles, found again by what they do, and unloaded when too many others have been used since.
+
+One takes some hundred memory maps of the 65,530 that Linux grants a process, and ``jax.jit`` keeps thousands.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .remembered import Latest
+
+KEPT = 48
+"""Programs held in memory, those last used: of 500 maps each at most."""
+
+Function = TypeVar("Function", bound=Callable)
+
+_programs: Latest[Callable] = Latest(KEPT)
+
+
+def program(function: Function) -> Function:
+    """Decorator: compile a function of pytrees, arrays being its arguments and all else a part of the program."""
+
+    @functools.wraps(function)
+    def call(*arguments):
+        leaves, structure = jax.tree_util.tree_flatten(arguments)
+        dynamic = tuple(leaf if eqx.is_array(leaf) else None for leaf in leaves)
+        static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+        shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
+        key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
+        return _programs.find(key, lambda: jax.jit(_Whole(function, structure, static)))(dynamic)
+
+    return call  # type: ignore[return-value]
+
+
+class _Whole:
+    """A function of the arrays among its arguments alone."""
+
+    def __init__(self, function: Callable, structure, static: tuple):
+        self.function, self.structure, self.static = function, structure, static
+        self.__name__ = function.__name__
+
+    def __call__(self, dynamic: tuple):
+        leaves = [d if s is None else s for d, s in zip(dynamic, self.static, strict=True)]
+        return self.function(*jax.tree_util.tree_unflatten(self.structure, leaves))

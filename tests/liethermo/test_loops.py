@@ -1,0 +1,191 @@
+"""A study in an ordinary loop: closures made anew find what was compiled for those before, and nothing piles up."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engine import programs, traced
+from liethermo.engine.remembered import Latest
+
+COMMON = """
+import resource, sys, time
+import jax.numpy as jnp, numpy as np
+import liethermo as lt, manifolds as mf
+
+def maps():
+    return sum(1 for _ in open("/proc/self/maps"))
+
+def memory():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+def build(k):
+    weights = np.array([1.0, 0.5, 0.1 + 0.1 * k])
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(weights * p * p) + k * p[0] ** 4,
+        lambda p: 0.5 * k * p @ p,
+        lt.ProjectedMetric(cometric=lambda p: jnp.eye(3) * (1.0 + k * p[1] ** 2)),
+        momentum_maps={"nothing": lambda p: 0.0 * k * p[0]},
+    )
+
+def canonical(k):
+    return lt.MetriplecticSystem(
+        lambda x: k * jnp.array([[0.0, 1.0], [-1.0, 0.0]]), lambda x: k * (x @ x) + jnp.cos(k * x[0]), dim=2
+    )
+
+def one_pass(i, everything):
+    k = 1.0 + 1e-4 * i
+    x, span, system = [0.3, 1.0, 0.2], (0.0, 0.3), build(k)
+    lt.integrate(system, x, span, 0.1, engine="compiled")
+    lt.flow(system, x, span, 0.1)
+    if everything:
+        free = lt.LiePoissonSystem(mf.so(3), lambda p: k * jnp.cos(p[0]) + p[1] ** 2)
+        lt.integrate(free, x, span, 0.1, lt.MetriplecticGauss(1, preserve=lambda p: k * p @ p), engine="compiled")
+        lt.integrate(system, x, span, 0.1, engine="array")
+        lt.ensemble(system, np.eye(3), span, 0.1)
+        lt.integrate(canonical(k), [0.3, 1.0], span, 0.1, engine="array")
+
+passes, everything = int(sys.argv[1]), sys.argv[2] == "all"
+one_pass(0, everything)
+one_pass(1, everything)
+"""
+
+LOOP = """
+before = maps(), memory()
+started = time.process_time()
+for i in range(2, passes):
+    one_pass(i, everything)
+print(maps() - before[0], memory() - before[1], (time.process_time() - started) / (passes - 2))
+"""
+
+
+def looped(passes: int, what: str) -> tuple[float, ...]:
+    done = subprocess.run([sys.executable, "-c", COMMON + LOOP, str(passes), what], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return tuple(map(float, done.stdout.split()))
+
+
+def test_a_loop_compiles_once_and_keeps_nothing():
+    """It was some 400 memory maps a pass, of the 65,530 that a process can have, and five seconds."""
+    maps, megabytes, each = looped(60, "some")
+    assert maps < 100
+    assert megabytes < 40
+    assert each < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("passes", "what"), [(300, "all"), (10_000, "some")])
+def test_long_loops(passes, what):
+    maps, megabytes, each = looped(passes, what)
+    assert maps < 300
+    assert megabytes < 200
+    assert each < 0.6
+
+
+# -- programs by content ----------------------------------------------------------------------------------------------
+
+STATE = jax.ShapeDtypeStruct((3,), jnp.float64)
+X = jnp.array([0.3, 1.0, 0.2])
+
+
+def function(a, weights, count=3, shift=0.0):
+    """With everything that a number can hide in."""
+    weights = np.asarray(weights)
+
+    def inner(c, w):
+        return a * c + w, c
+
+    def f(x):
+        looped = jax.lax.scan(inner, x[0], weights * x)[0] + jax.lax.fori_loop(0, count, lambda i, y: y * a, x[1])
+        chosen = jax.lax.cond(x[0] > a, lambda y: y * a, lambda y: y / (a + 2.0), x[2])
+        jitted = jax.jit(lambda y: jnp.sum(weights * y**2) / a)(x) + jax.nn.softplus(a * x[0]) + jnp.sinc(x[1])
+        places = x[jnp.asarray([0, 2])].sum() + x[(jnp.asarray(weights) * 0 + 1.0).astype(int)].sum()
+        return looped + chosen + jitted + places + jnp.where(x[0] > shift, x[0] ** 1.3, 0.0)
+
+    return f
+
+
+def test_other_numbers_are_other_arguments():
+    one, two = (traced.traced(function(a, w), STATE) for a, w in ((0.3, [1.0, 2.0, 3.0]), (0.4, [0.5, 2.5, 1.5])))
+    assert one.content is two.content
+    assert jax.tree_util.tree_structure(one) == jax.tree_util.tree_structure(two)
+    for f, g in ((function(0.3, [1.0, 2.0, 3.0]), one), (function(0.4, [0.5, 2.5, 1.5]), two)):
+        for derivative in (lambda f: f, jax.grad, jax.hessian):
+            assert np.abs(derivative(f)(X) - derivative(g)(X)).max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        function(0.3, [1.0, 2.0, 3.0], count=4),
+        lambda x: function(0.3, [1.0, 2.0, 3.0])(x) + x[0],
+        lambda x: function(0.3, [1.0, 2.0, 3.0])(x[::-1]),
+    ],
+    ids=["another count", "another operation", "another order"],
+)
+def test_other_operations_are_other_programs(other):
+    assert traced.traced(function(0.3, [1.0, 2.0, 3.0]), STATE).content is not traced.traced(other, STATE).content
+
+
+def test_integers_and_truths_belong_to_the_operations():
+    """They decide on indices and branches, so a program for others would be wrong."""
+
+    def of(a):
+        return lambda x: jnp.where(jnp.asarray(a) > 0.5, x[jnp.asarray(a).astype(int)], jnp.sin(x[0]))
+
+    contents = [traced.traced(of(a), STATE) for a in (0.2, 0.3, 0.7, 1.2)]
+    assert contents[0].content is contents[1].content
+    assert len({id(f.content) for f in contents}) == 3
+    for a, f in zip((0.2, 0.3, 0.7, 1.2), contents, strict=True):
+        assert f(X) == of(a)(X)
+
+
+def test_a_traced_function_says_what_it_takes():
+    with pytest.raises(lt.LiethermoError, match="shapes"):
+        traced.traced(function(0.3, [1.0, 2.0, 3.0]), STATE)(jnp.ones(4))
+
+
+def test_what_was_compiled_is_unloaded(monkeypatch):
+    """Programs that do differ: a bounded number is kept."""
+    monkeypatch.setattr(programs, "_programs", Latest(2))
+
+    @programs.program
+    def power(x, n: int):
+        return x**n
+
+    def maps():
+        with open("/proc/self/maps") as file:
+            return sum(1 for _ in file)
+
+    assert [float(power(jnp.asarray(2.0), n)) for n in range(3, 6)] == [8.0, 16.0, 32.0]
+    before = maps()
+    assert [float(power(jnp.asarray(2.0), n)) for n in range(6, 26)] == [2.0**n for n in range(6, 26)]
+    assert maps() - before < 20
+    assert len(programs._programs) == 2
+
+
+def test_a_family_built_by_a_new_function_each_time():
+    def run(k):
+        def family(rate):
+            return lt.LiePoissonSystem(
+                mf.so(3), lambda p: k * jnp.sum(p**2 * jnp.array([1.0, 2.0, 3.0])), lt.Quadratic(np.ones(3)),
+                lt.KillingDissipation(rate),
+            )  # fmt: skip
+
+        rates = np.array([0.5, 1.0])
+        together = lt.ensemble(family, X, (0.0, 1.0), 0.1, parameters=rates, engine="compiled").x
+        alone = [lt.integrate(family(r), X, (0.0, 1.0), 0.1, engine="compiled").x[-1] for r in rates]
+        assert np.abs(together - alone).max() < 1e-14
+
+    from liethermo.engine import compiled
+
+    run(0.5)
+    before = len(compiled._steppers)
+    run(0.6)
+    assert len(compiled._steppers) == before
