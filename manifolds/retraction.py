@@ -430,10 +430,10 @@ class MidpointRetraction(Retraction):
 _BY_NAME: dict[str, Callable[[Space], Retraction]] = {
     "midpoint": lambda space: MidpointRetraction(RiemannianRetraction(space)),
     "exp": RiemannianRetraction,
-    "projection": ProjectionRetraction,
     "euclidean": EuclideanRetraction,
     "group_exp": GroupRetraction,
     "cayley": CayleyRetraction,
+    "projection": ProjectionRetraction,
     "midpoint_euclidean": lambda space: MidpointRetraction(EuclideanRetraction(space)),
     "midpoint_group_exp": lambda space: MidpointRetraction(GroupRetraction(space)),
     "midpoint_cayley": lambda space: MidpointRetraction(CayleyRetraction(space)),

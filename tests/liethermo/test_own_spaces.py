@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+import manifolds as mf
 from tests.manifolds.test_own_spaces import MINE, Ellipsoid
 
 
@@ -23,13 +24,21 @@ def on_the_group():
     )
 
 
+def test_a_system_on_a_group_of_ones_own():
+    """The group stands for its space, and the axioms hold at random elements of it."""
+    system = on_the_group()
+    assert system.space == mf.GroupSpace(MINE)
+    assert system.check().passed
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "retraction"),
     [
         (lt.MetriplecticGauss, "cayley"),
-        pytest.param(lt.MetriplecticGauss, None, marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticMidpoint, None, marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticMidpoint, "midpoint_cayley", marks=pytest.mark.slow),
+        (lt.MetriplecticGauss, None),
+        (lt.MetriplecticMidpoint, None),
+        (lt.MetriplecticMidpoint, "midpoint_cayley"),
     ],
 )
 def test_a_group_of_ones_own_keeps_the_laws(method, retraction):
