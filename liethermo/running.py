@@ -389,7 +389,7 @@ def as_run(system: System, method) -> tuple[System, Any]:
     """The system and the method as they are run: with attitudes where there is a group, in charts on a manifold."""
     if not isinstance(method, OneStepMethod):
         return system, method
-    method = traced_energies(method.on(system), system.dim, "a preserved function")
+    method = traced_energies(method.on(system), system.dim)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method
