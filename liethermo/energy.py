@@ -590,15 +590,23 @@ def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> En
     return energy
 
 
-def traced_energies(tree, dim: int, role: str):
-    """A pytree with the energies in it checked as :func:`check_scalar` does; one that occurs twice stays one object."""
+def traced_energies(tree, dim: int, role: str | None = None):
+    """A pytree with the energies in it checked as :func:`check_scalar` does; one that occurs twice stays one object.
+
+    Without a role, those that are no functions of a state are left as they are.
+    """
     found: dict[int, Energy] = {}
 
     def checked(part):
         if not isinstance(part, Energy):
             return part
         if id(part) not in found:
-            found[id(part)] = check_scalar(part, dim, role)
+            try:
+                found[id(part)] = check_scalar(part, dim, role or "a function")
+            except (FunctionError, InputError):
+                if role is not None:
+                    raise
+                found[id(part)] = part
         return found[id(part)]
 
     return jax.tree_util.tree_map(checked, tree, is_leaf=lambda part: isinstance(part, Energy))

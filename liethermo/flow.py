@@ -27,8 +27,10 @@ def flow(
 
     The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations:
     the stage equations ``k = slopes(x, k)`` define k, and their linearisation its derivative (implicit function
-    theorem), exactly for the discrete flow. Use it under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``:
-    the parameters are the arrays among the leaves of the system, or whatever a function builds it from.
+    theorem), exactly for the discrete flow. Use it under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``,
+    and derivatives of derivatives: the parameters are the arrays among the leaves of the system, or whatever a function
+    builds it from, those that its functions close over among them. By itself it runs a compiled program, which is found
+    again for other numbers.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def flow(
     n, system = system.dim, driven(system)
     x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
     method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
-    method = traced_energies(method, system.dim, "a preserved function")
+    method = traced_energies(method, system.dim)
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])
     path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))[:, :n]

@@ -455,7 +455,7 @@ def as_run(system: System, method) -> tuple[System, Any]:
     if not isinstance(method, OneStepMethod):
         return driven(system, unit=1.0), method  # its errors are measured component by component
     system = driven(system)
-    method = traced_energies(method.pulled(system).on(system), system.dim, "a preserved function")
+    method = traced_energies(method.pulled(system).on(system), system.dim)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method

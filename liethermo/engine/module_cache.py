@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+from .scalarize import UnsupportedPrimitive
+
 
 def cache_folder() -> Path:
     """Where compiled modules are kept: ``$LIETHERMO_CACHE``, or a folder under the user's cache directory."""
@@ -22,6 +24,7 @@ def cache_folder() -> Path:
 def load(text: str, try_out: Callable[[ModuleType], None]) -> ModuleType:
     """The module with this text, compiled by ``try_out`` or found so on disk; from memory alone where that fails."""
     name = "liethermo_step_" + hashlib.sha256(text.encode()).hexdigest()[:24]
+    _count(name)
     try:
         module = _imported(name, _written(name, text.replace("CACHE", "True")))
         try_out(module)
@@ -35,6 +38,30 @@ def load(text: str, try_out: Callable[[ModuleType], None]) -> ModuleType:
     exec(compile(text.replace("CACHE", "False"), f"<{name}>", "exec"), module.__dict__)
     try_out(module)  # an error that is not the disk's shows here
     return module
+
+
+MOST_MODULES = 2_500
+"""Modules that a process may have: numba never unloads one, each takes ten memory maps and more, and there are 65,530.
+"""
+
+_names: set[str] = set()
+
+
+def _count(name: str) -> None:
+    if name not in _names and len(_names) >= MOST_MODULES:
+        raise TooManyModulesError(len(_names))
+    _names.add(name)
+
+
+class TooManyModulesError(UnsupportedPrimitive):
+    """A process that has compiled so many different programs that no more can be loaded safely."""
+
+    def __init__(self, count: int):
+        super().__init__("", "")
+        self.args = (
+            f"this process holds {count} modules of machine code, which cannot be unloaded, and another might exhaust "
+            "its memory maps: run systems of so many kinds in several processes, or with engine='array'",
+        )
 
 
 def _written(name: str, text: str) -> Path:

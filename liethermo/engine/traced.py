@@ -174,6 +174,9 @@ def is_plain(leaf) -> bool:
 def converted(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> tuple[Any, Any]:
     """A pytree with its plain functions traced, and the shapes of what ``use`` returned.
 
+    Plain numbers among its leaves, such as those of an ``equinox.Module`` that is used as a function, become arrays,
+    unless Python has to see their values.
+
     Parameters
     ----------
     tree : pytree
@@ -185,19 +188,38 @@ def converted(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Calla
         Of parts to be left alone.
     """
     leaves, structure = jax.tree_util.tree_flatten(tree, is_leaf=is_leaf)
+    if any(type(leaf) is float for leaf in leaves):
+        try:
+            return _watched(leaves, structure, use, shapes, float)
+        except (TypeError, ValueError, AttributeError):  # what is wrong without arrays too, shows below
+            pass
+    return _watched(leaves, structure, use, shapes, None)
+
+
+def _watched(leaves: list, structure, use: Callable, shapes, number: type | None) -> tuple[Any, Any]:
+    """What ``use`` makes of leaves, those of one type of number being arrays, and of functions that are watched."""
     recorders = {id(leaf): _Recorder(leaf) for leaf in leaves if is_plain(leaf)}
-    watched = jax.tree_util.tree_unflatten(structure, [recorders.get(id(leaf), leaf) for leaf in leaves])
-    arguments = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    found = jax.eval_shape(lambda *a: use(watched, *a), *arguments)
-    if not recorders:
-        return tree, found
+    moved = [i for i, leaf in enumerate(leaves) if type(leaf) is number]
+
+    def used(numbers, *arguments):
+        watched = [recorders.get(id(leaf), leaf) for leaf in leaves]
+        for i, value in zip(moved, numbers, strict=True):
+            watched[i] = value
+        return use(jax.tree_util.tree_unflatten(structure, watched), *arguments)
+
+    scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
+    found = jax.eval_shape(used, [scalar for _ in moved], *arguments)
     results = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
+    with jax.ensure_compile_time_eval():
+        for i in moved:
+            results[i] = jnp.asarray(np.float64(leaves[i]))
     return jax.tree_util.tree_unflatten(structure, results), found
 
 
 def settled(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
-    """As :func:`converted`, the pytree alone; nothing is traced where it has no plain functions."""
-    if not any(map(is_plain, jax.tree_util.tree_leaves(tree, is_leaf=is_leaf))):
+    """As :func:`converted`, the pytree alone; nothing is traced where there is nothing to convert."""
+    leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
+    if not any(is_plain(leaf) or type(leaf) is float for leaf in leaves):
         return tree
     return converted(tree, use, *shapes, is_leaf=is_leaf)[0]
 
@@ -206,18 +228,18 @@ class _Recorder:
     """A plain function in use, traced for the arguments that it is first called with."""
 
     def __init__(self, function: Callable):
-        self.function = function
-        self.__name__ = getattr(function, "__name__", type(function).__name__)
+        self.function, self.__name__ = function, getattr(function, "__name__", type(function).__name__)
         self._found: dict[tuple, Traced] = {}
+        self._otherwise = False
 
     @property
     def result(self) -> Callable:
         """The traced function, or the function itself where it is called in more than one way, or not at all."""
-        return next(iter(self._found.values())) if len(self._found) == 1 else self.function
+        return next(iter(self._found.values())) if len(self._found) == 1 and not self._otherwise else self.function
 
     def __call__(self, *arguments, **named):
         if named or not all(isinstance(a, jax.Array) for a in arguments):
-            self._found[object()] = self._found[object()] = None  # type: ignore[index, assignment]
+            self._otherwise = True
             return self.function(*arguments, **named)
         key = tuple((a.shape, a.dtype) for a in arguments)
         if key not in self._found:
@@ -405,7 +427,7 @@ class _Body:
 
 def _evaluated(eqn: JaxprEqn, values: Sequence) -> list:
     inputs = [Var(a.aval) for a in eqn.invars]
-    jaxpr = Jaxpr([], inputs, eqn.outvars, [eqn.replace(invars=inputs)], debug_info=DebugInfo("", "", None, None))
+    jaxpr = Jaxpr([], inputs, eqn.outvars, [eqn.replace(invars=list(inputs))], debug_info=DebugInfo("", "", None, None))
     with jax.ensure_compile_time_eval():
         return jaxpr_as_fun(ClosedJaxpr(jaxpr, []))(*values)
 
@@ -470,7 +492,7 @@ def _key_of_jaxpr(jaxpr: Jaxpr) -> Hashable:
     def name(atom) -> Hashable:
         return _key(atom) if isinstance(atom, Literal) else numbering.setdefault(atom, len(numbering))
 
-    front = tuple((name(v), v.aval.shape, v.aval.dtype) for v in (*jaxpr.constvars, *jaxpr.invars))
+    front = tuple((name(v), str(v.aval)) for v in (*jaxpr.constvars, *jaxpr.invars))
     body = tuple(
         (
             eqn.primitive,

@@ -36,12 +36,9 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
     c, k = positive(capacity, "capacity"), positive(conductance, "conductance")
     nodes = math.prod(sizes)
     graph = grid_graph(sizes)
-    if is_traced(k):
-        pairs = scipy.sparse.triu(graph).tocoo()
-        conductance = [(i, j, k) for i, j in zip(pairs.row, pairs.col, strict=True)]
-    else:
-        conductance = float(k) * graph
-    return ComposedSystem(Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=conductance)
+    pairs = zip(*scipy.sparse.triu(graph).nonzero(), strict=True)
+    edges = [(i, j, k) for i, j in pairs] if is_traced(k) else float(k) * graph
+    return ComposedSystem(Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=edges)
 
 
 def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:

@@ -211,9 +211,12 @@ def test_implicit_functions_have_derivatives_of_derivatives():
         first, second = slope * first, 0.5 * p * np.sin(y) * slope**3 * first**2 + slope * second
     modes = jax.jacfwd, jax.jacrev
     for outer, inner in itertools.product(modes, modes):
-        found = jax.jit(jax.vmap(lambda x, f=inner(root, 1), g=outer(inner(root, 1), 1): (f(p, x), g(p, x))))(x)
+        slopes = inner(root, 1)
+        found = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
         assert np.abs(found[0] - first).max() < 1e-12
         assert np.abs(found[1] - second).max() < 1e-12
+    by_guess = jax.grad(lambda guess: implicit.solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
+    assert by_guess == 0.0
     both = jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]), jax.jit(jax.jacfwd(jax.jacfwd(root, 0), 0))(p, x[0])
     assert np.abs(both[0] - both[1]) < 1e-12
 
