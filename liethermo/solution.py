@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
 
 VARIABLES = ("time", "x", "energy", "entropy", "attitude", "invariant_name", "invariant")
-ATTRIBUTES = ("format", "times", "status", "stats", "laws", "provenance", "event_time", "sha256")
+ATTRIBUTES = ("format", "times", "status", "stats", "laws", "evidence", "provenance", "event_time", "sha256")
 """What a file has."""
 
 
@@ -338,7 +338,7 @@ def _checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -
     found = hashlib.sha256()
     for name in sorted(series):
         values = np.asarray(series[name])
-        text = values.dtype.kind in "OUS"
+        text = values.dtype.kind in "OUS" or not values.size  # of a file an empty list of names has another type
         kind = "text" if text else values.dtype.newbyteorder("<").str
         found.update(json.dumps([name, kind, values.shape]).encode())
         found.update(json.dumps(values.tolist()).encode() if text else values.astype(kind, order="C").tobytes())
