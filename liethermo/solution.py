@@ -273,7 +273,7 @@ def load(path: str | os.PathLike) -> Solution:
     Warns
     -----
     UserWarning
-        If the file is one of version 0.1, which has no checksum: damage may show in nothing.
+        If an earlier version wrote the file, without a checksum: damage may show in nothing.
     """
     path = Path(path)
     if not path.is_file():
@@ -289,7 +289,7 @@ def load(path: str | os.PathLike) -> Solution:
             f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
         )
     if attributes["format"] in WITHOUT_CHECKSUM:
-        warnings.warn(f"{path} has no checksum, as it was written by version 0.1: damage would not show", stacklevel=2)
+        warnings.warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show", stacklevel=2)
     elif attributes.get("sha256") != _checksum(series, attributes):
         raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     try:
@@ -338,10 +338,12 @@ def _checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -
     found = hashlib.sha256()
     for name in sorted(series):
         values = np.asarray(series[name])
-        text = values.dtype.kind in "OUS" or not values.size  # of a file an empty list of names has another type
-        kind = "text" if text else values.dtype.newbyteorder("<").str
+        text = values.dtype.kind in "OUS"
+        kind = "text" if text or not values.size else values.dtype.newbyteorder("<").str
         found.update(json.dumps([name, kind, values.shape]).encode())
-        found.update(json.dumps(values.tolist()).encode() if text else values.astype(kind, order="C").tobytes())
+        found.update(
+            json.dumps(values.tolist()).encode() if kind == "text" else values.astype(kind, order="C").tobytes()
+        )
     said = [[name, str(attributes[name])] for name in ATTRIBUTES[:-1] if name in attributes]
     found.update(json.dumps(said).encode())
     return found.hexdigest()

@@ -129,7 +129,9 @@ def noise_of(system: System, x) -> jax.Array:
     return jnp.max(with_rounding(system.vector_field, x)[1])
 
 
-def solve_stages(slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable, noise: Callable) -> Solved:
+def solve_stages(
+    slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable, noise: Callable = lambda: jnp.zeros(())
+) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``.
 
     ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``, and

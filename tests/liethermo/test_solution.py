@@ -98,7 +98,7 @@ def test_a_changed_number_and_a_changed_word(solution, tmp_path):
             lt.load(path)
 
 
-def test_a_file_of_version_0_1(solution, tmp_path):
+def test_a_file_of_an_earlier_version(solution, tmp_path):
     """It has no checksum, loads, and says so."""
     import h5py
 
