@@ -104,7 +104,10 @@ class Audit:
         to keep; NaN where there is none.
     worst_residual : float
     passed : bool
-        Whether no row fails. That of the accuracy does where the steps do not resolve the motion.
+        Whether the laws hold along the motion of the system. How accurate the steps are is another question: see
+        ``verdict``, and ``resolved``.
+    resolved : bool or None
+        Whether the steps resolve the motion; None where the method has no estimate of its error.
     rows : tuple of AuditRow
     """
 
@@ -116,7 +119,11 @@ class Audit:
 
     @property
     def passed(self) -> bool:
-        return all(row.passed is not False for row in self.rows)
+        return all(row.passed is not False for row in self.rows if row.law != ACCURACY)
+
+    @property
+    def resolved(self) -> bool | None:
+        return next((row.passed for row in self.rows if row.law == ACCURACY), None)
 
     @property
     def verdict(self) -> str:
@@ -126,10 +133,11 @@ class Audit:
             return LAW_FAILS
         if CONSISTENCY in failing:
             return "the laws hold, but THIS IS NOT THE MOTION of the system"
-        if ACCURACY in failing:
-            return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
-        resolved = any(row.law == ACCURACY and row.passed for row in self.rows)
-        return "the laws hold, and the steps resolve the motion" if resolved else "the laws hold"
+        if self.resolved is None:
+            return "the laws hold"
+        if self.resolved:
+            return "the laws hold, and the steps resolve the motion"
+        return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __str__(self) -> str:
         width = max(len(row.law) for row in self.rows)

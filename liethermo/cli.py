@@ -29,8 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Integrate systems that obey the two laws of thermodynamics, and see that they do.",
-    epilog="Exit status: 0 where all laws hold, 1 where one fails, the steps do not resolve the motion, or the run "
-    "stopped early, 2 for a bad spec or file.",
+    epilog="Exit status: 0 where all laws hold, 1 where one fails or the run stopped early, 2 for a bad spec or file.",
 )
 SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, described in TOML.")]
 

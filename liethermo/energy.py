@@ -343,7 +343,8 @@ class Pullback(Energy):
         return self.term.value(self.of(x))
 
     def sensitivity(self, x) -> jax.Array:
-        return self.term.sensitivity(self.of(x)) if self.function is None else super().sensitivity(x)
+        own = self.function is None or isinstance(self.term, WithTime)  # no more than a choice of components, in units
+        return self.term.sensitivity(self.of(x)) if own else super().sensitivity(x)
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         low = jnp.zeros_like(x) + low

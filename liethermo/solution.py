@@ -193,7 +193,7 @@ class Solution:
 
         Parameters
         ----------
-        energy, entropy, casimirs, residual, accuracy, consistency : float
+        energy, entropy, casimirs, residual, attitude, accuracy, consistency : float
             What is accepted: see :class:`liethermo.audit.Tolerances`.
 
         Raises

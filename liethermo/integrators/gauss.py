@@ -164,9 +164,10 @@ class MetriplecticGauss(GaussMethod):
             return system.poisson.sharp(u, dH)
         gradients = [known[name] for name in functions]
         if functions.keys() <= {ENTROPY, *system.casimirs()}:
-            off = _projector(gradients)
+            off = _projector(system, u, gradients)
             return off(system.poisson.sharp(u, off(dH)))
-        return _projector([Gradients(dH, system.energy.gradient(u)), *gradients])(system.poisson.sharp(u, dH))
+        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
+        return off(system.poisson.sharp(u, dH))
 
     def _force(self, part: Dissipation, own: tuple[str, ...], system: System, u, dH, dS, known) -> jax.Array:
         """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions."""
@@ -182,9 +183,9 @@ class MetriplecticGauss(GaussMethod):
             return part.force(system, u, dH, dS, dL)
         gradients = [known[name] for name in functions]
         if lowers:
-            off = _projector(gradients)
+            off = _projector(system, u, gradients)
             return off(part.force(system, u, off(dH), dS, dL))
-        off = _projector([Gradients(dH, system.energy.gradient(u)), *gradients])
+        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
         return off(part.force(system, u, dH, off(dS), dL))
 
     def _kept(self, system: System) -> dict[str, Energy]:
@@ -231,9 +232,10 @@ def _made_of(system: System) -> dict[str, Energy]:
     return system.casimirs()
 
 
-def _projector(gradients: list[Gradients]) -> Callable:
-    """The orthogonal projector off discrete gradients."""
-    return frame([g.discrete for g in gradients], like=[g.plain for g in gradients]).off
+def _projector(system: System, u, gradients: list[Gradients]) -> Callable:
+    """The orthogonal projector off discrete gradients, raised: what is driven has a clock, which is not to be moved."""
+    pairs = [(system.raised(u, g.discrete), system.raised(u, g.plain)) for g in gradients]
+    return frame([d for d, _ in pairs], like=[p for _, p in pairs]).off
 
 
 def _seen_on(system: System, C: Energy) -> Energy:

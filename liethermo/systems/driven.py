@@ -22,6 +22,10 @@ state or of its velocity, which convergence and errors are measured against. A p
 """
 
 
+TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
+"""Times at which it is looked at what a body conserves."""
+
+
 class DrivenSystem(System):
     """A system with ``H(x, t)``, made autonomous: ``x' = Pi dH + force``, ``t' = 1``, ``W' = dH/dt`` at fixed x.
 
@@ -137,6 +141,12 @@ class DrivenSystem(System):
     def has_all_casimirs(self) -> bool:
         return self.body.has_all_casimirs
 
+    def conserves(self, functions):
+        """Whether the body does, as it is at some times: beside the clock, in its unit, nothing else would count."""
+        own = tuple(_WithoutClock(f) for f in functions)
+        found = [self.body.at_time(t).conserves(own) for t in TIMES]
+        return [all(kept) for kept in zip(*found, strict=True)]
+
     @property
     def ledger(self):
         return {"work": Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
@@ -161,6 +171,15 @@ class DrivenSystem(System):
         energy = solution.energy + solution.casimirs["work"]
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.presented(found)
+
+
+class _WithoutClock(Energy):
+    """A function of a state with clock and work that depends on neither, as one of the body's state."""
+
+    energy: Energy
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(jnp.concatenate([x, jnp.zeros(2)]))
 
 
 class _WithClock(mf.PoissonStructure):
@@ -250,6 +269,9 @@ class _MinusWork(Energy):
     def gradient(self, x) -> jax.Array:
         return jnp.zeros_like(x).at[-1].set(-1.0 / self.unit)
 
+    def sensitivity(self, x) -> jax.Array:
+        return jax.lax.stop_gradient(jnp.abs(self.value(x)))
+
     def in_chart(self, coordinates, space):
         slope = jnp.zeros(space.dim).at[-1].set(-1.0 / self.unit)
         return Quadratic(jnp.zeros(space.dim), slope, self.value(space.to_vector(coordinates.centre().point)))
@@ -262,7 +284,13 @@ class _OnSpaceAndTime(Energy):
     unit: float = eqx.field(static=True)
 
     def value(self, x) -> jax.Array:
-        return self.energy.value(jnp.append(x[:-2], x[-2] / self.unit))
+        return self.energy.value(self._joined(x))
+
+    def sensitivity(self, x) -> jax.Array:
+        return self.energy.sensitivity(self._joined(x))
+
+    def _joined(self, x):
+        return jnp.append(x[:-2], x[-2] / self.unit)
 
     def in_chart(self, coordinates, space):
         local = WithTime(_InChartAndTime(InChart(self, coordinates, space), self.unit))

@@ -53,7 +53,7 @@ def test_chunks_do_not_show(monkeypatch):
 def test_runs_are_reproducible_and_pure():
     first, second = (lt.integrate(BODY, X0, (0.0, 5.0), 0.1) for _ in range(2))
     assert np.array_equal(first.x, second.x)
-    assert first.provenance["method"] == "MetriplecticMidpoint(gradient=Gonzalez)"
+    assert first.provenance["method"] == "MetriplecticGauss(stages=1)"
 
 
 # -- input --------------------------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ def test_unusable_states(x0, words):
         ({"save_every": 1.5}, "save_every"),
         ({"engine": "quantum"}, "engine"),
         ({"on_failure": "ignore"}, "on_failure"),
-        ({"method": "midpoint"}, "lt.MetriplecticMidpoint"),
+        ({"method": "midpoint"}, "lt.MetriplecticGauss"),
     ],
 )
 def test_unusable_arguments(arguments, words):
