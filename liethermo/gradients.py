@@ -293,7 +293,10 @@ class Direction(NamedTuple):
     @classmethod
     def of(cls, k, b, weights=None, symmetries=None) -> Direction:
         """``d = W k``, W diagonal with the weights, but orthogonal to the symmetries, shape (s, r, m)."""
-        root = 1.0 if weights is None else jnp.sqrt(weights)
+        if weights is None:
+            root = jnp.ones(())
+        else:  # of zero too, whose root has no derivative
+            root = jnp.where(weights > 0.0, jnp.sqrt(jnp.where(weights > 0.0, weights, 1.0)), 0.0)
         whole = left = root * k
         if symmetries is not None:
             left = jax.vmap(lambda v, along: frame(list(along)).off(v))(whole, root * symmetries)

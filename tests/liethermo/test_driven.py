@@ -270,7 +270,7 @@ def test_the_derivative_of_a_flow_by_the_amplitude():
     """The flow of a spring is affine in the amplitude of what pushes it, the discrete one too."""
 
     def end(amplitude):
-        return lt.flow(pushed(amplitude), jnp.array([1.0, 0.0]), (0.7, 2.7), 0.1)
+        return lt.flow(pushed(amplitude), jnp.array([1.0, 0.0]), (0.7, 2.7), 0.1, lt.MetriplecticMidpoint())
 
     both = jax.jit(lambda amplitude: jax.jvp(end, (amplitude,), (1.0,)))
     (first, slope), (last, _) = both(0.0), both(1.0)
