@@ -203,7 +203,7 @@ def test_a_process_with_a_users_function(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     (home / f"{MODULE}.py").write_text(SOURCE)
-    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [1, 2, 4]}") + RUN + NO_FIGURES)
+    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [2, 3, 4]}") + RUN + NO_FIGURES)
 
     def call(*arguments):
         path = os.pathsep.join([str(EXAMPLE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
