@@ -28,8 +28,8 @@ COMPARED_STEPS = 300
 
 def by_library(system: lt.System, steps: int, engine: Engine, every: int | None = None) -> Callable[[], lt.Solution]:
     """A run of the library from :data:`.problems.X0`; by default only the last state is kept."""
-    span = (0.0, STEP * steps)
-    return functools.partial(lt.integrate, system, X0, span, STEP, save_every=every or steps, engine=engine)
+    span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint()
+    return functools.partial(lt.integrate, system, X0, span, STEP, midpoint, save_every=every or steps, engine=engine)
 
 
 def by_c(program: Body, steps: int, every: int | None = None) -> Callable[[], tuple[np.ndarray, np.ndarray]]:

@@ -25,6 +25,7 @@ def by_library(
 ) -> Callable[[], lt.Ensemble]:
     """A run of all bodies over so many steps."""
     span, step = (0.0, t_end), t_end / steps
+    method = lt.MetriplecticMidpoint() if method is None else method
     return functools.partial(lt.ensemble, system, x0s, span, step, method, outputs=outputs, engine=engine)
 
 

@@ -164,7 +164,7 @@ def test_momentum_sphere_is_labelled_by_the_names_of_the_basis(relaxed):
     system = lt.LiePoissonSystem(algebra, lt.Quadratic([0.1, 0.2, 1.0]), lt.Quadratic(np.ones(3)), validate=False)
     ax = lt.plot.momentum_sphere(relaxed, system).axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()) == ("Lx", "Ly", "Lz")
-    assert "Lx**2 + Ly**2 + Lz**2" in system._casimirs()
+    assert "Lx**2 + Ly**2 + Lz**2" in system.casimirs()
 
 
 def test_momentum_sphere_of_a_loaded_solution(body, relaxed, tmp_path):

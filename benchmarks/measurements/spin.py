@@ -68,8 +68,8 @@ def program(rate: float) -> Body:
 
 
 def by_library(rate: float, steps: int, every: int, engine: Engine) -> Callable[[], lt.Solution]:
-    span = (0.0, STEP * steps)
-    return functools.partial(lt.integrate, system(rate), X0, span, STEP, save_every=every, engine=engine)
+    span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint()
+    return functools.partial(lt.integrate, system(rate), X0, span, STEP, midpoint, save_every=every, engine=engine)
 
 
 def difference(rate: float = 0.03) -> float:
