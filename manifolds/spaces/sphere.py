@@ -77,6 +77,7 @@ class Sphere(Space):
     def _log(self, x, y):
         step = y - x
         w = step - _dot(x, step) * x  # of length sin(angle); free of cancellation for neighbours
+        w = w - _dot(x, w) * x  # near the antipode the first pass leaves rounding that is not tangent
         z, cosine = _dot(w, w), _dot(x, y)
         defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
         return jnp.where(defined, arc(z, cosine) * w, jnp.nan)
