@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 
 import liethermo as lt
@@ -273,3 +274,31 @@ def test_a_flow_with_a_loop_of_unknown_length():
     assert np.abs(np.subtract(a, b)).max() < 1e-13
     solution = lt.integrate(looping(1.2), X0, (0.0, 0.3), 0.1, engine="array")
     assert np.abs(solution.x[-1, 0] - a[0]) < 1e-14
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        lt.MetriplecticGauss(1),
+        pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticMidpoint(), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_the_derivative_at_an_equilibrium(method):
+    """Where nothing moves quotients are 0/0: the Jacobian is that of differences, and near ``expm`` of the field's."""
+
+    def energy(m):
+        return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4
+
+    friction = lt.ProjectedMetric(rate=0.3)
+    system = lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction)
+    x, h = jnp.array([1.0, 0.0, 0.0]), 0.1
+    end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
+    found = np.asarray(jax.jit(jax.jacfwd(end))(x))
+    steps = 1e-5 * np.eye(3)
+    differences = np.stack([(np.asarray(end(x + d)) - np.asarray(end(x - d))) / 2e-5 for d in steps], axis=1)
+    assert np.abs(found - differences).max() <= 1e-8
+    exact = scipy.linalg.expm(h * np.asarray(jax.jacfwd(system.vector_field)(x)))
+    assert np.abs(found - exact).max() <= 0.02 * h ** (method.order + 1)
+    assert np.abs(exact - np.eye(3)).max() > 0.01
