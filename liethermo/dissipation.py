@@ -176,6 +176,44 @@ def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple
         start = end
 
 
+class Carried(Dissipation):
+    """A dissipation in other coordinates or on a larger state: it obeys the laws of the one that it is made from.
+
+    Attributes
+    ----------
+    part : Dissipation
+    functions : tuple of Energy
+        What that one preserves, as functions of the new state.
+    """
+
+    part: Dissipation
+    functions: tuple[Energy, ...]
+
+    @property
+    def energy_law(self):
+        return self.part.energy_law
+
+    @property
+    def entropy_law(self):
+        return self.part.entropy_law
+
+    @property
+    def keeps_casimirs(self):
+        return self.part.keeps_casimirs
+
+    @property
+    def symmetric(self):
+        return self.part.symmetric
+
+    @property
+    def needs_entropy(self):
+        return self.part.needs_entropy
+
+    @property
+    def preserve(self):
+        return self.functions
+
+
 class SkewFriction(Dissipation):
     """A skew bracket with the energy alone, so that the energy is conserved: friction that heats [SML 6]."""
 

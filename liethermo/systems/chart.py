@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, Several
+from ..dissipation import Carried, Several
 from ..energy import Energy, Sum
 from .base import System
 
@@ -103,32 +103,10 @@ class _Poisson(mf.PoissonStructure):
         return place.lower(self.system.poisson.sharp(place.state, place.lift(alpha)))
 
 
-class _Force(Dissipation):
-    part: Dissipation
-    functions: tuple[Energy, ...]
+class _Force(Carried):
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
-
-    @property
-    def energy_law(self):
-        return self.part.energy_law
-
-    @property
-    def entropy_law(self):
-        return self.part.entropy_law
-
-    @property
-    def keeps_casimirs(self):
-        return self.part.keeps_casimirs
-
-    @property
-    def symmetric(self):
-        return self.part.symmetric
-
-    @property
-    def preserve(self):
-        return self.functions
 
     def force(self, system, x, dH, dS, dL):
         place = _Place(self.system, self.coordinates, self.place, x)

@@ -11,7 +11,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, Several
+from ..dissipation import Carried, Several
 from ..energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
 from ..errors import InputError
 from .base import System
@@ -59,9 +59,7 @@ class DrivenSystem(System):
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = None
         if body.dissipation is not None:
-            parts = tuple(
-                _OnBody(part, tuple(map(self._of_body, part.preserve)), unit) for part in body.dissipation.terms
-            )
+            parts = tuple(_OnBody(part, tuple(map(self._of_body, part.preserve))) for part in body.dissipation.terms)
             self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
 
     @property
@@ -207,36 +205,8 @@ def _clock(dH, unit: float) -> jax.Array:
     return unit**2 * jnp.stack([-dH[-1], dH[-2]])
 
 
-class _OnBody(Dissipation):
+class _OnBody(Carried):
     """A dissipation of the body, as it is at the time of the state."""
-
-    part: Dissipation
-    functions: tuple[Energy, ...]
-    unit: float = eqx.field(static=True)
-
-    @property
-    def energy_law(self):
-        return self.part.energy_law
-
-    @property
-    def entropy_law(self):
-        return self.part.entropy_law
-
-    @property
-    def keeps_casimirs(self):
-        return self.part.keeps_casimirs
-
-    @property
-    def symmetric(self):
-        return self.part.symmetric
-
-    @property
-    def needs_entropy(self):
-        return self.part.needs_entropy
-
-    @property
-    def preserve(self):
-        return self.functions
 
     def force(self, system, x, dH, dS, dL):
         dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
