@@ -27,7 +27,8 @@ class Tolerances:
 
     A change of a function is judged against the size at which rounding sees the function, its *sensitivity*
     ``max |grad f(x)| |x|`` along the run (:meth:`liethermo.Energy.sensitivity`), whatever its value is at the start.
-    Eight roundings of the value itself are allowed besides: nothing smaller can be seen where a constant is added.
+    Eight roundings of the value itself are allowed besides, and of the terms that cancel in it: nothing smaller can be
+    seen where a constant is added, or in ``1 - cos q`` near q = 0.
 
     Attributes
     ----------
@@ -160,10 +161,13 @@ class Rounding:
     value : float or ndarray
         Its size, at the start or the largest.
     sensitivity : float or ndarray
+    terms : float or ndarray
+        The size of the largest terms that the value is computed from.
     """
 
     value: Any
     sensitivity: Any
+    terms: Any = 0.0
 
     @property
     def size(self) -> Any:
@@ -173,7 +177,7 @@ class Rounding:
 
     def allowed(self, tolerance: float) -> Any:
         """The largest change accepted, relative to the size."""
-        return (tolerance * self.sensitivity + VALUE * np.abs(self.value)) / self.size
+        return (tolerance * self.sensitivity + VALUE * np.maximum(np.abs(self.value), self.terms)) / self.size
 
 
 def audit(solution: Solution, tolerances: Tolerances) -> Audit:
@@ -183,7 +187,7 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     low, high = stats.energy_range or (np.inf, -np.inf)
     lowest, highest = min(low, float(energy.min())), max(high, float(energy.max()))
     first = float(energy[0])
-    rounding = _rounding(energy, evidence.energy)
+    rounding = _rounding(energy, evidence.energy, evidence.terms.get("energy"))
     drift = float(max(highest - first, first - lowest) / rounding.size)
     allowed = float(rounding.allowed(tolerances.energy))
     if laws.energy == "conserved":
@@ -204,7 +208,7 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
     for name, series in solution.casimirs.items():
         if name in laws.ledger:
             continue
-        rounding = _rounding(series, evidence.invariants.get(name))
+        rounding = _rounding(series, evidence.invariants.get(name), evidence.terms.get(name))
         change = float(np.abs(series - series[0]).max() / rounding.size)
         if name in laws.conserved:
             kept.append(change)
@@ -237,14 +241,15 @@ def _entropy_row(solution: Solution, tolerances: Tolerances) -> tuple[float, Aud
     """The least increment of the entropy, and its law: at every step, and over all of the run."""
     S, law = solution.entropy, solution.laws.entropy
     assert S is not None
-    note, rounding = _note(solution.laws, "entropy"), _rounding(S, solution.evidence.entropy)
+    note, evidence = _note(solution.laws, "entropy"), solution.evidence
+    rounding = _rounding(S, evidence.entropy, evidence.terms.get("entropy"))
     least = float(min([*np.diff(S), _or(solution.stats.least_entropy_increment, np.inf)]))
     if law == "conserved":
         change = float(np.abs(S - S[0]).max() / rounding.size)
         return least, _verdict("entropy drift", change, float(rounding.allowed(tolerances.casimirs)), note)
     if law is None:
         return least, AuditRow("least entropy increment", least, None, None, "no law promised")
-    rounding = Rounding(float(np.abs(S).max()), rounding.sensitivity)
+    rounding = replace(rounding, value=float(np.abs(S).max()))
     one, all_ = (float(rounding.allowed(t) * rounding.size) for t in (tolerances.entropy, tolerances.casimirs))
     fall = float((np.maximum.accumulate(S) - S).max())
     if fall > all_ >= 0.0 and least >= -one:  # step by step below what rounding hides
@@ -271,9 +276,10 @@ def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     return replace(row, note=where if row.passed else f"the steps do not resolve the motion: try suggest_step; {where}")
 
 
-def _rounding(series: np.ndarray, sensitivity: float | None) -> Rounding:
+def _rounding(series: np.ndarray, sensitivity: float | None, terms: float | None) -> Rounding:
     """Of a function with this series; the largest of its values stands in for a sensitivity that is not known."""
-    return Rounding(abs(float(series[0])), float(np.abs(series).max()) if sensitivity is None else sensitivity)
+    largest = float(np.abs(series).max()) if sensitivity is None else sensitivity
+    return Rounding(abs(float(series[0])), largest, _or(terms, 0.0))
 
 
 def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:

@@ -576,8 +576,11 @@ def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> En
     try:
         energy, result = converted(energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ())
     except (TypeError, ValueError, IndexError, AttributeError) as error:
+        for term in energy.terms:
+            term.check_places(dim, role)  # says which term, where the fault is in its coordinates
+        message = f"{type(error).__name__}: {error}".rstrip(".")
         raise FunctionError(
-            f"{role} could not be evaluated on a state of shape ({dim},): {type(error).__name__}: {error}. "
+            f"{role} could not be evaluated on a state of shape ({dim},): {message}. "
             "It must be written with jax.numpy and accept one array"
         ) from error
     for term in energy.terms:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import jax
@@ -23,7 +23,7 @@ from .engine.interpret import at_points
 from .engine.programs import program
 from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
-from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, spread
+from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
 from .family import Family, common_size
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
@@ -166,14 +166,15 @@ class Ensemble:
             passed = bool(values[i] <= allowed[i])
             rows.append(AuditRow(law, float(values[i]), float(allowed[i]), passed, f"worst is trajectory {i}"))
 
-        rounding = Rounding(self.first_energy, self.energy_sensitivity)
+        terms = self.evidence.terms
+        rounding = Rounding(self.first_energy, self.energy_sensitivity, terms.get("energy", 0.0))
         if self.laws.energy == "conserved":
             worst(f"{name} drift", self.energy_drift, rounding.allowed(accepted.energy))
         elif self.laws.energy == "nonincreasing":
             increment = self.largest_energy_increment / rounding.size
             worst(f"relative {name} increment", increment, rounding.allowed(accepted.energy))
         if self.laws.entropy == "nondecreasing":
-            rounding = Rounding(self.entropy_scale, self.entropy_sensitivity)
+            rounding = Rounding(self.entropy_scale, self.entropy_sensitivity, terms.get("entropy", 0.0))
             fall = -self.least_entropy_increment / rounding.size
             worst("relative fall of the entropy", fall, rounding.allowed(accepted.entropy))
             in_all = -self.entropy_change / rounding.size
@@ -357,7 +358,7 @@ class _Record:
 
 
 class _Witness:
-    """Finds the local errors of first steps, when it is called."""
+    """Finds the local errors of first steps, and how the laws' functions are rounded there, when it is called."""
 
     def __init__(self, family: Family, member: System, method, states: np.ndarray, times: Timetable, record, engine):
         some = spread(len(states), STEPS_AGAIN)
@@ -381,17 +382,29 @@ class _Witness:
             state, _ = _advance_all(form, parameters, axes, self.method, state, jnp.asarray(self.h), 1, jnp.asarray(1))
             after = {name: np.asarray(value) for name, value in vars(state).items()}
         moved = np.abs(self._seen(after["x"] + after["low"]) - self._seen(self.x)).max(axis=1)
+        found = Evidence(terms=self._terms(own))
         told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
         if not told.any():
-            return Evidence()
+            return found
         h = np.full((number, 1), self.h)
         steps = np.concatenate([own, self.x, h, after["k"].reshape(number, -1)], axis=1)[told]
         errors = at_points(_first_errors, (form, self.method, len(own[0])), steps)
         relative = errors / np.fmax(moved, WHOLE * self.distance)[told]
-        return Evidence(local_error=float(np.nan_to_num(relative).max()), error_time=self.start)
+        return replace(found, local_error=float(np.nan_to_num(relative).max()), error_time=self.start)
+
+    def _terms(self, own: np.ndarray) -> dict[str, float]:
+        """The sizes at which the energy and the entropy are rounded, the largest of some trajectories."""
+        at = np.concatenate([own, self.x], axis=1)
+        largest = at_points(_first_terms, (self.family.form, own.shape[1]), at).max(axis=0)
+        return {name: float(size) for name, size in zip(("energy", "entropy"), np.nan_to_num(largest), strict=False)}
 
     def _seen(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
+
+
+def _first_terms(model: tuple[Form, int], at):
+    form, p = model
+    return sizes(laws_functions(form.build(at[:p])), at[p:])[1]
 
 
 def _first_errors(model: tuple[Form, OneStepMethod, int], step):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from .energy import Energy
 from .engine.interpret import at_points
+from .engine.rounding import with_rounding
 from .engine.scalarize import UnsupportedPrimitive
 from .integrators import OneStepMethod
 from .systems import System
@@ -51,6 +52,9 @@ class Evidence:
         Largest sensitivity along the run: the size at which the function is rounded (:meth:`Energy.sensitivity`).
     invariants : dict of float
         The same of the other recorded functions, by name.
+    terms : dict of float
+        Largest size at which the value of ``"energy"``, of ``"entropy"`` and of the others is rounded along the run:
+        that of the largest terms inside, which may cancel in the value.
     local_error : float or None
         Largest estimated local error of a step, relative to the distance that it goes, or to a hundredth of the whole
         motion where that is more; None where the method has no estimate or nothing moves.
@@ -64,6 +68,7 @@ class Evidence:
     energy: float | None = None
     entropy: float | None = None
     invariants: Mapping[str, float] = field(default_factory=dict)
+    terms: Mapping[str, float] = field(default_factory=dict)
     local_error: float | None = None
     error_time: float | None = None
     inconsistency: float | None = None
@@ -99,11 +104,12 @@ class Witness:
 
     @functools.cached_property
     def _found(self) -> Evidence:
-        entropy = [] if self.system.entropy is None else [self.system.entropy]
-        functions = (self.system.energy, *entropy, *self.functions.values())
-        largest = _largest(at_points(_sensitivities, functions, self.x))
-        own = dict(zip(self.functions, largest[1 + len(entropy) :], strict=True))
-        found = Evidence(largest[0], largest[1] if entropy else None, own)
+        functions = [*laws_functions(self.system), *self.functions.values()]
+        names = [*("energy", "entropy")[: len(functions) - len(self.functions)], *self.functions]
+        sensitivities, terms = at_points(sizes, tuple(functions), self.x)
+        own = dict(zip(names, _largest(sensitivities), strict=True))
+        energy, entropy = own.pop("energy"), own.pop("entropy", None)
+        found = Evidence(energy, entropy, own, dict(zip(names, _largest(terms), strict=True)))
         if not isinstance(self.method, OneStepMethod):
             return found
         number = min(STEPS_AGAIN, max(4, STATE_NUMBERS // self.x.shape[1]))
@@ -188,8 +194,15 @@ def _largest(values: np.ndarray) -> list[float]:
     return [float(v) for v in np.nan_to_num(values, nan=0.0, posinf=0.0).max(axis=0)]
 
 
-def _sensitivities(functions: tuple[Energy, ...], x):
-    return jnp.stack([f.sensitivity(x) for f in functions])
+def laws_functions(system: System) -> list[Energy]:
+    """The energy, and the entropy where there is one."""
+    return [system.energy, *([] if system.entropy is None else [system.entropy])]
+
+
+def sizes(functions: Sequence[Energy], x) -> tuple[jnp.ndarray, jnp.ndarray]:
+    """The sensitivities of functions at a state, and the sizes at which their values are rounded."""
+    sensitivities = jnp.stack([f.sensitivity(x) for f in functions])
+    return sensitivities, jnp.stack([with_rounding(f.value, x)[1] for f in functions])
 
 
 def _field(system: System, x):

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .energy import Energy
+from .engine.rounding import with_rounding
 from .errors import InputError
 from .frames import frame
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 EPS = float(np.finfo(np.float64).eps)
 
 DIFFERENCE_NOISE = 8 * EPS
-"""Rounding error of ``H(x') - H(x)`` relative to ``|H(x)| + |H(x')|``: a few roundings inside H."""
+"""Rounding error of ``H(x') - H(x)`` relative to the size at which the values are rounded: a few roundings inside H."""
 
 CURVATURE_SWITCH = 1e-6
 """Relative second difference of the slope, about 0.15 (|d|/L)^2 on a length L over which H varies, above which the
@@ -140,7 +141,7 @@ class CoordinateIncrement(DiscreteGradient):
         along, slope = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
         second = along[:, 0] + along[:, 2] - 2.0 * along[:, 1]
         mean = along[:, 1] + (5 / 18) * second
-        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1])
+        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1]) + _rounded(term, x)
         found = values[1:] - values[:-1]
         defect = _gated_defect(found, sizes, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
         return mean + _divide(defect, d)
@@ -330,7 +331,8 @@ class Change(NamedTuple):
         # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
         difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
         slope = jnp.max(jnp.linalg.norm(ends, axis=1))
-        noise = DIFFERENCE_NOISE * (jnp.abs(before) + jnp.abs(after)) + 4 * EPS * slope * jnp.linalg.norm(x)
+        size = jnp.abs(before) + jnp.abs(after) + _rounded(term, x)
+        noise = DIFFERENCE_NOISE * size + 4 * EPS * slope * jnp.linalg.norm(x)
         return cls(difference, noise, gradients)
 
 
@@ -365,22 +367,31 @@ def _values(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
+def _rounded(term: Energy, x) -> jax.Array:
+    """The size at which the value at x is rounded: that of the largest terms inside, though they cancel in the value.
+
+    Near q = 0 the value of ``1 - cos q`` is rounding, of the size of 1. It needs nothing of the step, so that it is
+    found once, not at every iteration.
+    """
+    return jax.lax.stop_gradient(with_rounding(term.value, x)[1])
+
+
 def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array]:
-    """``H(x + low + d) - H(x + low)``, and the sum of the two in size; ``gradient`` is one in between.
+    """``H(x + low + d) - H(x + low)``, and the size at which it is rounded; ``gradient`` is one in between.
 
     From values where steps begin and end, so that their rounding cancels from step to step, and the gradient for what
     these points leave out: else a step would take back what rounding, or a steering of the energy, has put into low.
     """
     new, new_low = compensated(x, low + d)
     before, after = _values(term, jnp.stack([x, new]))
-    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after)
+    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after) + _rounded(term, x)
 
 
 def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale):
     """Defect of a predicted difference of two values of H, shut out where it is no more than rounding noise.
 
-    ``size`` is the sum of the two values, ``argument_effect`` is ``|grad H| |x|``: one rounding of the argument moves H
-    by eps times that.
+    ``size`` is that at which the values are rounded, ``argument_effect`` is ``|grad H| |x|``: one rounding of the
+    argument moves H by eps times that.
     """
     defect = difference - predicted
     noise = DIFFERENCE_NOISE * size + 4 * EPS * argument_effect

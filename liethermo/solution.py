@@ -29,6 +29,9 @@ VARIABLES = ("time", "x", "energy", "entropy", "attitude", "invariant_name", "in
 ATTRIBUTES = ("format", "times", "status", "stats", "laws", "evidence", "provenance", "event_time", "sha256")
 """What a file has."""
 
+SEAL = b"\nliethermo sha256 "
+"""What comes after the end of the NetCDF file, with the digest of all before it."""
+
 
 @dataclass(frozen=True)
 class Status:
@@ -247,6 +250,7 @@ class Solution:
             numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
             checked = {name: {"fletcher32": True} for name in numbers}
             dataset.to_netcdf(temporary, engine="h5netcdf", encoding=checked)
+            _seal(temporary)
             os.replace(temporary, path)
         except OSError as error:
             raise FileError(f"cannot write {path}: {error}") from error
@@ -278,6 +282,7 @@ def load(path: str | os.PathLike) -> Solution:
     path = Path(path)
     if not path.is_file():
         raise FileError(f"there is no file {path}")
+    _check_seal(path)
     try:
         series, attributes = _content(path)
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
@@ -318,6 +323,42 @@ def load(path: str | os.PathLike) -> Solution:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
+
+
+def _seal(path: Path) -> None:
+    """Append the digest of a file to it; readers of HDF5 do not look beyond the end that its header states."""
+    digest = _digest(path, path.stat().st_size)
+    with open(path, "ab") as file:
+        file.write(SEAL + digest)
+
+
+def _check_seal(path: Path) -> None:
+    """Before HDF5 sees the file: a damaged one can keep its reader in an endless loop.
+
+    A file without a seal is let through: programs that write to an HDF5 file may cut off what follows its end.
+    """
+    length = len(SEAL) + 2 * hashlib.sha256().digest_size
+    whole = path.stat().st_size - length
+    if whole < 0:
+        return
+    with open(path, "rb") as file:
+        file.seek(whole)
+        end = file.read()
+    if end.startswith(SEAL) and end != SEAL + _digest(path, whole):
+        raise FileError(f"{path} is damaged, or was changed: it does not have the checksum that it was written with")
+
+
+def _digest(path: Path, length: int) -> bytes:
+    """SHA-256 of the beginning of a file, in hexadecimal digits."""
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while length > 0:
+            part = file.read(min(length, 2**20))
+            if not part:
+                break
+            found.update(part)
+            length -= len(part)
+    return found.hexdigest().encode()
 
 
 def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from fractions import Fraction
 from functools import cached_property
 
 import jax
@@ -579,15 +578,20 @@ def _without_rounding(
     The constants are those of matrices of norm 1, the ``columns``.
     """
     scaled = constants * scales
-    nearest = [_nearest_fraction(c, scale) for c, scale in zip(scaled.ravel(), scales.ravel(), strict=True)]
-    snapped = np.array(nearest).reshape(constants.shape)
+    snapped = _nearest_fractions(scaled, 1e-12 * np.maximum(scales, np.abs(scaled)))
     defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
     return snapped if defect <= 4 * np.finfo(float).eps else scaled
 
 
-def _nearest_fraction(value: float, scale: float) -> float:
-    nearest = float(Fraction(float(value)).limit_denominator(64))
-    return nearest if abs(nearest - value) < 1e-12 * max(scale, abs(value)) else float(value)
+def _nearest_fractions(values: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Each value, or the nearest fraction of denominator 64 or less where that is nearer than ``within``."""
+    found, least = values, within
+    for denominator in range(1, 65):
+        fractions = np.round(values * denominator) / denominator
+        distances = np.abs(fractions - values)
+        found = np.where(distances < least, fractions, found)
+        least = np.minimum(distances, least)
+    return found
 
 
 def _real_columns(matrices: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ An algebra, a dissipation or a method enters by being registered (algebras and m
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -30,6 +30,24 @@ TOLERANCES = {
 
 def tolerance(name: str) -> float:
     return TOLERANCES[name][0]
+
+
+class BuiltOnUse(Mapping):
+    """What is built when it is first asked for, by name: collecting the tests builds nothing."""
+
+    def __init__(self, makers: Mapping[str, Callable]) -> None:
+        self._makers, self._built = dict(makers), {}
+
+    def __getitem__(self, name: str):
+        if name not in self._built:
+            self._built[name] = self._makers[name]()
+        return self._built[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
 
 
 ALGEBRAS = list(mf.registered())

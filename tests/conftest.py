@@ -1,5 +1,7 @@
 """Shared settings: property tests are deterministic, so that a failure here is a failure everywhere."""
 
+from collections import defaultdict
+
 import hypothesis
 import jax
 import pytest
@@ -8,6 +10,21 @@ hypothesis.settings.register_profile(
     "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=6
 )
 hypothesis.settings.load_profile("liethermo")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of the cases of a test marked ``sampled(n)``, n spread over all of them run by default; the rest are slow."""
+    cases = defaultdict(list)
+    for item in items:
+        mark = item.get_closest_marker("sampled")
+        if mark and not item.get_closest_marker("slow"):
+            cases[item.parent.nodeid, item.originalname, mark.args[0]].append(item)
+    for (*_, wanted), crossed in cases.items():
+        kept = {(2 * i + 1) * len(crossed) // (2 * wanted) for i in range(wanted)}
+        for i, item in enumerate(crossed):
+            if i not in kept:
+                item.add_marker("slow")
 
 
 @pytest.fixture(autouse=True, scope="session")

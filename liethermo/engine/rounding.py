@@ -31,6 +31,9 @@ LOOPS = frozenset({"cond", "scan", "while"})
 SHARE = 2.0**-36
 """Largest error, relative to what a result is: far above rounding, and small enough for errors to add."""
 
+SAMPLES = 3
+"""Times that errors are drawn: those of two instructions may cancel in one."""
+
 PATTERNS = 8
 """Arrays of errors for each size: few, since a program holds them."""
 
@@ -49,38 +52,41 @@ def with_rounding(function: Callable, x) -> tuple[jax.Array, jax.Array]:
     """
     closed = jax.make_jaxpr(function)(x)
 
-    def erring(share):
-        return _evaluated(closed.jaxpr, closed.consts, [x], itertools.count(), share)[0]
+    def erring(shares):
+        return _evaluated(closed.jaxpr, closed.consts, [x], itertools.count(), shares)[0]
 
-    right, wrong = jax.vmap(erring)(np.array([0.0, SHARE]))  # one program for both, as one is quicker to compile
-    size = jnp.abs(wrong - right) / SHARE
+    found = jax.vmap(erring)(np.eye(SAMPLES + 1, SAMPLES, -1) * SHARE)  # one program, as one is quicker to compile
+    right, wrong = found[0], found[1:]
+    size = jnp.max(jnp.abs(wrong - right), axis=0) / SHARE
     return right, jnp.where(jnp.isfinite(size), size, 0.0)
 
 
-def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], share) -> list:
-    """The results of a program each of whose instructions errs, by a share of what it gives."""
+def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], shares) -> list:
+    """The results of a program each of whose instructions errs, by shares of what it gives."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     for equation in jaxpr.eqns:
         given = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
         name, parameters = equation.primitive.name, equation.params
         inner = next((parameters[key] for key in INNER if key in parameters), None)
         if inner is not None and name not in LOOPS and hasattr(inner, "consts"):
-            found = _evaluated(inner.jaxpr, inner.consts, given, numbers, share)
+            found = _evaluated(inner.jaxpr, inner.consts, given, numbers, shares)
         else:
             bound = equation.primitive.get_bind_params(parameters)
             functions, parameters = bound if isinstance(bound, tuple) else ((), bound)  # as older versions of JAX have
             found = equation.primitive.bind(*functions, *given, **parameters)
             found = found if equation.primitive.multiple_results else [found]
             if name not in EXACT:
-                found = [_erring(value, next(numbers), share) for value in found]
+                found = [_erring(value, next(numbers), shares) for value in found]
         values.update(zip(equation.outvars, found, strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
 
 
-def _erring(value, number: int, share):
+def _erring(value, number: int, shares):
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
-    return value + value * (share * _pattern(np.shape(value)[-1:], number % PATTERNS))
+    shape = np.shape(value)[-1:]
+    errors = [share * _pattern(shape, (number + SAMPLES * i) % PATTERNS) for i, share in enumerate(shares)]
+    return value + value * sum(errors[1:], errors[0])
 
 
 @functools.cache

@@ -94,8 +94,9 @@ class OneStepMethod(eqx.Module):
     def keeps(self, system: System, name: str) -> bool:
         """Whether it keeps, to rounding, the function of the system with this name, which the system conserves."""
         casimir, quadratic = name in system.casimirs(), system.functions()[name].is_quadratic
-        if quadratic and system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic):
-            return bool(self.preserves & {"casimirs", "quadratic_casimirs"})  # no gradient is corrected: collocation
+        linear = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
+        if quadratic and linear and self.order > 1:  # every discrete gradient is that of a collocation polynomial
+            return bool(self.preserves & {"casimirs", "quadratic_casimirs"})
         if "quadratic_casimirs" in self.preserves:
             by_force = system.dissipation is None or system.dissipation.keeps_casimirs
             return casimir and quadratic and by_force

@@ -56,8 +56,7 @@ class MetriplecticMidpoint(OneStepMethod):
 
     @property
     def preserves(self) -> frozenset[str]:
-        kept = {"energy", "entropy_law_quadratic"}
-        return frozenset(kept | {"quadratic_casimirs"} if self.order == 2 else kept)
+        return frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         d = h * k[0]

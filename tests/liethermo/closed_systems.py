@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 import liethermo as lt
+from tests.cases import BuiltOnUse
 
 
 def mass(q):
@@ -40,14 +41,18 @@ def heater(q, v, S, t):
 MECHANICAL = lt.Kinetic(mass) - lt.Potential(internal_energy)
 X0 = [0.4, -0.3, 0.5, 0.8, 0.2]
 
-ISOLATED = {
-    "mechanical": lt.SimpleClosedSystem(MECHANICAL, 5, friction=friction),
-    "tangled": lt.SimpleClosedSystem(tangled, 5, friction=cubic_friction, validate=False),
-}
-OPEN = {
-    "mechanical": lt.SimpleClosedSystem(MECHANICAL, 5, friction=friction, external=swirl, heat_power=heater),
-    "tangled": lt.SimpleClosedSystem(tangled, 5, cubic_friction, swirl, heater, validate=False),
-}
+ISOLATED = BuiltOnUse(
+    {
+        "mechanical": lambda: lt.SimpleClosedSystem(MECHANICAL, 5, friction=friction),
+        "tangled": lambda: lt.SimpleClosedSystem(tangled, 5, friction=cubic_friction, validate=False),
+    }
+)
+OPEN = BuiltOnUse(
+    {
+        "mechanical": lambda: lt.SimpleClosedSystem(MECHANICAL, 5, friction, swirl, heater),
+        "tangled": lambda: lt.SimpleClosedSystem(tangled, 5, cubic_friction, swirl, heater, validate=False),
+    }
+)
 SCHEMES = {
     "scheme 1": lt.VariationalIntegrator.verlet(),
     "scheme 2": lt.VariationalIntegrator.midpoint(),

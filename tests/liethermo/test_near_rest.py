@@ -1,15 +1,19 @@
 """Motions that come to rest at the origin, where nothing can be judged by the size of the state."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import liethermo as lt
+import manifolds as mf
 from liethermo.engine import array
 from liethermo.engine.rounding import with_rounding
 from liethermo.models.thermo_particles import thermo_particles_solution
+from tests.cases import slow
 
-TWO = lt.models.thermo_particles()
+two = functools.cache(lt.models.thermo_particles)
 WARM = np.log([0.5, 1.5])  # relaxes to T = 1, where both entropies vanish
 
 
@@ -26,13 +30,13 @@ def test_the_size_at_which_a_function_is_rounded():
         value, size = with_rounding(function, np.array(x))
         assert value == function(x)
         assert 0.2 * expected <= size <= 5 * expected
-    assert 0.2 < array.noise_of(TWO, np.zeros(2)) < 10.0
+    assert 0.2 < array.noise_of(two(), np.zeros(2)) < 10.0
     assert array.noise_of(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
 
 
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_two_bodies_of_temperature_one(engine):
-    solution = lt.integrate(TWO, WARM, (0.0, 60.0), 0.1, engine=engine)
+    solution = lt.integrate(two(), WARM, (0.0, 60.0), 0.1, engine=engine)
     assert np.abs(solution.x[-1]).max() < 1e-14
     assert solution.stats.worst_residual < 1e-12
     assert np.abs(solution.energy - 2.0).max() < 2e-15
@@ -42,7 +46,7 @@ def test_two_bodies_of_temperature_one(engine):
 def test_starting_next_to_rest():
     """At temperatures that differ by 1e-9: nothing of the run is larger."""
     x0 = np.array([1e-9, -1e-9])
-    solution = lt.integrate(TWO, x0, (0.0, 2.0), 0.1, lt.MetriplecticGauss(2), engine="compiled")
+    solution = lt.integrate(two(), x0, (0.0, 2.0), 0.1, lt.MetriplecticGauss(2), engine="compiled")
     assert solution.x[-1] == pytest.approx(np.exp(-4.0) * x0, rel=1e-6)
 
 
@@ -60,20 +64,20 @@ def test_a_grid_that_cools_to_temperature_one(engine):
 def test_an_ensemble_that_comes_to_rest(engine):
     starts = np.random.default_rng(0).uniform(0.5, 1.5, (5, 2))
     starts = np.log(starts / starts.mean(axis=1, keepdims=True))
-    runs = lt.ensemble(TWO, starts, (0.0, 40.0), 0.1, engine=engine)
+    runs = lt.ensemble(two(), starts, (0.0, 40.0), 0.1, engine=engine)
     assert runs.ok.all(), str(runs)
     assert np.abs(runs.x).max() < 1e-14
     assert runs.residual.max() < 1e-12
 
 
 def test_flow_to_rest():
-    assert np.abs(lt.flow(TWO, WARM, (0.0, 30.0), 0.1)).max() < 1e-13
+    assert np.abs(lt.flow(two(), WARM, (0.0, 30.0), 0.1)).max() < 1e-13
 
 
 @pytest.mark.parametrize("x0", [WARM, np.zeros(2)], ids=["warm", "at rest"])
 def test_adaptive_steps_to_rest(x0):
     """Some tens of steps, and the last of them long: rounding is no error."""
-    solution = lt.integrate(TWO, x0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(3))
+    solution = lt.integrate(two(), x0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(3))
     assert solution.stats.steps < 200
     assert np.abs(solution.x[-1]).max() < 1e-13
 
@@ -104,3 +108,21 @@ def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
     assert "save_every or save_at" in solution.status.message
     assert solution.stats.steps == 20
     assert lt.integrate(body, x0, (0.0, 5.0), lt.Adaptive(1e-8), save_at=[1.0], **few).status.ok
+
+
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticGauss(2), slow(lt.MetriplecticMidpoint()), slow(lt.MetriplecticMidpoint("mean_value"))]
+)
+def test_terms_that_cancel_in_the_energy(method):
+    """``1 - cos q`` is rounding near q = 0, of the size of 1, however small the energy is that comes out."""
+    system = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + 1.0 - jnp.cos(x[0]))
+    amplitudes, h = np.array([1e-9, 1e-7, 1e-5, 1e-3]), 0.05
+    starts = np.stack([np.zeros(4), amplitudes], axis=1)
+    swing = np.array([np.sin(10.0), np.cos(10.0)])
+    runs = lt.ensemble(system, starts, (0.0, 10.0), h, method)
+    assert runs.audit().passed, f"\n{runs.audit()}"
+    assert np.abs(runs.x / amplitudes[:, None] - swing).max() < (1e-6 if method.order == 4 else 0.01)
+    for x0 in starts:
+        solution = lt.integrate(system, x0, (0.0, 10.0), h, method)
+        assert solution.audit().passed, f"\n{solution.audit()}"
+        assert np.abs(solution.x[-1] / x0[1] - swing).max() < (1e-6 if method.order == 4 else 0.01)

@@ -22,7 +22,7 @@ def rebuilt(tree):
 def each_system():
     yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
     yield from SYSTEMS.items()
-    yield from ((f"simple closed, {name}", lambda system=system: system) for name, system in ISOLATED.items())
+    yield from ((f"simple closed, {name}", lambda name=name: ISOLATED[name]) for name in ISOLATED)
     for name in lt.models.__all__:
         yield f"model {name}", getattr(lt.models, name)
 

@@ -50,7 +50,7 @@ def test_xarray(solution):
     assert json.loads(dataset.attrs["provenance"])["library"].startswith("liethermo ")
 
 
-@pytest.mark.parametrize("keep", [0, 10, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("keep", [0, 10, 0.3, 0.9, 0.99])
 def test_a_file_cut_short(solution, tmp_path, keep):
     path = solution.save(tmp_path / "run.nc")
     content = path.read_bytes()
@@ -69,10 +69,14 @@ def same(a, b) -> bool:
 
 @pytest.mark.filterwarnings("error")
 def test_a_damaged_file_is_refused_or_loads_unharmed(solution, tmp_path, capfd):
-    """One bit of a file is flipped, at places all over it: never another trajectory, nor a word on the terminal."""
+    """One bit of a file is flipped, at places all over it: never another trajectory, nor a word on the terminal.
+
+    Nor does it ever reach the reader of HDF5, which some such files keep busy for ever; but in the words of the seal.
+    """
     path, other = solution.save(tmp_path / "run.nc"), tmp_path / "damaged.nc"
     content, random, refused = path.read_bytes(), np.random.default_rng(12), 0
-    for place in random.integers(len(content), size=300):
+    words = range(len(content) - 80, len(content) - 70)
+    for place in [*random.integers(len(content) - 100, size=300), *words]:
         damaged = bytearray(content)
         damaged[place] ^= 1 << random.integers(8)
         other.write_bytes(damaged)
@@ -80,7 +84,7 @@ def test_a_damaged_file_is_refused_or_loads_unharmed(solution, tmp_path, capfd):
             assert same(lt.load(other), solution), place
         except lt.FileError:
             refused += 1
-    assert 50 < refused < 280  # the rest is padding
+    assert refused == 300
     assert capfd.readouterr().err == ""
 
 

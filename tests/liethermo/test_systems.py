@@ -1,5 +1,6 @@
 """Systems: the Euler-Poincaré side, the axioms' report, and input that is refused."""
 
+import functools
 import warnings
 
 import equinox as eqx
@@ -27,7 +28,7 @@ def quartic(xi):
 @given(seed=st.integers(0, 10**6))
 def test_legendre_transform(seed):
     """mu = dl/dxi and xi = dH/dmu are inverse; H(mu) = <mu, xi> - l(xi); grad H and its Hessian are consistent."""
-    system = _QUARTIC
+    system = _quartic_system()
     xi = 2.0 * np.random.default_rng(seed).standard_normal(3)
     mu = system.momentum(xi)
     assert np.allclose(system.velocity(mu), xi, rtol=0, atol=1e-12)
@@ -39,11 +40,13 @@ def test_legendre_transform(seed):
 
 @jax.jit
 def _derivatives(mu, xi):
-    H = _QUARTIC.energy.value
+    H = _quartic_system().energy.value
     return jax.grad(H)(mu), jax.hessian(H)(mu), jax.hessian(quartic)(xi)
 
 
-_QUARTIC = lt.EulerPoincareSystem(mf.so(3), quartic, entropy=SPHERE, dissipation=lt.KillingDissipation(0.5))
+@functools.cache
+def _quartic_system():
+    return lt.EulerPoincareSystem(mf.so(3), quartic, entropy=SPHERE, dissipation=lt.KillingDissipation(0.5))
 
 
 def test_quadratic_lagrangians_are_transformed_in_closed_form():
@@ -60,7 +63,7 @@ def test_quadratic_lagrangians_are_transformed_in_closed_form():
 
 
 def test_an_euler_poincare_run_obeys_the_laws():
-    solution = lt.integrate(_QUARTIC, [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
+    solution = lt.integrate(_quartic_system(), [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
     assert solution.audit().passed, f"\n{solution.audit()}"
     assert solution.entropy[-1] > 1.05 * solution.entropy[0]
 

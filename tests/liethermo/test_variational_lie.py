@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import manifolds as mf
 from liethermo.engine.interpret import at_points
 from liethermo.models.body_with_wheels import body_with_wheels_rest
 
-BODY = lt.models.body_with_wheels()
+body = functools.cache(lt.models.body_with_wheels)
 X0 = [0.1, 1.0, 0.2, 0.5, -0.3, 0.4, 0.0]
 METHOD = lt.LieVariational()
 
@@ -27,7 +29,9 @@ def braking(xi, S):
     return -(0.1 + 0.05 * S**2) * (1.0 + xi @ xi) * jnp.array([1.0, 0.5, 0.2]) * xi
 
 
-TANGLED = lt.EulerPoincareClosedSystem(mf.so(3), tangled, braking)
+@functools.cache
+def tangled_system():
+    return lt.EulerPoincareClosedSystem(mf.so(3), tangled, braking)
 
 
 def residuals(system, x):
@@ -42,8 +46,9 @@ def residuals(system, x):
     }, rate[-1]
 
 
-@pytest.mark.parametrize("system", [BODY, TANGLED], ids=["body with wheels", "tangled"])
-def test_the_equations(system):
+@pytest.mark.parametrize("make", [body, tangled_system], ids=["body with wheels", "tangled"])
+def test_the_equations(make):
+    system = make()
     points = np.random.default_rng(0).standard_normal((8, system.dim))
     found, production = at_points(residuals, system, points)
     for name, residual in found.items():
@@ -56,11 +61,11 @@ def test_the_equations(system):
 def test_a_body_that_heats_itself():
     """Both ends of the balance, the sign of the production, and the spatial momentum, which friction does not touch."""
     h = 0.1
-    solution = lt.integrate(BODY, X0, (0.0, 200.0), h, METHOD, engine="array")
+    solution = lt.integrate(body(), X0, (0.0, 200.0), h, METHOD, engine="array")
     assert solution.stats.least_entropy_increment >= 0.0
     assert (np.diff(solution.x[:200, -1]) > 0.0).all()  # later it is at rest
     assert solution.audit().energy_drift < 1e-3  # 4e-4 measured: of second order, and bounded
-    g, mu = METHOD.attitudes(BODY, solution.x, h)[:, :3, :3], np.asarray(BODY.momenta(solution.x))[:, :3]
+    g, mu = METHOD.attitudes(body(), solution.x, h)[:, :3, :3], np.asarray(body().momenta(solution.x))[:, :3]
     spatial = np.einsum("kij,kj->ki", g, mu)  # Ad*_{g^-1} mu = g mu on SO(3)
     assert np.abs(spatial - spatial[0]).max() < 1e-12 * np.linalg.norm(spatial[0])
     assert np.abs(mu - mu[0]).max() > 0.5  # in the body it moves
@@ -68,7 +73,7 @@ def test_a_body_that_heats_itself():
     # it ends as a spin about the axis of greatest inertia, wheels at rest, at the temperature of the energy balance
     assert np.abs(solution.x[-1, 1:6]).max() < 1e-2
     expected = body_with_wheels_rest(np.linalg.norm(mu[0]), solution.energy[0])
-    assert float(BODY.temperature(solution.x[-1])) == pytest.approx(expected, rel=1e-3)
+    assert float(body().temperature(solution.x[-1])) == pytest.approx(expected, rel=1e-3)
 
 
 def _errors(system, x0, steps, t=2.0):
@@ -81,11 +86,11 @@ def _errors(system, x0, steps, t=2.0):
 
 
 @pytest.mark.parametrize(
-    ("system", "x0"), [(TANGLED, [0.5, 1.0, -0.4, 0.1]), pytest.param(BODY, X0, marks=pytest.mark.slow)]
+    ("make", "x0"), [(tangled_system, [0.5, 1.0, -0.4, 0.1]), pytest.param(body, X0, marks=pytest.mark.slow)]
 )
-def test_observed_order(system, x0):
+def test_observed_order(make, x0):
     """2 by hand: the discrete Lagrangian is symmetric."""
-    errors = _errors(system, x0, (20, 40, 80, 160))
+    errors = _errors(make(), x0, (20, 40, 80, 160))
     assert METHOD.order == 2
     assert (np.abs(np.log2(np.array(errors[:-1]) / errors[1:]) - 2) < 0.2).all(), errors
 
@@ -109,8 +114,8 @@ def test_without_friction_the_casimirs_and_the_energy_stay():
 
 def test_a_control_that_does_not_keep_the_spatial_momentum():
     """The same system by a metriplectic scheme, which knows no group: its |mu| drifts."""
-    solution = lt.integrate(BODY, X0, (0.0, 20.0), 0.1, lt.Reference(rtol=1e-5))
-    size = np.linalg.norm(np.asarray(BODY.momenta(solution.x))[:, :3], axis=1)
+    solution = lt.integrate(body(), X0, (0.0, 20.0), 0.1, lt.Reference(rtol=1e-5))
+    size = np.linalg.norm(np.asarray(body().momenta(solution.x))[:, :3], axis=1)
     assert np.abs(size - size[0]).max() > 1e-8
 
 
