@@ -36,7 +36,8 @@ class BuiltOnUse(Mapping):
     """What is built when it is first asked for, by name: collecting the tests builds nothing."""
 
     def __init__(self, makers: Mapping[str, Callable]) -> None:
-        self._makers, self._built = dict(makers), {}
+        self._makers = dict(makers)
+        self._built: dict = {}
 
     def __getitem__(self, name: str):
         if name not in self._built:
