@@ -11,10 +11,10 @@ import numpy as np
 import scipy.sparse
 
 from .energy import Energy, Function, check_scalar, recognised
-from .engine.interpret import polynomial_degree
-from .engine.traced import settled
 from .errors import FunctionError, InputError
 from .indices import Indices, cliques
+from .tracing.interpret import polynomial_degree
+from .tracing.traced import settled
 
 
 class Each(Energy):

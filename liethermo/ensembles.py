@@ -19,9 +19,6 @@ import numpy as np
 from .audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
 from .engine import array, compiled
 from .engine.compiled import Form
-from .engine.interpret import at_points
-from .engine.programs import program
-from .engine.scalarize import UnsupportedPrimitive
 from .errors import InputError
 from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
 from .family import Family, common_size
@@ -30,6 +27,9 @@ from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, law
 from .solution import Laws
 from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import CHUNK_STEPS, Timetable
+from .tracing.interpret import at_points
+from .tracing.programs import program
+from .tracing.scalarize import UnsupportedPrimitive
 
 LANES = 16
 """Trajectories in a block of the compiled engine: two AVX-512 vectors, enough to hide the latency of arithmetic."""

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .energy import Energy
-from .engine.interpret import at_points
 from .engine.rounding import with_rounding
-from .engine.scalarize import UnsupportedPrimitive
 from .integrators import OneStepMethod
 from .systems import System
+from .tracing.interpret import at_points
+from .tracing.scalarize import UnsupportedPrimitive
 
 MEASURED = 256
 """States of a run at which the sensitivities of its functions are evaluated."""

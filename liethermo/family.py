@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .engine.compiled import Form
-from .engine.remembered import fingerprint
-from .engine.traced import Traced, traced
 from .errors import InputError
 from .systems import System
+from .tracing.remembered import fingerprint
+from .tracing.traced import Traced, traced
 
 PROBES = 8
 """Members of a family that are built, and so checked, one by one."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from .energy import traced_energies
 from .engine import array, implicit
-from .engine.programs import program
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .systems import DrivenSystem, System, driven
 from .timetable import Timetable
+from .tracing.programs import program
 
 
 def flow(

@@ -11,7 +11,7 @@ import numpy as np
 
 from .each import Each
 from .energy import Energy, Function, Pullback, Quadratic, is_traced
-from .engine.interpret import at_points
+from .tracing.interpret import at_points
 
 
 class Kinetic(Energy):

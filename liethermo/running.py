@@ -17,10 +17,6 @@ import numpy as np
 
 from .energy import traced_energies
 from .engine import array, compiled
-from .engine.interpret import at_points
-from .engine.programs import program
-from .engine.remembered import remembered
-from .engine.scalarize import UnsupportedPrimitive
 from .engine.sparse import SparseEngine
 from .errors import InputError
 from .evidence import MEASURED, Witness, spread
@@ -30,6 +26,10 @@ from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System, driven
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
+from .tracing.interpret import at_points
+from .tracing.programs import program
+from .tracing.remembered import remembered
+from .tracing.scalarize import UnsupportedPrimitive
 
 SMALL_DIM, SMALL_PROGRAM = 16, 4000
 """Components of a state and operations of a step up to which it is compiled in about the time that XLA takes (two or

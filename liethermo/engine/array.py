@@ -20,7 +20,7 @@ from manifolds import matrix_functions
 
 from ..integrators import OneStepMethod
 from ..systems import System
-from .programs import program
+from ..tracing.programs import program
 from .rounding import with_rounding
 
 EPS = float(np.finfo(np.float64).eps)

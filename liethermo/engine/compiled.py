@@ -26,12 +26,12 @@ import numpy as np
 
 from ..integrators import OneStepMethod
 from ..systems import System
+from ..tracing.remembered import Latest, remembered
+from ..tracing.scalarize import Program, scalarize
 from . import array, step_loop
 from . import straight_line as straight_line_module
 from .array import State
 from .module_cache import load
-from .remembered import Latest, remembered
-from .scalarize import Program, scalarize
 from .straight_line import is_plain
 
 VECTORS = {"x": "X", "low": "LOW", "k": "K", "before": "BEFORE"}

@@ -16,9 +16,9 @@ import numpy as np
 
 from ..integrators import OneStepMethod
 from ..systems import System
+from ..tracing.programs import program
 from . import array
 from .linear import Compression, Inverse
-from .programs import program
 from .rounding import with_rounding
 
 LIMIT = 80

@@ -14,11 +14,11 @@ import manifolds as mf
 
 from ..dissipation import Dissipation, portions
 from ..energy import Energy, as_energy, check_scalar, on_points, recognised
-from ..engine.interpret import at_points
 from ..errors import InputError
 from ..frames import frame
 from ..gradients import stage_gradients
 from ..systems import ChartSystem, System
+from ..tracing.interpret import at_points
 from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register
 from .charts import in_charts
 from .composed_entropy import composed_gradients

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..engine.programs import program
 from ..errors import InputError
 from ..systems import System
+from ..tracing.programs import program
 
 
 @dataclass(frozen=True)

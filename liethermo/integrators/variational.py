@@ -11,10 +11,10 @@ import numpy as np
 
 from manifolds.matrix_functions import solve
 
-from ..engine.interpret import polynomial_degree
-from ..engine.programs import program
 from ..errors import InputError
 from ..systems import SimpleClosedSystem, System
+from ..tracing.interpret import polynomial_degree
+from ..tracing.programs import program
 from .base import OneStepMethod
 from .discrete import DiscreteSystem, FiniteDifference, Pair
 

@@ -10,9 +10,9 @@ import manifolds as mf
 from manifolds import matrix_functions
 from manifolds.matrix_functions import solve
 
-from ..engine.programs import program
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem, System
+from ..tracing.programs import program
 from .base import OneStepMethod
 
 NEWTON_STEPS = 20

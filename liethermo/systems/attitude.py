@@ -13,8 +13,8 @@ import manifolds as mf
 from manifolds import matrix_functions
 
 from ..energy import Energy, Sum
-from ..engine.interpret import at_points
 from ..errors import InputError
+from ..tracing.interpret import at_points
 from .base import System
 from .lie_poisson import LiePoissonSystem
 

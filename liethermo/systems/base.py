@@ -16,9 +16,9 @@ from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
 from ..energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
-from ..engine.interpret import at_points
-from ..engine.traced import settled
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
+from ..tracing.interpret import at_points
+from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 
 SCALES = (1.0, 1e-4, 1e4)

@@ -12,8 +12,8 @@ import numpy as np
 from ..dissipation import semidefinite
 from ..each import Each
 from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
-from ..engine.traced import converted
 from ..errors import InputError
+from ..tracing.traced import converted
 
 
 class Subsystem(eqx.Module):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..dissipation import KERNEL
-from ..engine.interpret import at_points
 from ..errors import InputError
+from ..tracing.interpret import at_points
 
 if TYPE_CHECKING:
     from .base import System

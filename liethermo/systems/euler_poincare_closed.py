@@ -14,9 +14,9 @@ from manifolds.matrix_functions import solve
 
 from ..dissipation import Law, SkewFriction
 from ..energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
-from ..engine.interpret import at_points
-from ..engine.traced import settled
 from ..errors import InputError
+from ..tracing.interpret import at_points
+from ..tracing.traced import settled
 from .base import System
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component

@@ -14,10 +14,10 @@ import manifolds as mf
 from manifolds.matrix_functions import inverse
 
 from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
-from ..engine.interpret import at_points
-from ..engine.programs import program
 from ..errors import InputError
 from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
+from ..tracing.interpret import at_points
+from ..tracing.programs import program
 from .euler_poincare import inverse_gradient, singular_everywhere
 from .evolution import (
     ContactSystem,

@@ -15,8 +15,8 @@ from manifolds.matrix_functions import solve
 
 from ..dissipation import Law, SkewFriction, semidefinite
 from ..energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
-from ..engine.interpret import at_points
 from ..errors import InputError
+from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities
 

@@ -13,7 +13,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engine import compiled, step_loop
-from liethermo.engine.remembered import Latest
+from liethermo.tracing.remembered import Latest
 from tests.cases import DISSIPATIONS, build, state_of
 
 BODY = lt.models.rigid_body()

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.interpret import at_points
 from liethermo.systems.driven import UNIT
+from liethermo.tracing.interpret import at_points
 
 RATE = 1.3
 SPAN = (0.5, 3.5)

@@ -11,8 +11,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine import programs, traced
-from liethermo.engine.remembered import Latest
+from liethermo.tracing import programs, traced
+from liethermo.tracing.remembered import Latest
 
 COMMON = """
 import resource, sys, time

@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.interpret import at_points
+from liethermo.tracing.interpret import at_points
 from tests.cases import DISSIPATIONS, build, slow
 from tests.liethermo.closed_systems import ISOLATED
 from tests.liethermo.test_convergence import SYSTEMS

@@ -7,7 +7,7 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.remembered import KEPT, fingerprint, remembered
+from liethermo.tracing.remembered import KEPT, fingerprint, remembered
 
 
 def counted():

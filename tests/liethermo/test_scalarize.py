@@ -24,10 +24,10 @@ from jax.extend.core import jaxprs_in_params
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.primitives import FUNCTIONS, OPERATIONS, RULES, Instruction
-from liethermo.engine.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize
 from liethermo.engine.straight_line import is_plain
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
+from liethermo.tracing.primitives import FUNCTIONS, OPERATIONS, RULES, Instruction
+from liethermo.tracing.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize
 from tests.cases import DISSIPATIONS, EPS, build, state_of
 
 rng = np.random.default_rng(0)
@@ -493,7 +493,7 @@ def test_text_is_the_same_in_every_process():
     """Its hash is the key of a cache on disk."""
     script = """
 import jax, jax.numpy as jnp, manifolds as mf
-from liethermo.engine.scalarize import scalarize
+from liethermo.tracing.scalarize import scalarize
 C = mf.su(2).structure_constants
 f = lambda x, p: jnp.einsum("abc,a,b->c", C, x, jax.grad(lambda y: jnp.sum(jnp.cos(p * y)) * jnp.linalg.norm(y))(x))
 spec = jax.ShapeDtypeStruct((3,), jnp.float64)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engine.interpret import at_points
+from liethermo.tracing.interpret import at_points
 from tests.cases import tolerance
 
 from .closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engine.interpret import at_points
 from liethermo.models.cylinder import cylinder_rest
 from liethermo.models.mass_spring_gas import CASES, mass_spring_gas_solution
+from liethermo.tracing.interpret import at_points
 
 START = [0.3, -0.2, 0.1]
 FRICTIONS = {"undamped": 0.0, "underdamped": 2.0, "critical": 10.0, "overdamped": 25.0}

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liethermo.engine.primitives import Instruction
-from liethermo.engine.scalarize import Program
 from liethermo.engine.straight_line import OF_NUMBERS, OF_TESTS, TESTS, is_plain, straight_line
+from liethermo.tracing.primitives import Instruction
+from liethermo.tracing.scalarize import Program
 from tests.liethermo.test_scalarize import STEPS, program_of, shapes, steps
 
 LANES = 3

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engine.interpret import at_points
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
+from liethermo.tracing.interpret import at_points
 
 from .closed_systems import ISOLATED, OPEN, SCHEMES, X0
 

@@ -10,8 +10,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.interpret import at_points
 from liethermo.models.body_with_wheels import body_with_wheels_rest
+from liethermo.tracing.interpret import at_points
 
 body = functools.cache(lt.models.body_with_wheels)
 X0 = [0.1, 1.0, 0.2, 0.5, -0.3, 0.4, 0.0]

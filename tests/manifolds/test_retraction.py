@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import manifolds as mf
-from liethermo.engine.scalarize import scalarize
+from liethermo.tracing.scalarize import scalarize
 
 TOLERANCES = {
     # name: (bound, what was measured and why)

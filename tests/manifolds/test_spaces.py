@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import manifolds as mf
-from liethermo.engine.scalarize import scalarize
+from liethermo.tracing.scalarize import scalarize
 
 TOLERANCES = {
     # name: (bound, what was measured and why)

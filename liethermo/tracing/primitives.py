@@ -643,7 +643,7 @@ RULES: dict[str, Rule] = {
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
 }
-"""How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.engine.scalarize`."""
+"""How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.tracing.scalarize`."""
 
 PARAMETERS = """
 accuracy axes axis broadcast_dimensions conjugate_a dimension dimension_numbers dimensions dtype fill_value index_dtype
