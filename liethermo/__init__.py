@@ -21,8 +21,6 @@ from .dissipation import (
     KillingDissipation,
     ProjectedMetric,
 )
-from .each import Each
-from .energy import Energy, Function, Quadratic, TimeDependent
 from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
@@ -38,7 +36,10 @@ from .errors import (
     SpecError,
 )
 from .flow import flow
-from .gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
+from .functions.each import Each
+from .functions.energy import Energy, Function, Quadratic, TimeDependent
+from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
+from .functions.mechanics import Kinetic, Potential
 from .graph_files import Graph, read_graph
 from .integrators import (
     DiscreteHerglotz,
@@ -54,7 +55,6 @@ from .integrators import (
     WithAttitude,
     registered_methods,
 )
-from .mechanics import Kinetic, Potential
 from .solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (

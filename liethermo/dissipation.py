@@ -21,9 +21,9 @@ import scipy.sparse
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from .energy import Energy, as_energy, recognised
 from .errors import IndefiniteError, InputError
-from .indices import union
+from .functions.energy import Energy, as_energy, recognised
+from .functions.indices import union
 
 if TYPE_CHECKING:
     from .systems import System

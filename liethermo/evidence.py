@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .energy import Energy
-from .engine.rounding import with_rounding
+from .functions.energy import Energy
+from .functions.rounding import with_rounding
 from .integrators import OneStepMethod
 from .systems import System
 from .tracing.interpret import at_points

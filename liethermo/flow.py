@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .energy import traced_energies
 from .engine import array, implicit
+from .functions.energy import traced_energies
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .systems import DrivenSystem, System, driven
 from .timetable import Timetable

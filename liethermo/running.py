@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .energy import traced_energies
 from .engine import array, compiled
 from .engine.sparse import SparseEngine
 from .errors import InputError
 from .evidence import MEASURED, Witness, spread
+from .functions.energy import traced_energies
 from .integrators import OneStepMethod, Reference, WithAttitude
 from .solution import Laws, Solution, Stats, Status
 from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of

@@ -18,8 +18,8 @@ import scipy.sparse
 import manifolds as mf
 
 from .dissipation import Dissipation, Law, SkewFriction
+from .functions.indices import Indices, as_pattern, cliques
 from .graph import Edges
-from .indices import Indices, as_pattern, cliques
 
 
 class HeatConduction(Dissipation):

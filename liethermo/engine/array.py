@@ -18,10 +18,10 @@ import numpy as np
 
 from manifolds import matrix_functions
 
+from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-from .rounding import with_rounding
 
 EPS = float(np.finfo(np.float64).eps)
 

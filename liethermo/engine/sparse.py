@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
 from . import array
 from .linear import Compression, Inverse
-from .rounding import with_rounding
 
 LIMIT = 80
 """Newton iterations: cheap ones, most of which use factors that are there already."""

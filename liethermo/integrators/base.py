@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engine.rounding import with_rounding
 from ..errors import InputError
-from ..gradients import EPS, compensated
+from ..functions.gradients import EPS, compensated
+from ..functions.rounding import with_rounding
 from ..systems import System
 from .tableaus import MOST_STAGES, at_start, beyond, gauss
 

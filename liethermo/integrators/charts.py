@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import manifolds as mf
 
 from ..errors import InputError
-from ..gradients import EPS
+from ..functions.gradients import EPS
 from ..systems import ChartSystem, System
 from .base import OneStepMethod, collocation_error
 

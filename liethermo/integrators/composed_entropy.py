@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from ..energy import Energy
-from ..frames import Frame, frame
-from ..gradients import Change, Direction, corrected
+from ..functions.energy import Energy
+from ..functions.frames import Frame, frame
+from ..functions.gradients import Change, Direction, corrected
 
 NEWTON = 3
 """Steps of Newton's method to a level of the Casimirs: the distance is O(h), so what is left is O(h^8)."""

@@ -13,10 +13,10 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import Dissipation, portions
-from ..energy import Energy, as_energy, check_scalar, on_points, recognised
 from ..errors import InputError
-from ..frames import frame
-from ..gradients import stage_gradients
+from ..functions.energy import Energy, as_energy, check_scalar, on_points, recognised
+from ..functions.frames import frame
+from ..functions.gradients import stage_gradients
 from ..systems import ChartSystem, System
 from ..tracing.interpret import at_points
 from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register

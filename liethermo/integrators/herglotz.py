@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 from manifolds.matrix_functions import solve
 
-from ..energy import Energy, as_energy
 from ..errors import InputError
+from ..functions.energy import Energy, as_energy
 from ..systems import EvolutionSystem, System
 from .base import OneStepMethod
 

@@ -7,7 +7,7 @@ import jax
 
 import manifolds as mf
 
-from ..gradients import DiscreteGradient, discrete_gradient
+from ..functions.gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
 from .base import OneStepMethod, collocation_error, register
 from .charts import in_charts

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from manifolds import matrix_functions
 
 from ..errors import InputError
-from ..gradients import compensated
+from ..functions.gradients import compensated
 from ..systems import AttitudeSystem
 from .base import OneStepMethod
 from .tableaus import gauss

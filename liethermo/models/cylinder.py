@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..energy import Function
-from ..mechanics import Kinetic
+from ..functions.energy import Function
+from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
 from ..systems.simple_closed import timed
 from .gas_piston import GAS_CONSTANT, IdealGas

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..energy import Function
-from ..mechanics import Kinetic
+from ..functions.energy import Function
+from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Subsystem
 from .parameters import positive
 from .thermo_particles import Warmth

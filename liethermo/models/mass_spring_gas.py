@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..energy import Function, Quadratic
+from ..functions.energy import Function, Quadratic
 from ..systems import SimpleClosedSystem
 from .gas_piston import GAS_CONSTANT
 from .parameters import positive

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg
 
-from ..energy import Quadratic
+from ..functions.energy import Quadratic
 from ..systems import EvolutionSystem
 from .parameters import positive
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from ..energy import is_traced
 from ..errors import InputError
+from ..functions.energy import is_traced
 
 
 def positive(value, name: str, count: int | None = None) -> jax.Array:

@@ -12,8 +12,8 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import KillingDissipation, checked_rate
-from ..energy import Quadratic, is_traced
 from ..errors import InputError
+from ..functions.energy import Quadratic, is_traced
 from ..systems import LiePoissonSystem
 
 PUBLISHED = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..each import Each
-from ..energy import Energy, Function, Quadratic
 from ..errors import InputError
-from ..mechanics import Kinetic
+from ..functions.each import Each
+from ..functions.energy import Energy, Function, Quadratic
+from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Copies
 from .parameters import positive, whole
 

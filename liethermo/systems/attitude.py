@@ -12,8 +12,8 @@ import numpy as np
 import manifolds as mf
 from manifolds import matrix_functions
 
-from ..energy import Energy, Sum
 from ..errors import InputError
+from ..functions.energy import Energy, Sum
 from ..tracing.interpret import at_points
 from .base import System
 from .lie_poisson import LiePoissonSystem

@@ -15,8 +15,8 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation import Dissipation, Law
-from ..energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
+from ..functions.energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..dissipation import semidefinite
-from ..each import Each
-from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
 from ..errors import InputError
+from ..functions.each import Each
+from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
 from ..tracing.traced import converted
 
 

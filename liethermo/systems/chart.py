@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import manifolds as mf
 
 from ..dissipation import Carried, Several
-from ..energy import Energy, Sum
+from ..functions.energy import Energy, Sum
 from .base import System
 
 

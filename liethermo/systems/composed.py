@@ -14,11 +14,11 @@ import scipy.sparse
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
 from ..errors import InputError
+from ..functions.energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
+from ..functions.indices import as_pattern, pattern, union
+from ..functions.mechanics import is_free_of, is_mechanical
 from ..graph import Edges, edges, parts
-from ..indices import as_pattern, pattern, union
-from ..mechanics import is_free_of, is_mechanical
 from ..thermal import ContactFriction, Drag, HeatConduction, LinearFriction
 from .base import System
 from .bodies import Copies, Subsystem, named

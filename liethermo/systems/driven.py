@@ -12,8 +12,8 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import Carried, Several
-from ..energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
 from ..errors import InputError
+from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
 from .base import System
 
 UNIT = 2.0**-100

@@ -13,8 +13,8 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Dissipation, EulerPoincareForce
-from ..energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
 from ..errors import InputError
+from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
 from .lie_poisson import LiePoissonSystem
 
 NEWTON_STEPS = 50

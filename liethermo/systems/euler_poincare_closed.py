@@ -13,8 +13,8 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Law, SkewFriction
-from ..energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
 from ..errors import InputError
+from ..functions.energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .base import System

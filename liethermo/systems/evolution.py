@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import manifolds as mf
 
 from ..dissipation import Law, SkewFriction
-from ..energy import Energy, Quadratic, as_energy, check_scalar, recognised
 from ..errors import InputError
-from ..mechanics import is_mechanical
+from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, recognised
+from ..functions.mechanics import is_mechanical
 from .base import System
 
 

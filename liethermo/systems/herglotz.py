@@ -13,9 +13,9 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import inverse
 
-from ..energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
 from ..errors import InputError
-from ..mechanics import Kinetic, is_free_of_momenta, is_mechanical
+from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..functions.mechanics import Kinetic, is_free_of_momenta, is_mechanical
 from ..tracing.interpret import at_points
 from ..tracing.programs import program
 from .euler_poincare import inverse_gradient, singular_everywhere

@@ -14,8 +14,8 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation import Dissipation
-from ..energy import Energy, as_energy, check_scalar
 from ..errors import InputError
+from ..functions.energy import Energy, as_energy, check_scalar
 from .base import System
 
 RECORDED_MONOMIALS = 400

@@ -14,8 +14,8 @@ import manifolds as mf
 from manifolds.matrix_functions import solve
 
 from ..dissipation import Law, SkewFriction, semidefinite
-from ..energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
 from ..errors import InputError
+from ..functions.energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.gradients import GRADIENTS
+from liethermo.functions.gradients import GRADIENTS
 from tests.cases import tolerance
 
 seeds = st.integers(0, 10**6)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.gradients import GRADIENTS
+from liethermo.functions.gradients import GRADIENTS
 from tests.cases import EPS, energy_of
 
 NAMES = list(GRADIENTS)

@@ -8,7 +8,7 @@ import liethermo as lt
 import manifolds as mf
 from benchmarks.measurements import spin
 from benchmarks.problems import general_body
-from liethermo.gradients import GRADIENTS
+from liethermo.functions.gradients import GRADIENTS
 
 MILLION = 1_000_000
 

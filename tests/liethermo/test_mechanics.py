@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.gradients import GRADIENTS
-from liethermo.mechanics import is_mechanical
+from liethermo.functions.gradients import GRADIENTS
+from liethermo.functions.mechanics import is_mechanical
 from tests.cases import EPS
 
 seeds = st.integers(0, 10**6)

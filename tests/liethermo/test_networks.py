@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 from liethermo.engine import array, linear
-from liethermo.gradients import GRADIENTS, stage_gradients
+from liethermo.functions.gradients import GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss
 from liethermo.models.heat_grid import grid_graph, heat_grid_solution
 from tests.cases import tolerance

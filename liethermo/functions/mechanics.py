@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..tracing.interpret import at_points
 from .each import Each
 from .energy import Energy, Function, Pullback, Quadratic, is_traced
-from .tracing.interpret import at_points
 
 
 class Kinetic(Energy):

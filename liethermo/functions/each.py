@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from ..errors import FunctionError, InputError
+from ..tracing.interpret import polynomial_degree
+from ..tracing.traced import settled
 from .energy import Energy, Function, check_scalar, recognised
-from .errors import FunctionError, InputError
 from .indices import Indices, cliques
-from .tracing.interpret import polynomial_degree
-from .tracing.traced import settled
 
 
 class Each(Energy):

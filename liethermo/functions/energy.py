@@ -21,10 +21,10 @@ import scipy.sparse
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from .errors import FunctionError, InputError
+from ..errors import FunctionError, InputError
+from ..tracing.interpret import at_points, polynomial_degree
+from ..tracing.traced import converted
 from .indices import cliques, pattern, union
-from .tracing.interpret import at_points, polynomial_degree
-from .tracing.traced import converted
 
 if TYPE_CHECKING:
     from .gradients import DiscreteGradient, Path

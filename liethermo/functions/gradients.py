@@ -23,13 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import InputError
 from .energy import Energy
-from .engine.rounding import with_rounding
-from .errors import InputError
 from .frames import frame
+from .rounding import with_rounding
 
 if TYPE_CHECKING:
-    from .integrators.tableaus import Finer
+    from ..integrators.tableaus import Finer
 
 EPS = float(np.finfo(np.float64).eps)
 
