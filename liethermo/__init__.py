@@ -11,7 +11,7 @@ import manifolds  # noqa: F401  (switches 64-bit mode on before anything is trac
 
 from . import models
 from .audit import Audit
-from .dissipation import (
+from .dissipation.base import (
     Dissipation,
     DoubleBracket,
     EulerPoincareForce,

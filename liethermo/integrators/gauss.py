@@ -12,7 +12,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Dissipation, portions
+from ..dissipation.base import Dissipation, portions
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy, check_scalar, on_points, recognised
 from ..functions.frames import frame

@@ -11,7 +11,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import KillingDissipation, checked_rate
+from ..dissipation.base import KillingDissipation, checked_rate
 from ..errors import InputError
 from ..functions.energy import Quadratic, is_traced
 from ..systems import LiePoissonSystem

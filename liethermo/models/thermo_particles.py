@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.edges import edges
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
-from ..graph import edges
 from ..systems import ComposedSystem, Copies, Subsystem
 from .parameters import positive, whole
 

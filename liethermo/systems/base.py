@@ -14,7 +14,7 @@ import scipy.sparse
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from ..dissipation import Dissipation, Law
+from ..dissipation.base import Dissipation, Law
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
 from ..tracing.interpret import at_points

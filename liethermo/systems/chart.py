@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation import Carried, Several
+from ..dissipation.base import Carried, Several
 from ..functions.energy import Energy, Sum
 from .base import System
 

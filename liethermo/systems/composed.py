@@ -13,13 +13,13 @@ import scipy.sparse
 
 import manifolds as mf
 
-from ..dissipation import Dissipation
+from ..dissipation.base import Dissipation
+from ..dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
+from ..dissipation.edges import Edges, edges, parts
 from ..errors import InputError
 from ..functions.energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
 from ..functions.indices import as_pattern, pattern, union
 from ..functions.mechanics import is_free_of, is_mechanical
-from ..graph import Edges, edges, parts
-from ..thermal import ContactFriction, Drag, HeatConduction, LinearFriction
 from .base import System
 from .bodies import Copies, Subsystem, named
 from .evolution import entropy_component

@@ -11,7 +11,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Carried, Several
+from ..dissipation.base import Carried, Several
 from ..errors import InputError
 from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
 from .base import System

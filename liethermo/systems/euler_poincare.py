@@ -12,7 +12,7 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation import Dissipation, EulerPoincareForce
+from ..dissipation.base import Dissipation, EulerPoincareForce
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
 from .lie_poisson import LiePoissonSystem

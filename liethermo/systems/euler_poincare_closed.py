@@ -12,7 +12,7 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation import Law, SkewFriction
+from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
 from ..tracing.interpret import at_points

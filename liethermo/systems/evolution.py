@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation import Law, SkewFriction
+from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, recognised
 from ..functions.mechanics import is_mechanical

@@ -13,7 +13,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation import Dissipation
+from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy, check_scalar
 from .base import System

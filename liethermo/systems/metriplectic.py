@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation import Dissipation
+from ..dissipation.base import Dissipation
 from ..errors import InputError
 from .base import System, square_field
 from .chart import ChartSystem

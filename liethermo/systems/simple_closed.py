@@ -13,7 +13,7 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation import Law, SkewFriction, semidefinite
+from ..dissipation.base import Law, SkewFriction, semidefinite
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
 from ..tracing.interpret import at_points

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.graph import Edges
-from liethermo.thermal import HeatConduction
+from liethermo.dissipation.bodies import HeatConduction
+from liethermo.dissipation.edges import Edges
 from tests.cases import tolerance
 
 seeds = st.integers(0, 10**6)

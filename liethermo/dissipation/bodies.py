@@ -17,9 +17,9 @@ import scipy.sparse
 
 import manifolds as mf
 
-from .dissipation import Dissipation, Law, SkewFriction
-from .functions.indices import Indices, as_pattern, cliques
-from .graph import Edges
+from ..functions.indices import Indices, as_pattern, cliques
+from .base import Dissipation, Law, SkewFriction
+from .edges import Edges
 
 
 class HeatConduction(Dissipation):

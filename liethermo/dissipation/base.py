@@ -21,12 +21,12 @@ import scipy.sparse
 import manifolds as mf
 from manifolds._arrays import real_array
 
-from .errors import IndefiniteError, InputError
-from .functions.energy import Energy, as_energy, recognised
-from .functions.indices import union
+from ..errors import IndefiniteError, InputError
+from ..functions.energy import Energy, as_energy, recognised
+from ..functions.indices import union
 
 if TYPE_CHECKING:
-    from .systems import System
+    from ..systems import System
 
 KERNEL = "K grad H = 0, as given"
 """The row of a check on a friction operator before it is projected."""

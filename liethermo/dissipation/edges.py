@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from .errors import InputError
+from ..errors import InputError
 
 ASYMMETRY = 1e-12
 """How far a symmetric matrix may be from its transpose, relative to its largest entry."""
