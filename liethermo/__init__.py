@@ -40,7 +40,6 @@ from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .functions.mechanics import Kinetic, Potential
-from .graph_files import Graph, read_graph
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
@@ -75,6 +74,7 @@ from .systems import (
     System,
     ThermodynamicHerglotz,
 )
+from .systems.composed.graph_files import Graph, read_graph
 from .timeloop import integrate
 
 __all__ = [

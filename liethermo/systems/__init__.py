@@ -2,9 +2,9 @@
 
 from .attitude import AttitudeSystem
 from .base import System
-from .bodies import Copies, Subsystem
 from .chart import ChartSystem
-from .composed import ComposedSystem
+from .composed.bodies import Copies, Subsystem
+from .composed.system import ComposedSystem
 from .driven import DrivenSystem, driven
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..dissipation.base import semidefinite
-from ..errors import InputError
-from ..functions.each import Each
-from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
-from ..tracing.traced import converted
+from ...dissipation.base import semidefinite
+from ...errors import InputError
+from ...functions.each import Each
+from ...functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ...tracing.traced import converted
 
 
 class Subsystem(eqx.Module):

@@ -13,16 +13,16 @@ import scipy.sparse
 
 import manifolds as mf
 
-from ..dissipation.base import Dissipation
-from ..dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
-from ..dissipation.edges import Edges, edges, parts
-from ..errors import InputError
-from ..functions.energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
-from ..functions.indices import as_pattern, pattern, union
-from ..functions.mechanics import is_free_of, is_mechanical
-from .base import System
+from ...dissipation.base import Dissipation
+from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
+from ...dissipation.edges import Edges, edges, parts
+from ...errors import InputError
+from ...functions.energy import Energy, Function, TimeDependent, check_scalar, is_traced, needed_arguments
+from ...functions.indices import as_pattern, pattern, union
+from ...functions.mechanics import is_free_of, is_mechanical
+from ..base import System
+from ..evolution import entropy_component
 from .bodies import Copies, Subsystem, named
-from .evolution import entropy_component
 
 
 class ComposedSystem(System):
