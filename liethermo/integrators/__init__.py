@@ -2,15 +2,15 @@
 
 from .base import OneStepMethod, registered_methods
 from .charts import InCharts
-from .discrete import DiscreteSystem, FiniteDifference
 from .gauss import MetriplecticGauss
 from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
-from .variational import VariationalIntegrator
-from .variational_gauss import VariationalGauss
-from .variational_lie import LieVariational
+from .variational.discrete import DiscreteSystem, FiniteDifference
+from .variational.gauss import VariationalGauss
+from .variational.lie import LieVariational
+from .variational.schemes import VariationalIntegrator
 
 DEFAULT_METHOD = MetriplecticGauss(1)
 """Of order 2; where energy and entropy are quadratic it is the midpoint scheme."""

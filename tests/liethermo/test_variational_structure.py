@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.integrators.discrete import Pair
+from liethermo.integrators.variational.discrete import Pair
 from manifolds.matrix_functions import solve
 
 from .closed_systems import MECHANICAL, OPEN, SCHEMES, X0

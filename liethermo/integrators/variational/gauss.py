@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from manifolds.matrix_functions import solve
 
-from ..systems import SimpleClosedSystem, System
-from .base import GaussMethod, checked_stages
-from .tableaus import gauss
-from .variational import need_simple_closed, velocity_slope
+from ...systems import SimpleClosedSystem, System
+from ..base import GaussMethod, checked_stages
+from ..tableaus import gauss
+from .schemes import need_simple_closed, velocity_slope
 
 
 class VariationalGauss(GaussMethod):

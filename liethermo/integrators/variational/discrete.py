@@ -18,8 +18,8 @@ import jax.numpy as jnp
 
 from manifolds.matrix_functions import solve
 
-from ..errors import InputError
-from ..systems import SimpleClosedSystem
+from ...errors import InputError
+from ...systems import SimpleClosedSystem
 
 
 class FiniteDifference(eqx.Module):

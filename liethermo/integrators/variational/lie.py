@@ -10,10 +10,10 @@ import manifolds as mf
 from manifolds import matrix_functions
 from manifolds.matrix_functions import solve
 
-from ..errors import InputError
-from ..systems import EulerPoincareClosedSystem, System
-from ..tracing.programs import program
-from .base import OneStepMethod
+from ...errors import InputError
+from ...systems import EulerPoincareClosedSystem, System
+from ...tracing.programs import program
+from ..base import OneStepMethod
 
 NEWTON_STEPS = 20
 """For the velocities between the states of a finished run."""

@@ -11,11 +11,11 @@ import numpy as np
 
 from manifolds.matrix_functions import solve
 
-from ..errors import InputError
-from ..systems import SimpleClosedSystem, System
-from ..tracing.interpret import polynomial_degree
-from ..tracing.programs import program
-from .base import OneStepMethod
+from ...errors import InputError
+from ...systems import SimpleClosedSystem, System
+from ...tracing.interpret import polynomial_degree
+from ...tracing.programs import program
+from ..base import OneStepMethod
 from .discrete import DiscreteSystem, FiniteDifference, Pair
 
 CONSTRAINT_TOLERANCE = 1e-10

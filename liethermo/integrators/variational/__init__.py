@@ -1,0 +1,1 @@
+"""Variational schemes for simple closed systems, on R^n and on Lie groups."""
