@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
-from .engine import array, compiled
-from .engine.compiled import Form
+from .engines import array
+from .engines.compiled import stepper as compiled
+from .engines.compiled.stepper import Form
 from .errors import InputError
 from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
 from .family import Family, common_size

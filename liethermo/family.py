@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engine.compiled import Form
+from .engines.compiled.stepper import Form
 from .errors import InputError
 from .systems import System
 from .tracing.remembered import fingerprint

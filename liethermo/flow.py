@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engine import array, implicit
+from .engines import array, implicit
 from .functions.energy import traced_energies
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .systems import DrivenSystem, System, driven

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engine import array, compiled
-from .engine.sparse import SparseEngine
+from .engines import array
+from .engines.compiled import stepper as compiled
+from .engines.sparse.newton import SparseEngine
 from .errors import InputError
 from .evidence import MEASURED, Witness, spread
 from .functions.energy import traced_energies

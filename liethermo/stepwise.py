@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .engine import array
+from .engines import array
 from .errors import FunctionError, InputError
 from .integrators import DEFAULT_METHOD, OneStepMethod
 from .integrators.tableaus import integrated

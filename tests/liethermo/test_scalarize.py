@@ -24,7 +24,7 @@ from jax.extend.core import jaxprs_in_params
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine.straight_line import is_plain
+from liethermo.engines.compiled.straight_line import is_plain
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
 from liethermo.tracing.primitives import FUNCTIONS, OPERATIONS, RULES, Instruction
 from liethermo.tracing.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liethermo.engine.straight_line import OF_NUMBERS, OF_TESTS, TESTS, is_plain, straight_line
+from liethermo.engines.compiled.straight_line import OF_NUMBERS, OF_TESTS, TESTS, is_plain, straight_line
 from liethermo.tracing.primitives import Instruction
 from liethermo.tracing.scalarize import Program
 from tests.liethermo.test_scalarize import STEPS, program_of, shapes, steps

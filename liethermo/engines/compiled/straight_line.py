@@ -16,8 +16,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ..tracing.primitives import OF_TESTS, TESTS, Scalar
-from ..tracing.scalarize import Program
+from ...tracing.primitives import OF_TESTS, TESTS, Scalar
+from ...tracing.scalarize import Program
 
 NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
 

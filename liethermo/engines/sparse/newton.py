@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..functions.rounding import with_rounding
-from ..integrators import OneStepMethod
-from ..systems import System
-from ..tracing.programs import program
-from . import array
+from ...functions.rounding import with_rounding
+from ...integrators import OneStepMethod
+from ...systems import System
+from ...tracing.programs import program
+from .. import array
 from .linear import Compression, Inverse
 
 LIMIT = 80

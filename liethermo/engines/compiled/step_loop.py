@@ -11,7 +11,7 @@ The programs work on the lanes from ``first`` to ``last``.
 
 import numpy as np
 
-from .array import (
+from ..array import (
     FIXED_POINT_LIMIT,
     FLOOR,
     HALVINGS,

@@ -24,13 +24,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..integrators import OneStepMethod
-from ..systems import System
-from ..tracing.remembered import Latest, remembered
-from ..tracing.scalarize import Program, scalarize
-from . import array, step_loop
+from ...integrators import OneStepMethod
+from ...systems import System
+from ...tracing.remembered import Latest, remembered
+from ...tracing.scalarize import Program, scalarize
+from .. import array
+from ..array import State
+from . import step_loop
 from . import straight_line as straight_line_module
-from .array import State
 from .module_cache import load
 from .straight_line import is_plain
 
@@ -297,7 +298,7 @@ class Stepper:
         if spelled_out:
             lines += ["njit = entry = lambda function: function"]
         else:
-            lines += ["import numba", "", "from liethermo.engine.straight_line import straight_line", ""]
+            lines += ["import numba", "", "from liethermo.engines.compiled.straight_line import straight_line", ""]
             lines += [f"# translated by {_translator()}"]
             options = "error_model='numpy', nogil=True, no_cfunc_wrapper=True"
             lines += [f"entry = numba.njit(cache=CACHE, {options})"]

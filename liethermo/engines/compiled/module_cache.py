@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from ..tracing.scalarize import UnsupportedPrimitive
+from ...tracing.scalarize import UnsupportedPrimitive
 
 
 def cache_folder() -> Path:

@@ -1,0 +1,1 @@
+"""How the definition of a step becomes fast code."""

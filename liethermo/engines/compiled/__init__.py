@@ -1,0 +1,1 @@
+"""Machine code for small systems on the CPU."""

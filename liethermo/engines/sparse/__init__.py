@@ -1,0 +1,1 @@
+"""Newton's method with sparse matrices for large networks."""
