@@ -10,7 +10,6 @@ import importlib
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 
 from . import models
-from .audit import Audit
 from .dissipation.base import (
     Dissipation,
     DoubleBracket,
@@ -54,7 +53,8 @@ from .integrators import (
     WithAttitude,
     registered_methods,
 )
-from .solution import Solution, Stats, Status, load
+from .results.audit import Audit
+from .results.solution import Solution, Stats, Status, load
 from .stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
     AttitudeSystem,

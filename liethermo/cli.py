@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from .solution import Solution
+    from .results.solution import Solution
     from .spec import Spec
     from .systems import System
 
@@ -120,7 +120,7 @@ def models() -> None:
 @_told()
 def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
     """Audit the laws of a saved run."""
-    from .solution import load
+    from .results.solution import load
 
     solution = load(file)
     typer.echo(
@@ -153,7 +153,7 @@ def _folder(spec: Path, folder: Path) -> Path:
 def _draw(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
     """Draw the figures of a spec; returns the names of their files."""
     os.environ.setdefault("MPLBACKEND", "agg")  # files only: no window, and no screen needed
-    from . import plot
+    from .results import plot
 
     files = []
     for name in plan.outputs.figures:

@@ -16,16 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
 from .engines import array
 from .engines.compiled import stepper as compiled
 from .engines.compiled.stepper import Form
 from .errors import InputError
-from .evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
 from .family import Family, common_size
 from .integrators import DEFAULT_METHOD, OneStepMethod
+from .results.audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
+from .results.evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
+from .results.solution import Laws
 from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
-from .solution import Laws
 from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import CHUNK_STEPS, Timetable
 from .tracing.interpret import at_points
@@ -151,7 +151,7 @@ class Ensemble:
         Parameters
         ----------
         energy, entropy, casimirs, residual, accuracy : float
-            What is accepted: see :class:`liethermo.audit.Tolerances`.
+            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------

@@ -19,10 +19,10 @@ from .engines import array
 from .engines.compiled import stepper as compiled
 from .engines.sparse.newton import SparseEngine
 from .errors import InputError
-from .evidence import MEASURED, Witness, spread
 from .functions.energy import traced_energies
 from .integrators import OneStepMethod, Reference, WithAttitude
-from .solution import Laws, Solution, Stats, Status
+from .results.evidence import MEASURED, Witness, spread
+from .results.solution import Laws, Solution, Stats, Status
 from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
 from .systems import AttitudeSystem, LiePoissonSystem, System, driven

@@ -9,8 +9,8 @@ from typing import Literal
 from .errors import ConvergenceError, InputError, NonFiniteError
 from .integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from .progress import Progress
+from .results.solution import Solution
 from .running import NO_GROUP, Run, as_run, check_choice, prepared
-from .solution import Solution
 from .stepwise import Adaptive, Relaxed
 from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import Timetable

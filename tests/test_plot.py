@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.plot import BLUE, GREEN, GREY, RED, _LevelSurface, _quadric_through, _sphere
+from liethermo.results.plot import BLUE, GREEN, GREY, RED, _LevelSurface, _quadric_through, _sphere
 
 SIZE_OF_A_PICTURE = 5_000  # bytes; an empty one is smaller
 

@@ -20,10 +20,10 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
+from ..errors import FileError, InputError
+from ..systems import System
 from .audit import EPS, LAW_FAILS, Audit
-from .errors import FileError, InputError
 from .solution import Solution
-from .systems import System
 
 SUFFIXES = (".pdf", ".png", ".svg")
 DPI = 150

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .functions.energy import Energy
-from .functions.rounding import with_rounding
-from .integrators import OneStepMethod
-from .systems import System
-from .tracing.interpret import at_points
-from .tracing.scalarize import UnsupportedPrimitive
+from ..functions.energy import Energy
+from ..functions.rounding import with_rounding
+from ..integrators import OneStepMethod
+from ..systems import System
+from ..tracing.interpret import at_points
+from ..tracing.scalarize import UnsupportedPrimitive
 
 MEASURED = 256
 """States of a run at which the sensitivities of its functions are evaluated."""

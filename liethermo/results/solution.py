@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import FileError, InputError
 from .audit import Audit, Tolerances, audit
-from .errors import FileError, InputError
 from .evidence import Evidence
 
 if TYPE_CHECKING:
     import xarray
 
-    from .stepwise import Dense
+    from ..stepwise import Dense
 
 FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
 
@@ -197,7 +197,7 @@ class Solution:
         Parameters
         ----------
         energy, entropy, casimirs, residual, attitude, accuracy, consistency : float
-            What is accepted: see :class:`liethermo.audit.Tolerances`.
+            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------
