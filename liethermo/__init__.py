@@ -20,7 +20,6 @@ from .dissipation.base import (
     KillingDissipation,
     ProjectedMetric,
 )
-from .ensembles import Ensemble, ensemble
 from .errors import (
     AxiomError,
     CasimirError,
@@ -34,7 +33,6 @@ from .errors import (
     NonFiniteError,
     SpecError,
 )
-from .flow import flow
 from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
@@ -55,7 +53,10 @@ from .integrators import (
 )
 from .results.audit import Audit
 from .results.solution import Solution, Stats, Status, load
-from .stepwise import Adaptive, Relaxed, suggest_step
+from .runs.ensemble import Ensemble, ensemble
+from .runs.flow import flow
+from .runs.integrate import integrate
+from .runs.stepwise import Adaptive, Relaxed, suggest_step
 from .systems import (
     AttitudeSystem,
     ChartSystem,
@@ -75,7 +76,6 @@ from .systems import (
     ThermodynamicHerglotz,
 )
 from .systems.composed.graph_files import Graph, read_graph
-from .timeloop import integrate
 
 __all__ = [
     "Adaptive",

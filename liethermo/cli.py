@@ -57,8 +57,8 @@ def run(
     ] = None,
 ) -> None:
     """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
+    from .runs.integrate import integrate
     from .spec import read
-    from .timeloop import integrate
 
     plan = read(spec)
     system = plan.system()

@@ -21,7 +21,7 @@ from .evidence import Evidence
 if TYPE_CHECKING:
     import xarray
 
-    from ..stepwise import Dense
+    from ..runs.stepwise import Dense
 
 FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
 
@@ -173,7 +173,7 @@ class Solution:
         return {**vars(self), "evidence": self.evidence, "witness": None}
 
     def __call__(self, t) -> np.ndarray:
-        """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.stepwise.Dense`.
+        """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.runs.stepwise.Dense`.
 
         Raises
         ------

@@ -145,7 +145,7 @@ def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
 
 
 def test_save_to_writes_on_failure_and_on_the_way(tmp_path, monkeypatch):
-    monkeypatch.setattr("liethermo.running.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("liethermo.runs.run.CHECKPOINT_SECONDS", 0.0)
     saved = []
     original = lt.Solution.save
     monkeypatch.setattr(lt.Solution, "save", lambda self, path: saved.append(len(self.t)) or original(self, path))

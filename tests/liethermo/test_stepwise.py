@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.engine import array, compiled
-from liethermo.stepwise import Control
+from liethermo.runs.stepwise import Control
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]

@@ -16,21 +16,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engines import array
-from .engines.compiled import stepper as compiled
-from .engines.compiled.stepper import Form
-from .errors import InputError
+from ..engines import array
+from ..engines.compiled import stepper as compiled
+from ..engines.compiled.stepper import Form
+from ..errors import InputError
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..results.audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
+from ..results.evidence import (
+    STEPS_AGAIN,
+    STILL,
+    WHOLE,
+    Evidence,
+    error_at,
+    has_estimate,
+    laws_functions,
+    sizes,
+    spread,
+)
+from ..results.solution import Laws
+from ..systems import AttitudeSystem, DrivenSystem, System
+from ..tracing.interpret import at_points
+from ..tracing.programs import program
+from ..tracing.scalarize import UnsupportedPrimitive
 from .family import Family, common_size
-from .integrators import DEFAULT_METHOD, OneStepMethod
-from .results.audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
-from .results.evidence import STEPS_AGAIN, STILL, WHOLE, Evidence, error_at, has_estimate, laws_functions, sizes, spread
-from .results.solution import Laws
-from .running import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
-from .systems import AttitudeSystem, DrivenSystem, System
+from .run import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
 from .timetable import CHUNK_STEPS, Timetable
-from .tracing.interpret import at_points
-from .tracing.programs import program
-from .tracing.scalarize import UnsupportedPrimitive
 
 LANES = 16
 """Trajectories in a block of the compiled engine: two AVX-512 vectors, enough to hide the latency of arithmetic."""

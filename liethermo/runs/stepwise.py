@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from .engines import array
-from .errors import FunctionError, InputError
-from .integrators import DEFAULT_METHOD, OneStepMethod
-from .integrators.tableaus import integrated
-from .systems import DrivenSystem, System, driven
+from ..engines import array
+from ..errors import FunctionError, InputError
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators.tableaus import integrated
+from ..systems import DrivenSystem, System, driven
+from ..tracing.interpret import evaluator
 from .timetable import Timetable
-from .tracing.interpret import evaluator
 
 GROWTH = 3.0
 """Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""

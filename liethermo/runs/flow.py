@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engines import array, implicit
-from .functions.energy import traced_energies
-from .integrators import DEFAULT_METHOD, OneStepMethod
-from .systems import DrivenSystem, System, driven
+from ..engines import array, implicit
+from ..functions.energy import traced_energies
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..systems import DrivenSystem, System, driven
+from ..tracing.programs import program
 from .timetable import Timetable
-from .tracing.programs import program
 
 
 def flow(

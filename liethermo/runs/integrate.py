@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable
 from typing import Literal
 
-from .errors import ConvergenceError, InputError, NonFiniteError
-from .integrators import DEFAULT_METHOD, OneStepMethod, Reference
+from ..errors import ConvergenceError, InputError, NonFiniteError
+from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
+from ..results.solution import Solution
+from ..systems import AttitudeSystem, DrivenSystem, System
 from .progress import Progress
-from .results.solution import Solution
-from .running import NO_GROUP, Run, as_run, check_choice, prepared
+from .run import NO_GROUP, Run, as_run, check_choice, prepared
 from .stepwise import Adaptive, Relaxed
-from .systems import AttitudeSystem, DrivenSystem, System
 from .timetable import Timetable
 
 

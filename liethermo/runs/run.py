@@ -15,22 +15,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engines import array
-from .engines.compiled import stepper as compiled
-from .engines.sparse.newton import SparseEngine
-from .errors import InputError
-from .functions.energy import traced_energies
-from .integrators import OneStepMethod, Reference, WithAttitude
-from .results.evidence import MEASURED, Witness, spread
-from .results.solution import Laws, Solution, Stats, Status
+from ..engines import array
+from ..engines.compiled import stepper as compiled
+from ..engines.sparse.newton import SparseEngine
+from ..errors import InputError
+from ..functions.energy import traced_energies
+from ..integrators import OneStepMethod, Reference, WithAttitude
+from ..results.evidence import MEASURED, Witness, spread
+from ..results.solution import Laws, Solution, Stats, Status
+from ..systems import AttitudeSystem, LiePoissonSystem, System, driven
+from ..tracing.interpret import at_points
+from ..tracing.programs import program
+from ..tracing.remembered import remembered
+from ..tracing.scalarize import UnsupportedPrimitive
 from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
 from .stepwise import run as run_stepwise
-from .systems import AttitudeSystem, LiePoissonSystem, System, driven
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
-from .tracing.interpret import at_points
-from .tracing.programs import program
-from .tracing.remembered import remembered
-from .tracing.scalarize import UnsupportedPrimitive
 
 SMALL_DIM, SMALL_PROGRAM = 16, 4000
 """Components of a state and operations of a step up to which it is compiled in about the time that XLA takes (two or

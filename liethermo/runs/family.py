@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .engines.compiled.stepper import Form
-from .errors import InputError
-from .systems import System
-from .tracing.remembered import fingerprint
-from .tracing.traced import Traced, traced
+from ..engines.compiled.stepper import Form
+from ..errors import InputError
+from ..systems import System
+from ..tracing.remembered import fingerprint
+from ..tracing.traced import Traced, traced
 
 PROBES = 8
 """Members of a family that are built, and so checked, one by one."""

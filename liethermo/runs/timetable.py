@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .errors import InputError
+from ..errors import InputError
 
 CHUNK_SAVES = 1024
 """Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
