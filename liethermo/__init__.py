@@ -157,5 +157,5 @@ __all__ = [
 
 def __getattr__(name: str):
     if name == "plot":  # matplotlib is imported only when a picture is wanted
-        return importlib.import_module(".plot", __name__)
+        return importlib.import_module(".results.plot", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,7 +19,7 @@ from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
 from benchmarks.report import Target
 from benchmarks.timing import race
-from liethermo.engine import array
+from liethermo.engines import array
 
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
 

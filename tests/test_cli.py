@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import liethermo as lt
 from liethermo.cli import app
-from liethermo.engine import compiled
+from liethermo.engines.compiled import stepper as compiled
 from liethermo.integrators import METHODS
 from liethermo.spec import FIGURES
 

@@ -13,7 +13,7 @@
 
    A step solves k = slopes(k) by fixed-point iteration from 2 k - before, down to the rounding plateau, and adds h k
    with compensated summation; what rounding has done to the energy is steered back. The iteration is that of
-   liethermo/engine/step_loop.py without Newton's method: where the library would turn to that, this run ends. */
+   liethermo/engines/compiled/step_loop.py without Newton's method: where the library would turn to that, this run ends. */
 
 #include <math.h>
 #include <stdint.h>

@@ -1,4 +1,4 @@
-/* When to stop iterating, and when to steer the energy: the rules of liethermo/engine/array.py, where the reasons stand. */
+/* When to stop iterating, and when to steer the energy: the rules of liethermo/engines/array.py, where the reasons stand. */
 
 #ifndef RULES_H
 #define RULES_H

@@ -173,7 +173,7 @@ class Solution:
         return {**vars(self), "evidence": self.evidence, "witness": None}
 
     def __call__(self, t) -> np.ndarray:
-        """States at any times, shape (..., n), from the collocation polynomials: see :class:`liethermo.runs.stepwise.Dense`.
+        """States at any times, shape (..., n), from the collocation polynomials of the steps.
 
         Raises
         ------

@@ -306,7 +306,7 @@ class _Record:
             self.path = np.full((size, len(self.counts), system.dim + 2), np.nan)
 
     def put(self, chosen: slice, before: dict[str, np.ndarray], after: dict[str, np.ndarray], saved) -> None:
-        """The outcome of some trajectories: fields of :class:`.engine.array.State`, and the saves."""
+        """The outcome of some trajectories: fields of :class:`liethermo.engines.array.State`, and the saves."""
         rows, steps = self.rows, after["step"].astype(np.int64)
         span = np.minimum(steps * self.times.h, self.times.end - self.times.start)
         energy, first = after["energy"], before["energy"]

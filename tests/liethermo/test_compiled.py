@@ -12,7 +12,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine import compiled, step_loop
+from liethermo.engines.compiled import step_loop
+from liethermo.engines.compiled import stepper as compiled
 from liethermo.tracing.remembered import Latest
 from tests.cases import DISSIPATIONS, build, state_of
 

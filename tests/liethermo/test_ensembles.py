@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo import ensembles
+from liethermo.runs import ensemble as ensembles
 
 BODY = lt.models.rigid_body()
 ENGINES = ("array", "compiled")

@@ -11,7 +11,7 @@ import scipy.optimize
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine import implicit
+from liethermo.engines import implicit
 
 X0 = jnp.array([0.3, 1.0, 0.2])
 PARAMETERS = jnp.array([10.0, 5.0, 1.0, 1.0])

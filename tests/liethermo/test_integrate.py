@@ -9,8 +9,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo import running as loop
-from liethermo.engine import array
+from liethermo.engines import array
+from liethermo.runs import run as loop
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]

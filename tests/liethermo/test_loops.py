@@ -185,7 +185,7 @@ def test_a_family_built_by_a_new_function_each_time():
         alone = [lt.integrate(family(r), X, (0.0, 1.0), 0.1, engine="compiled").x[-1] for r in rates]
         assert np.abs(together - alone).max() < 1e-14
 
-    from liethermo.engine import compiled
+    from liethermo.engines.compiled import stepper as compiled
 
     run(0.5)
     before = len(compiled._steppers)
@@ -195,7 +195,8 @@ def test_a_family_built_by_a_new_function_each_time():
 
 def test_machine_code_that_cannot_be_unloaded_is_bounded(monkeypatch):
     """Of programs that do differ; "auto" goes on with the array engine, and says so."""
-    from liethermo.engine import compiled, module_cache
+    from liethermo.engines.compiled import module_cache
+    from liethermo.engines.compiled import stepper as compiled
     from liethermo.runs.run import CompiledEngineWarning
 
     monkeypatch.setattr(module_cache, "_names", {"another"})

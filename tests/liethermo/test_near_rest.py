@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine import array
+from liethermo.engines import array
 from liethermo.functions.rounding import with_rounding
 from liethermo.models.thermo_particles import thermo_particles_solution
 from tests.cases import slow

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.engine import array, linear
+from liethermo.engines import array
+from liethermo.engines.sparse import linear
 from liethermo.functions.gradients import GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss
 from liethermo.models.heat_grid import grid_graph, heat_grid_solution

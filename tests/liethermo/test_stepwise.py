@@ -8,7 +8,8 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engine import array, compiled
+from liethermo.engines import array
+from liethermo.engines.compiled import stepper as compiled
 from liethermo.runs.stepwise import Control
 
 BODY = lt.models.rigid_body()
