@@ -10,16 +10,13 @@ import importlib
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 
 from . import models
-from .dissipation.base import (
-    Dissipation,
-    DoubleBracket,
-    EulerPoincareForce,
-    FourBracket,
-    FrictionOperator,
-    InnerProductDissipation,
-    KillingDissipation,
-    ProjectedMetric,
-)
+from .dissipation.base import Dissipation
+from .dissipation.double_bracket import DoubleBracket
+from .dissipation.force import EulerPoincareForce
+from .dissipation.four_bracket import FourBracket
+from .dissipation.friction_operator import FrictionOperator
+from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.projected_metric import ProjectedMetric
 from .errors import (
     AxiomError,
     CasimirError,
@@ -52,11 +49,14 @@ from .integrators import (
     registered_methods,
 )
 from .results.audit import Audit
-from .results.solution import Solution, Stats, Status, load
+from .results.solution import Solution, load
+from .results.status import Stats, Status
+from .runs.adaptive import Adaptive
 from .runs.ensemble import Ensemble, ensemble
+from .runs.events import Relaxed
 from .runs.flow import flow
 from .runs.integrate import integrate
-from .runs.stepwise import Adaptive, Relaxed, suggest_step
+from .runs.suggest import suggest_step
 from .systems import (
     AttitudeSystem,
     ChartSystem,

@@ -11,7 +11,8 @@ import numpy as np
 
 import manifolds as mf
 
-from ..dissipation.base import KillingDissipation, checked_rate
+from ..dissipation.checks import checked_rate
+from ..dissipation.inner_product import KillingDissipation
 from ..errors import InputError
 from ..functions.energy import Quadratic, is_traced
 from ..systems import LiePoissonSystem

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -11,7 +11,27 @@ from ..errors import InputError
 
 if TYPE_CHECKING:
     from .evidence import Evidence
-    from .solution import Laws, Solution
+    from .status import Laws, Stats, Status
+
+
+class Record(Protocol):
+    """What an audit looks at: see :class:`liethermo.Solution`."""
+
+    @property
+    def energy_balance(self) -> np.ndarray: ...
+    @property
+    def entropy(self) -> np.ndarray | None: ...
+    @property
+    def casimirs(self) -> dict[str, np.ndarray]: ...
+    @property
+    def status(self) -> Status: ...
+    @property
+    def stats(self) -> Stats: ...
+    @property
+    def laws(self) -> Laws: ...
+    @property
+    def evidence(self) -> Evidence: ...
+
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -180,7 +200,7 @@ class Rounding:
         return (tolerance * self.sensitivity + VALUE * np.maximum(np.abs(self.value), self.terms)) / self.size
 
 
-def audit(solution: Solution, tolerances: Tolerances) -> Audit:
+def audit(solution: Record, tolerances: Tolerances) -> Audit:
     """See :meth:`liethermo.Solution.audit`."""
     stats, laws, evidence, rows, energy = solution.stats, solution.laws, solution.evidence, [], solution.energy_balance
     name = " minus ".join(["energy", *laws.balance])
@@ -237,7 +257,7 @@ def audit(solution: Solution, tolerances: Tolerances) -> Audit:
 UNPROMISED = "a constant of this system, which the method does not promise to keep exactly"
 
 
-def _entropy_row(solution: Solution, tolerances: Tolerances) -> tuple[float, AuditRow]:
+def _entropy_row(solution: Record, tolerances: Tolerances) -> tuple[float, AuditRow]:
     """The least increment of the entropy, and its law: at every step, and over all of the run."""
     S, law = solution.entropy, solution.laws.entropy
     assert S is not None

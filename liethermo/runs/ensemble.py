@@ -33,7 +33,7 @@ from ..results.evidence import (
     sizes,
     spread,
 )
-from ..results.solution import Laws
+from ..results.status import Laws
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import at_points
 from ..tracing.programs import program

@@ -10,9 +10,10 @@ from ..errors import ConvergenceError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, DrivenSystem, System
+from .adaptive import Adaptive
+from .events import Relaxed
 from .progress import Progress
 from .run import NO_GROUP, Run, as_run, check_choice, prepared
-from .stepwise import Adaptive, Relaxed
 from .timetable import Timetable
 
 

@@ -21,14 +21,18 @@ from ..engines.sparse.newton import SparseEngine
 from ..errors import InputError
 from ..functions.energy import traced_energies
 from ..integrators import OneStepMethod, Reference, WithAttitude
+from ..results.dense import Dense
 from ..results.evidence import MEASURED, Witness, spread
-from ..results.solution import Laws, Solution, Stats, Status
+from ..results.solution import Solution
+from ..results.status import Laws, Stats, Status
 from ..systems import AttitudeSystem, LiePoissonSystem, System, driven
 from ..tracing.interpret import at_points
 from ..tracing.programs import program
 from ..tracing.remembered import remembered
 from ..tracing.scalarize import UnsupportedPrimitive
-from .stepwise import MOST_KEPT, Adaptive, Dense, Event, stops_of
+from .adaptive import Adaptive
+from .events import Event
+from .stepwise import MOST_KEPT, stops_of
 from .stepwise import run as run_stepwise
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
 

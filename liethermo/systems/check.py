@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..dissipation.base import KERNEL
+from ..dissipation.friction_operator import KERNEL
 from ..errors import InputError
 from ..tracing.interpret import at_points
 

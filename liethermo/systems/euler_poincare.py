@@ -12,7 +12,8 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation.base import Dissipation, EulerPoincareForce
+from ..dissipation.base import Dissipation
+from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
 from .lie_poisson import LiePoissonSystem

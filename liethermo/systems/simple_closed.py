@@ -13,7 +13,8 @@ import numpy as np
 import manifolds as mf
 from manifolds.matrix_functions import solve
 
-from ..dissipation.base import Law, SkewFriction, semidefinite
+from ..dissipation.base import Law, SkewFriction
+from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
 from ..tracing.interpret import at_points

@@ -10,7 +10,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.compiled import stepper as compiled
-from liethermo.runs.stepwise import Control
+from liethermo.runs.adaptive import Control
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...dissipation.base import semidefinite
+from ...dissipation.checks import semidefinite
 from ...errors import InputError
 from ...functions.each import Each
 from ...functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised

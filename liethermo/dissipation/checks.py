@@ -1,0 +1,76 @@
+"""What is asked of the matrices, forms and rates that constructions are given."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds._arrays import real_array
+
+from ..errors import IndefiniteError, InputError
+
+if TYPE_CHECKING:
+    from ..systems import System
+
+
+# -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def form_at(form, x):
+    """A constant, or a function of the state evaluated at x."""
+    return jnp.asarray(form(x)) if callable(form) else form
+
+
+def zero_state(dim: int):
+    return jax.ShapeDtypeStruct((dim,), jnp.float64)
+
+
+def checked_rate(rate) -> jax.Array:
+    """A rate as one non-negative number (or a traced one)."""
+    array = real_array(rate)
+    if array.shape != ():
+        raise InputError(f"a rate is one number, not an array of shape {array.shape}")
+    if not isinstance(array, jax.core.Tracer) and not float(array) >= 0.0:
+        raise InputError(f"a dissipation rate must be >= 0, not {float(array)}: a negative one would lower the entropy")
+    return array
+
+
+def semidefinite(form, what: str) -> jax.Array:
+    """A form as a symmetric positive semidefinite matrix (or a traced one)."""
+    matrix = real_array(form)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
+    if isinstance(matrix, jax.core.Tracer):
+        return matrix
+    numbers = np.asarray(matrix)
+    scale = float(np.abs(numbers).max())
+    asymmetry = float(np.abs(numbers - numbers.T).max())
+    if not asymmetry <= 1e-12 * scale:
+        raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
+    lowest = float(np.linalg.eigvalsh(numbers)[0]) if np.isfinite(numbers).all() else -np.inf
+    if lowest < -1e-12 * scale * matrix.shape[0]:
+        raise IndefiniteError(
+            f"{what} has the negative eigenvalue {lowest:.3g}: it must be positive semidefinite, or entropy would fall",
+            residual=lowest,
+            tolerance=1e-12 * scale * matrix.shape[0],
+        )
+    return matrix
+
+
+def check_matrix(form, dim: int, what: str) -> None:
+    shape = jax.eval_shape(lambda x: jnp.asarray(form_at(form, x)), zero_state(dim)).shape
+    if shape != (dim, dim):
+        raise InputError(f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {shape}")
+
+
+def needed_algebra(system: System, name: str, dim: int | None = None) -> mf.LieAlgebra:
+    algebra = getattr(system, "algebra", None)
+    if algebra is None:
+        raise InputError(f"{name} lives on a Lie algebra: use it in a LiePoissonSystem, or take ProjectedMetric()")
+    if dim is not None and dim != algebra.dim:
+        raise InputError(f"the form of {name} is ({dim}, {dim}), but {algebra.name} has dimension {algebra.dim}")
+    return algebra

@@ -1,0 +1,60 @@
+"""Double brackets: the energy falls along coadjoint orbits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+
+if TYPE_CHECKING:
+    pass
+from .base import Dissipation
+from .checks import check_matrix, checked_rate, semidefinite
+
+
+class DoubleBracket(Dissipation):
+    """Double bracket: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
+
+    ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
+    on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir
+    and is conserved.
+
+    Parameters
+    ----------
+    rate : float, >= 0
+    metric : array, shape (n, n), optional
+        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space.
+    """
+
+    rate: jax.Array
+    metric: jax.Array | None
+
+    def __init__(self, rate=1.0, metric=None):
+        self.rate = checked_rate(rate)
+        self.metric = None if metric is None else semidefinite(metric, "the metric")
+
+    @property
+    def energy_law(self):
+        return "nonincreasing"
+
+    @property
+    def entropy_law(self):
+        return "conserved"
+
+    @property
+    def keeps_casimirs(self):
+        return True
+
+    @property
+    def needs_entropy(self):
+        return False
+
+    def prepared(self, system):
+        if self.metric is not None:
+            check_matrix(self.metric, system.dim, "the metric")
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        motion = system.poisson.sharp(x, dH)
+        lowered = system.lowered(x, motion) if self.metric is None else self.metric @ motion
+        return self.rate * system.poisson.sharp(x, lowered)

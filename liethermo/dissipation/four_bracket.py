@@ -1,0 +1,108 @@
+"""Metriplectic 4-brackets: tensors with the symmetries of a curvature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    pass
+from .base import Dissipation
+from .checks import check_matrix, form_at, semidefinite, zero_state
+from .inner_product import InnerProductDissipation, KillingDissipation
+
+
+class FourBracket(Dissipation):
+    """Metriplectic 4-bracket dissipation ``(F, G) = (F, H; G, H)`` [Morrison & Updike 2024].
+
+    The 4-bracket ``(F, K; G, N) = R^{ijkl} F_i K_j G_k N_l`` has the symmetries of a curvature tensor, so H is
+    conserved whatever R is. Two families have constructors of their own: :meth:`kulkarni_nomizu`, which contains
+    (BFM 2.2), and :meth:`lie_algebra`, which is (BFM 3.7).
+
+    Parameters
+    ----------
+    tensor : array, shape (n, n, n, n), or function from x, shape (n,), to one
+        ``R[i, j, k, l]``, antisymmetric in (i, j) and in (k, l), symmetric under exchange of the pairs.
+
+    Raises
+    ------
+    InputError
+        If a constant tensor lacks a symmetry, which is named.
+    """
+
+    tensor: Callable | jax.Array
+
+    def __init__(self, tensor):
+        if not callable(tensor):
+            tensor = jnp.asarray(tensor, dtype=jnp.float64)
+            if tensor.ndim != 4 or len(set(tensor.shape)) != 1:
+                raise InputError(f"a 4-bracket has shape (n, n, n, n), not {tensor.shape}")
+            _check_curvature_symmetries(tensor)
+        self.tensor = tensor
+
+    @staticmethod
+    def kulkarni_nomizu(sigma, mu) -> Dissipation:
+        """4-bracket ``sigma ∧ mu`` of two symmetric semidefinite forms on covectors, constant or functions of x.
+
+        ``K(a, b) = sigma(a, b) mu(h, h) - sigma(a, h) mu(h, b) + mu(a, b) sigma(h, h) - mu(a, h) sigma(h, b)``, h = dH.
+        With sigma = G/2 and mu = G it is the projected metric (BFM 2.2) of G.
+        """
+        return KulkarniNomizu(sigma, mu)
+
+    @staticmethod
+    def lie_algebra(form=None) -> Dissipation:
+        """4-bracket ``𝒦([dF, dK], [dG, dN])`` of an inner product 𝒦 on g (by default that of KillingDissipation)."""
+        return KillingDissipation() if form is None else InnerProductDissipation(form)
+
+    def prepared(self, system):
+        shape = jax.eval_shape(lambda x: jnp.asarray(form_at(self.tensor, x)), zero_state(system.dim)).shape
+        if shape != (system.dim,) * 4:
+            raise InputError(f"the 4-bracket has shape {shape}, but the state has {system.dim} components")
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        return jnp.einsum("ijkl,j,k,l->i", form_at(self.tensor, x), dH, dS, dH)
+
+
+class KulkarniNomizu(Dissipation):
+    """The 4-bracket of two forms; see :meth:`FourBracket.kulkarni_nomizu`."""
+
+    sigma: Callable | jax.Array
+    mu: Callable | jax.Array
+
+    def __init__(self, sigma, mu):
+        self.sigma = sigma if callable(sigma) else semidefinite(sigma, "the form sigma")
+        self.mu = mu if callable(mu) else semidefinite(mu, "the form mu")
+
+    def prepared(self, system):
+        check_matrix(self.sigma, system.dim, "the form sigma")
+        check_matrix(self.mu, system.dim, "the form mu")
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        sigma, mu = form_at(self.sigma, x), form_at(self.mu, x)
+        sH, mH = sigma @ dH, mu @ dH
+        from_sigma = jnp.dot(mH, dH) * (sigma @ dS) - jnp.dot(mH, dS) * sH
+        from_mu = jnp.dot(sH, dH) * (mu @ dS) - jnp.dot(sH, dS) * mH
+        return from_sigma + from_mu
+
+
+def _check_curvature_symmetries(R) -> None:
+    if isinstance(R, jax.core.Tracer):
+        return
+    R = np.asarray(R)
+    tolerance = 1e-12 * float(np.abs(R).max())
+    for name, image in [
+        ("R[i,j,k,l] = -R[j,i,k,l]", -R.transpose(1, 0, 2, 3)),
+        ("R[i,j,k,l] = -R[i,j,l,k]", -R.transpose(0, 1, 3, 2)),
+        ("R[i,j,k,l] = R[k,l,i,j]", R.transpose(2, 3, 0, 1)),
+    ]:
+        residual = float(np.abs(R - image).max())
+        if residual > tolerance:
+            raise InputError(f"not a 4-bracket: {name} fails by {residual:.3g} (tolerance {tolerance:.1g})")

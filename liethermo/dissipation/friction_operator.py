@@ -1,0 +1,71 @@
+"""Friction by a matrix that the user gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+if TYPE_CHECKING:
+    pass
+from .base import Dissipation
+from .checks import check_matrix, checked_rate, form_at, semidefinite
+
+KERNEL = "K grad H = 0, as given"
+"""The row of a check on a friction operator before it is projected."""
+
+
+class FrictionOperator(Dissipation):
+    """Dissipation by a friction matrix K(x) with ``K(x) grad H(x) = 0`` [BFM Remark 4.7].
+
+    That K has grad H in its kernel is tested where a system is built, and by ``system.check()``: of another K only the
+    projection ``P^T K P`` would act, P the projector off grad H. ``project=True`` says that this is meant.
+
+    A discretisation hands it a discrete gradient dH beside ``grad H(x)``. The kernel is then moved from the one to the
+    other: ``K_d = P^T K P`` with ``P = 1 - dH grad H^T / (grad H . dH)``, the projector along dH onto the complement of
+    grad H. K_d is semidefinite, has dH in its kernel, keeps every other kernel vector of K that is orthogonal to grad H
+    (momentum maps), and tends to K.
+
+    Parameters
+    ----------
+    K : function from x, shape (n,), to a matrix (n, n), or a constant matrix
+    rate : float, >= 0
+    project : bool
+        Take any symmetric semidefinite K, and let its projection off grad H act.
+    """
+
+    K: Callable | jax.Array
+    rate: jax.Array
+    project: bool = eqx.field(static=True)
+
+    def __init__(self, K, rate=1.0, project: bool = False):
+        self.K = K if callable(K) else semidefinite(K, "the friction operator K")
+        self.rate = checked_rate(rate)
+        self.project = bool(project)
+
+    def prepared(self, system):
+        check_matrix(self.K, system.dim, "the friction operator K")
+        return self
+
+    def own_residuals(self, system, x):
+        if self.project:
+            return {}
+        K, dH = form_at(self.K, x), system.energy.gradient(x)
+        dH = dH if system.space is None else system.lowered(x, system.raised(x, dH))
+        size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
+        missed = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
+        return {KERNEL: missed / jnp.where(size > 0.0, size, 1.0)}
+
+    def force(self, system, x, dH, dS, dL):
+        gradient, raised, K = system.raised(x, system.energy.gradient(x)), system.raised(x, dH), form_at(self.K, x)
+        overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
+        # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
+        safe = overlap > 1e-3 * square
+        along = jnp.where(safe, gradient, raised)
+        overlap = jnp.where(safe, overlap, square)
+        along = along / jnp.where(overlap > 0.0, overlap, 1.0)
+        image = K @ (dS - jnp.dot(along, dS) * dH)
+        return self.rate * (image - jnp.dot(dH, image) * along)

@@ -1,0 +1,112 @@
+"""Inner products on a Lie algebra, projected off the velocity: BFM's dissipation, and that of the Killing form."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..errors import IndefiniteError, InputError
+
+if TYPE_CHECKING:
+    pass
+from .base import Dissipation
+from .checks import checked_rate, needed_algebra, semidefinite
+
+
+class InnerProductDissipation(Dissipation):
+    """Dissipation by an inner product on the Lie algebra: ``K(alpha, beta) = 𝒦([dH, alpha], [dH, beta])``.
+
+    It is the forced Euler-Poincaré equation ``mu' = ad*_xi (mu + F)`` with ``<F, eta> = 𝒦(eta, [xi, grad S])``
+    [BFM 3.6-3.7], so ``S' = 𝒦([xi, grad S], [xi, grad S]) >= 0`` for a Casimir S.
+
+    Parameters
+    ----------
+    K : array, shape (dim, dim)
+        The inner product 𝒦 on g, symmetric and positive semidefinite.
+
+    Raises
+    ------
+    IndefiniteError, InputError
+        If it is not.
+    """
+
+    K: jax.Array
+
+    def __init__(self, K):
+        self.K = semidefinite(K, "the inner product 𝒦")
+
+    def prepared(self, system):
+        needed_algebra(system, "InnerProductDissipation", self.K.shape[0])
+        return self
+
+    def momentum(self, dH, turned):
+        return self.K @ turned
+
+    def force(self, system, x, dH, dS, dL):
+        g = system.algebra
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
+
+
+class KillingDissipation(Dissipation):
+    """Dissipation by the Killing form kappa, made positive: :class:`InnerProductDissipation` with the algebra's own 𝒦.
+
+    ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
+    noncompact semisimple algebras, and ``-rate * kappa`` again wherever that is at least semidefinite (se(3)). On so(3)
+    ``-kappa = 2 I``, so rate 1/2 gives the projected metric (BFM 2.2).
+
+    Parameters
+    ----------
+    rate : float, >= 0
+
+    Raises
+    ------
+    IndefiniteError
+        When used on an algebra that is not semisimple and whose ``-kappa`` is indefinite.
+    """
+
+    rate: jax.Array
+    form: jax.Array | None
+
+    def __init__(self, rate=1.0, form=None):
+        self.rate = checked_rate(rate)
+        self.form = form  # filled in by prepared(), once the algebra is known
+
+    @staticmethod
+    def inner_product(g: mf.LieAlgebra) -> np.ndarray:
+        """The positive semidefinite form 𝒦 on g for rate 1, shape (dim, dim)."""
+        if g.is_semisimple():
+            form = -g.killing_form() @ g.cartan_involution()
+            return (form + form.T) / 2
+        form = -g.killing_form()
+        if g.killing_signature()[0]:
+            lowest = float(np.linalg.eigvalsh(form)[0])
+            raise IndefiniteError(
+                f"{g.name} is not semisimple and minus its Killing form is indefinite (lowest eigenvalue "
+                f"{lowest:.3g}), so it cannot measure dissipation: entropy would fall along some motions. Give "
+                "an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which needs none",
+                residual=lowest,
+                tolerance=0.0,
+            )
+        return form
+
+    def prepared(self, system):
+        g = needed_algebra(system, "KillingDissipation")
+        form = self.inner_product(g)
+        if g.is_solvable():  # Cartan's criterion: kappa(g, [g, g]) = 0
+            raise InputError(
+                f"{g.name} is solvable: its Killing form vanishes on brackets, so "
+                "KillingDissipation would do nothing; use ProjectedMetric() or InnerProductDissipation(K)"
+            )
+        return KillingDissipation(self.rate, jnp.asarray(form))
+
+    def momentum(self, dH, turned):
+        return self.rate * (self.form @ turned)
+
+    def force(self, system, x, dH, dS, dL):
+        g = system.algebra
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))

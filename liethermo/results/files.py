@@ -1,0 +1,144 @@
+"""Solutions in NetCDF files: written whole, sealed, and checked before they are read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import FileError
+
+if TYPE_CHECKING:
+    import xarray
+
+FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
+
+VARIABLES = ("time", "x", "energy", "entropy", "attitude", "invariant_name", "invariant")
+ATTRIBUTES = ("format", "times", "status", "stats", "laws", "evidence", "provenance", "event_time", "sha256")
+"""What a file has."""
+
+SEAL = b"\nliethermo sha256 "
+"""What comes after the end of the NetCDF file, with the digest of all before it."""
+
+
+def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
+    """Write a NetCDF file; it appears whole or not at all."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
+        checked = {name: {"fletcher32": True} for name in numbers}
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=checked)
+        _seal(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise FileError(f"cannot write {path}: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The variables and the attributes of a file that :func:`write` wrote, checked.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, cut short, damaged, or not a result of this library.
+
+    Warns
+    -----
+    UserWarning
+        If an earlier version wrote the file, without a checksum: damage may show in nothing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"there is no file {path}")
+    _check_seal(path)
+    try:
+        series, attributes = _content(path)
+    except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
+        raise FileError(
+            f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
+        ) from error
+    if attributes.get("format") not in (FORMAT, *WITHOUT_CHECKSUM):
+        raise FileError(
+            f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
+        )
+    if attributes["format"] in WITHOUT_CHECKSUM:
+        warnings.warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show", stacklevel=3)
+    elif attributes.get("sha256") != checksum(series, attributes):
+        raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
+    return series, attributes
+
+
+def _seal(path: Path) -> None:
+    """Append the digest of a file to it; readers of HDF5 do not look beyond the end that its header states."""
+    digest = _digest(path, path.stat().st_size)
+    with open(path, "ab") as file:
+        file.write(SEAL + digest)
+
+
+def _check_seal(path: Path) -> None:
+    """Before HDF5 sees the file: a damaged one can keep its reader in an endless loop.
+
+    A file without a seal is let through: programs that write to an HDF5 file may cut off what follows its end.
+    """
+    length = len(SEAL) + 2 * hashlib.sha256().digest_size
+    whole = path.stat().st_size - length
+    if whole < 0:
+        return
+    with open(path, "rb") as file:
+        file.seek(whole)
+        end = file.read()
+    if end.startswith(SEAL) and end != SEAL + _digest(path, whole):
+        raise FileError(f"{path} is damaged, or was changed: it does not have the checksum that it was written with")
+
+
+def _digest(path: Path, length: int) -> bytes:
+    """SHA-256 of the beginning of a file, in hexadecimal digits."""
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while length > 0:
+            part = file.read(min(length, 2**20))
+            if not part:
+                break
+            found.update(part)
+            length -= len(part)
+    return found.hexdigest().encode()
+
+
+def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The variables of a file by name, and its attributes."""
+    import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
+
+    with h5py.File(path) as file:
+        found = {name: file[name] for name in VARIABLES if name in file}
+        series = {
+            name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
+        }
+        said = {name: np.asarray(file.attrs[name]).item() for name in ATTRIBUTES if name in file.attrs}
+        return series, said
+
+
+def checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:
+    """SHA-256 of the names, types, shapes and bytes of all variables, and of the attributes."""
+    found = hashlib.sha256()
+    for name in sorted(series):
+        values = np.asarray(series[name])
+        text = values.dtype.kind in "OUS"
+        kind = "text" if text or not values.size else values.dtype.newbyteorder("<").str
+        found.update(json.dumps([name, kind, values.shape]).encode())
+        found.update(
+            json.dumps(values.tolist()).encode() if kind == "text" else values.astype(kind, order="C").tobytes()
+        )
+    said = [[name, str(attributes[name])] for name in ATTRIBUTES[:-1] if name in attributes]
+    found.update(json.dumps(said).encode())
+    return found.hexdigest()
