@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,10 +18,7 @@ import scipy.sparse
 
 from ..functions.energy import Energy
 from ..functions.indices import union
-
-if TYPE_CHECKING:
-    from ..systems import System
-
+from .geometry import Geometry
 
 Law = Literal["conserved", "nondecreasing", "nonincreasing"]
 T = TypeVar("T")
@@ -51,7 +48,7 @@ class Dissipation(eqx.Module):
         """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
         return True
 
-    def couplings(self, system: System) -> scipy.sparse.csr_array | None:
+    def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:
         """Which components of the force depend on which components of the state and of the gradients it is handed.
 
         A pattern, shape (n, n), for systems too large for a full Jacobian matrix; None where it is not known.
@@ -77,23 +74,23 @@ class Dissipation(eqx.Module):
     def needs_entropy(self) -> bool:
         return True
 
-    def prepared(self, system: System) -> Dissipation:
+    def prepared(self, system: Geometry) -> Dissipation:
         """This dissipation, checked against the system it is used in and completed with what that determines."""
         del system
         return self
 
-    def own_residuals(self, system: System, x) -> dict[str, jax.Array]:
+    def own_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
         """Residuals at x of what it was given and would have to mend, relative to what cancels, by their names."""
         del system, x
         return {}
 
     @abstractmethod
-    def force(self, system: System, x, dH, dS, dL) -> jax.Array:
+    def force(self, system: Geometry, x, dH, dS, dL) -> jax.Array:
         """The dissipative part of ``x'``, shape (n,).
 
         Parameters
         ----------
-        system : System
+        system : Geometry
         x : array, shape (n,)
         dH, dS : array, shape (n,)
             Gradients of energy and entropy, continuous or discrete.
@@ -152,7 +149,7 @@ class Several(Dissipation):
     def needs_entropy(self) -> bool:
         return any(part.needs_entropy for part in self.parts)
 
-    def prepared(self, system: System) -> Dissipation:
+    def prepared(self, system: Geometry) -> Dissipation:
         return Several(tuple(part.prepared(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):

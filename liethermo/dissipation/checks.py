@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +10,7 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..errors import IndefiniteError, InputError
-
-if TYPE_CHECKING:
-    from ..systems import System
-
+from .geometry import Geometry
 
 # -- helpers ------------------------------------------------------------------------------------------------------
 
@@ -67,7 +62,7 @@ def check_matrix(form, dim: int, what: str) -> None:
         raise InputError(f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {shape}")
 
 
-def needed_algebra(system: System, name: str, dim: int | None = None) -> mf.LieAlgebra:
+def needed_algebra(system: Geometry, name: str, dim: int | None = None) -> mf.LieAlgebra:
     algebra = getattr(system, "algebra", None)
     if algebra is None:
         raise InputError(f"{name} lives on a Lie algebra: use it in a LiePoissonSystem, or take ProjectedMetric()")

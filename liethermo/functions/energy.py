@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -25,9 +24,7 @@ from ..errors import FunctionError, InputError
 from ..tracing.interpret import at_points, polynomial_degree
 from ..tracing.traced import converted
 from .indices import cliques, pattern, union
-
-if TYPE_CHECKING:
-    from .gradients import DiscreteGradient, Path
+from .path import Path, Scheme
 
 LARGEST_CLIQUE = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
@@ -68,7 +65,7 @@ class Energy(eqx.Module):
         """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
         return False
 
-    def discrete_gradient(self, scheme: DiscreteGradient, x, d, low) -> jax.Array:
+    def discrete_gradient(self, scheme: Scheme, x, d, low) -> jax.Array:
         """The discrete gradient of one term by a scheme, shape (n,), from x + low to x + low + d."""
         return scheme.quadratic(self, x, d, low) if self.is_quadratic else scheme.general(self, x, d, low)
 

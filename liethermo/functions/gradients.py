@@ -15,8 +15,7 @@ shut out where it is rounding noise, by a gate that is continuous, scale free, a
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,10 +25,8 @@ import numpy as np
 from ..errors import InputError
 from .energy import Energy
 from .frames import frame
+from .path import Finer, Path
 from .rounding import with_rounding
-
-if TYPE_CHECKING:
-    from ..integrators.tableaus import Finer
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -201,58 +198,6 @@ def stage_gradients(
     path = Path(x, low, h * (b @ k), u, k, further, symmetries, h, b, finer)
     parts = [term.stage_gradients(_stage_gradients, path) for term in energy.terms]
     return sum(parts[1:], parts[0])
-
-
-class Path(NamedTuple):
-    """The collocation polynomial of a step, in the coordinates that a term depends on.
-
-    Attributes
-    ----------
-    start, low, step : array, shape (m,)
-        It leads from start + low to start + low + step.
-    points, slopes : array, shape (s, m)
-        At the stages.
-    further : two arrays, shape (r, m), or None
-        Points and slopes at the nodes of ``finer``.
-    symmetries : array, shape (s, r, m), or None
-        Vectors at the stages that corrections are to be orthogonal to.
-    """
-
-    start: jax.Array
-    low: jax.Array
-    step: jax.Array
-    points: jax.Array
-    slopes: jax.Array
-    further: tuple[jax.Array, jax.Array] | None
-    symmetries: jax.Array | None
-    h: jax.Array
-    b: np.ndarray
-    finer: Finer | None
-
-    def through(self, coordinates: Callable) -> tuple[Path, Callable]:
-        """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
-
-        def seen(x, d):
-            return jax.jvp(coordinates, (x,), (d,))
-
-        def turned(x, directions):
-            return jax.vmap(lambda d: seen(x, d)[1])(directions)
-
-        def back(covectors):
-            return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
-
-        low = jnp.zeros_like(self.start) + self.low
-        (points, slopes), step = jax.vmap(seen)(self.points, self.slopes), self.step
-        path = self._replace(
-            start=coordinates(self.start),
-            low=seen(self.start + 0.5 * low, low)[1],
-            step=seen(self.start + (low + 0.5 * step), step)[1],
-            points=points,
-            slopes=slopes,
-            further=None if self.further is None else jax.vmap(seen)(*self.further),
-            symmetries=None if self.symmetries is None else jax.vmap(turned)(self.points, self.symmetries),
-        )
-        return path, back
 
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:

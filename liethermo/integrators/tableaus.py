@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..functions.path import Finer
+
 MOST_STAGES = 8
 
 
@@ -48,23 +50,6 @@ def integrated(stages: int, theta) -> np.ndarray:
     nodes = 2 * np.asarray(theta, dtype=np.float64) - 1
     values = _legendre(stages, nodes)
     return _integrals(values) @ _coefficients(stages).astype(np.float64)
-
-
-class Finer(NamedTuple):
-    """Further nodes between those of a Gauss rule, which make it a Kronrod rule.
-
-    Attributes
-    ----------
-    A, slopes : ndarray, shape (s + 1, s)
-        ``x + h A @ k`` and ``slopes @ k`` are the collocation polynomial and its slope at the further nodes.
-    b, change : ndarray, shapes (s + 1,) and (s,)
-        Their weights, and what is added to those of the Gauss nodes.
-    """
-
-    A: np.ndarray
-    slopes: np.ndarray
-    b: np.ndarray
-    change: np.ndarray
 
 
 @functools.cache

@@ -1,0 +1,50 @@
+"""The geometry that a dissipation is handed."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax
+
+import manifolds as mf
+
+from ..functions.energy import Energy
+
+
+class Geometry(Protocol):
+    """What a dissipation may ask of the system that it acts in. Every system has it, whatever its class.
+
+    One on the dual of a Lie algebra has the attribute ``algebra`` besides, and ``poisson.places`` says where the bodies
+    are in the state of a system of several.
+
+    Attributes
+    ----------
+    dim : int
+        Components of a state.
+    energy : Energy
+    poisson : manifolds.PoissonStructure
+        Its ``sharp(x, dH)`` is the conservative motion.
+    space : manifolds.Space or None
+        None on R^n.
+    """
+
+    @property
+    def dim(self) -> int: ...
+    @property
+    def energy(self) -> Energy: ...
+    @property
+    def poisson(self) -> mf.PoissonStructure: ...
+    @property
+    def space(self) -> mf.Space | None: ...
+
+    def raised(self, x, alpha) -> jax.Array:
+        """The tangent vector that the metric of the space makes of a covector, shape (n,)."""
+        ...
+
+    def lowered(self, x, v) -> jax.Array:
+        """The covector that the metric of the space makes of a tangent vector, shape (n,)."""
+        ...
+
+    def tangent(self, x, w) -> jax.Array:
+        """The tangent vector nearest to an array, shape (n,)."""
+        ...

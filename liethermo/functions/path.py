@@ -1,0 +1,86 @@
+"""The collocation polynomial of a step, as the terms of an energy see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Finer(NamedTuple):
+    """Further nodes between those of a Gauss rule, which make it a Kronrod rule.
+
+    Attributes
+    ----------
+    A, slopes : ndarray, shape (s + 1, s)
+        ``x + h A @ k`` and ``slopes @ k`` are the collocation polynomial and its slope at the further nodes.
+    b, change : ndarray, shapes (s + 1,) and (s,)
+        Their weights, and what is added to those of the Gauss nodes.
+    """
+
+    A: np.ndarray
+    slopes: np.ndarray
+    b: np.ndarray
+    change: np.ndarray
+
+
+class Path(NamedTuple):
+    """The collocation polynomial of a step, in the coordinates that a term depends on.
+
+    Attributes
+    ----------
+    start, low, step : array, shape (m,)
+        It leads from start + low to start + low + step.
+    points, slopes : array, shape (s, m)
+        At the stages.
+    further : two arrays, shape (r, m), or None
+        Points and slopes at the nodes of ``finer``.
+    symmetries : array, shape (s, r, m), or None
+        Vectors at the stages that corrections are to be orthogonal to.
+    """
+
+    start: jax.Array
+    low: jax.Array
+    step: jax.Array
+    points: jax.Array
+    slopes: jax.Array
+    further: tuple[jax.Array, jax.Array] | None
+    symmetries: jax.Array | None
+    h: jax.Array
+    b: np.ndarray
+    finer: Finer | None
+
+    def through(self, coordinates: Callable) -> tuple[Path, Callable]:
+        """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
+
+        def seen(x, d):
+            return jax.jvp(coordinates, (x,), (d,))
+
+        def turned(x, directions):
+            return jax.vmap(lambda d: seen(x, d)[1])(directions)
+
+        def back(covectors):
+            return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
+
+        low = jnp.zeros_like(self.start) + self.low
+        (points, slopes), step = jax.vmap(seen)(self.points, self.slopes), self.step
+        path = self._replace(
+            start=coordinates(self.start),
+            low=seen(self.start + 0.5 * low, low)[1],
+            step=seen(self.start + (low + 0.5 * step), step)[1],
+            points=points,
+            slopes=slopes,
+            further=None if self.further is None else jax.vmap(seen)(*self.further),
+            symmetries=None if self.symmetries is None else jax.vmap(turned)(self.points, self.symmetries),
+        )
+        return path, back
+
+
+class Scheme(Protocol):
+    """What a term asks of a discrete gradient: see :class:`liethermo.functions.gradients.DiscreteGradient`."""
+
+    def quadratic(self, term: Any, x, d, low) -> jax.Array: ...
+    def general(self, term: Any, x, d, low) -> jax.Array: ...
