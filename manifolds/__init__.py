@@ -4,37 +4,13 @@ Importing this package switches JAX to 64-bit floating point: the laws are kept 
 round them away.
 """
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
-from .casimirs import NoPolynomialCasimirWarning  # noqa: E402
-from .catalogue import (  # noqa: E402
-    abelian,
-    aff,
-    bianchi,
-    g2,
-    galilei,
-    gl,
-    heisenberg,
-    registered,
-    se,
-    sl,
-    so,
-    sp,
-    su,
-)
-from .contact import (  # noqa: E402
-    CanonicalContact,
-    ContactForm,
-    ContactStructure,
-    Cosymplectic,
-    ExtendedPhaseSpace,
-    LagrangianContact,
-    SplitContact,
-)
-from .coordinates import Coordinates, Place, coordinates_around  # noqa: E402
-from .errors import (  # noqa: E402
+from . import _precision  # noqa: F401
+from .algebras.casimirs import NoPolynomialCasimirWarning
+from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
+from .algebras.invariants import TracePolynomial
+from .algebras.lie_algebra import LieAlgebra, direct_sum, semidirect_sum
+from .algebras.polynomial import Polynomial
+from .errors import (
     AntisymmetryError,
     ClosureError,
     ComponentError,
@@ -48,30 +24,10 @@ from .errors import (  # noqa: E402
     ShapeError,
     SpaceError,
 )
-from .geomstats_bridge import GeomstatsSpace, from_geomstats  # noqa: E402
-from .invariants import TracePolynomial  # noqa: E402
-from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum  # noqa: E402
-from .lie_group import (  # noqa: E402
-    GL,
-    SE,
-    SL,
-    SO,
-    SU,
-    Heisenberg,
-    MatrixGroup,
-    Sp,
-    registered_groups,
-)
-from .poisson import (  # noqa: E402
-    Canonical,
-    LiePoisson,
-    NoPoisson,
-    PoissonMap,
-    PoissonStructure,
-    PoissonTensor,
-)
-from .polynomial import Polynomial  # noqa: E402
-from .retraction import (  # noqa: E402
+from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
+from .groups.matrix_group import MatrixGroup, registered_groups
+from .retractions.coordinates import Coordinates, Place, coordinates_around
+from .retractions.retraction import (
     CayleyRetraction,
     Chart,
     EuclideanRetraction,
@@ -82,7 +38,7 @@ from .retraction import (  # noqa: E402
     RiemannianRetraction,
     retraction,
 )
-from .spaces import (  # noqa: E402
+from .spaces import (
     SPD,
     Euclidean,
     GroupSpace,
@@ -97,7 +53,18 @@ from .spaces import (  # noqa: E402
     Stiefel,
     registered_spaces,
 )
-from .statistics import dispersion, frechet_mean  # noqa: E402
+from .spaces.geomstats_bridge import GeomstatsSpace, from_geomstats
+from .spaces.statistics import dispersion, frechet_mean
+from .structures.contact import (
+    CanonicalContact,
+    ContactForm,
+    ContactStructure,
+    Cosymplectic,
+    ExtendedPhaseSpace,
+    LagrangianContact,
+    SplitContact,
+)
+from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
 
 __all__ = [
     "GL",

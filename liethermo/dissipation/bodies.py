@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-import manifolds as mf
+from manifolds.structures.contact import Places
 
 from ..functions.indices import Indices, as_pattern, cliques
 from .base import Dissipation, Law, SkewFriction
@@ -154,7 +154,7 @@ class ContactFriction(SkewFriction):
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _places(system) -> mf.contact.Places:
+def _places(system) -> Places:
     return system.poisson.places
 
 
@@ -167,12 +167,12 @@ def _apply(R, v):
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _of_body(places: mf.contact.Places, mine: np.ndarray) -> np.ndarray:
+def _of_body(places: Places, mine: np.ndarray) -> np.ndarray:
     """The components of the state of the body that some of the momenta belong to."""
     return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
 
 
-def _pairs(first: Indices, second: Indices, places: mf.contact.Places):
+def _pairs(first: Indices, second: Indices, places: Places):
     """For each edge and component: the numbers of the two momenta, and of the edge."""
     i, j = np.asarray(first), np.asarray(second)
     starts = np.searchsorted(places.owner, np.arange(len(places.S)))
@@ -182,7 +182,7 @@ def _pairs(first: Indices, second: Indices, places: mf.contact.Places):
     return starts[i][edge] + within, starts[j][edge] + within, edge
 
 
-def _within(places: mf.contact.Places, dim: int) -> scipy.sparse.csr_array:
+def _within(places: Places, dim: int) -> scipy.sparse.csr_array:
     """The pattern in which all components of a body depend on each other, and on none of another body."""
     starts = np.concatenate([[0], places.S[:-1] + 1])
     body = np.repeat(np.arange(len(starts)), places.S + 1 - starts)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds import matrix_functions
+from manifolds.matrices.linear import inverse
 
 from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
@@ -222,8 +222,8 @@ def _inverse(matrix):
 
 @_inverse.def_vmap
 def _inverses(axis_size, batched, matrices):
-    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrix_functions.solve
-    return matrix_functions.inverse(matrices), True
+    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrices.linear.solve
+    return inverse(matrices), True
 
 
 class State(eqx.Module):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from manifolds import matrix_functions
+from manifolds.matrices.linear import solve
 
 
 def solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
@@ -91,7 +91,7 @@ def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **r
 
         moved = jax.jvp(of_moving, tuple(leaves[i] for i in moving), tuple(dots))[1]
         matrix = jax.jacfwd(lambda k: misfit(jax.tree_util.tree_unflatten(structure, leaves), k))(k)
-        step = matrix_functions.solve(matrix.reshape(k.size, k.size), moved.reshape(-1, 1))
+        step = solve(matrix.reshape(k.size, k.size), moved.reshape(-1, 1))
         return -step.reshape(k.shape)
 
     levels = [(0, *level[:-1], *(level[i] for i in moving)) for level in axes]

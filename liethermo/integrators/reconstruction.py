@@ -8,7 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds import matrix_functions
+from manifolds.groups.maps import central, from_adjoint_cayley
+from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
 from ..functions.gradients import compensated
@@ -148,9 +149,9 @@ def _collocated(algebra, xi) -> jax.Array:
     turned = algebra.ad(xi).swapaxes(-1, -2)
     implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * dim, stages * dim)
     start = jnp.tile(jnp.eye(dim), (stages, 1))
-    Q = matrix_functions.solve_near_identity(jnp.eye(stages * dim) - implicit, start).reshape(stages, dim, dim)
+    Q = solve_near_identity(jnp.eye(stages * dim) - implicit, start).reshape(stages, dim, dim)
     R = jnp.eye(dim) + jnp.einsum("j,jab,jbc->ca", tableau.b, turned, Q)
-    return matrix_functions.from_adjoint_cayley(algebra, R) + matrix_functions.central(algebra, tableau.b @ xi)
+    return from_adjoint_cayley(algebra, R) + central(algebra, tableau.b @ xi)
 
 
 def _inverse_dexp(algebra, omega, xi, order: int) -> jax.Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds import matrix_functions
+from manifolds.groups import maps
 
 from ..errors import InputError
 from ..functions.energy import Energy, Sum
@@ -65,7 +65,7 @@ class AttitudeSystem(System):
 
     @property
     def unrollable(self) -> bool:
-        general = {"exp": matrix_functions.exp, "coadjoint": matrix_functions.adjoint_cayley}
+        general = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
         own = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
         kind = self.body.reconstruction or ""
         unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again

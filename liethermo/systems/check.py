@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.base import Dissipation, Law
 from ..dissipation.friction_operator import KERNEL
+from ..dissipation.geometry import Geometry
 from ..errors import InputError
+from ..functions.energy import Energy
 from ..tracing.interpret import at_points
-
-if TYPE_CHECKING:
-    from .base import System
 
 AXIOM_TOLERANCE = 1e-10
 """Largest residual of an axiom, relative to the size of what should cancel: derivatives round at about 1e-13."""
@@ -59,7 +59,36 @@ class CheckReport:
         return "\n".join(line.rstrip() for line in [*lines, f"{total} (at {self.points} points)"])
 
 
-def check_system(system: System, points, samples: int, seed: int, scale: float, times=None) -> CheckReport:
+class Subject(Geometry, Protocol):
+    """What is checked: see :class:`liethermo.systems.base.System`."""
+
+    production_name: ClassVar[str]
+
+    @property
+    def entropy(self) -> Energy | None: ...
+    @property
+    def dissipation(self) -> Dissipation | None: ...
+    @property
+    def momentum_maps(self) -> dict[str, Energy]: ...
+    @property
+    def energy_law(self) -> Law | None: ...
+    @property
+    def entropy_law(self) -> Law | None: ...
+    @property
+    def is_driven(self) -> bool: ...
+    @property
+    def smooth(self) -> bool: ...
+
+    def at_time(self, t) -> Subject: ...
+    def local(self, x, centred: bool = False) -> tuple[Subject, jax.Array]: ...
+    def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray: ...
+    def state(self, x, batch: bool = False) -> jax.Array: ...
+    def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array: ...
+    def own_residuals(self, x) -> dict[str, jax.Array]: ...
+    def vector_field(self, x) -> jax.Array: ...
+
+
+def check_system(system: Subject, points, samples: int, seed: int, scale: float, times=None) -> CheckReport:
     """See :meth:`liethermo.systems.base.System.check`."""
     if points is None:
         if samples < 1:
@@ -119,7 +148,7 @@ _MOMENTUM_MAP = "a momentum map has to commute with H and lie in the kernel of K
 _OWN = "what sets this kind of system apart does not hold"
 
 
-def _row(system: System, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
+def _row(system: Subject, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
     worst = float(values.max())
     if name == "production":
         least = float(values.min())
@@ -137,7 +166,7 @@ def _indefiniteness(K: np.ndarray) -> float:
     return max(0.0, -float(np.linalg.eigvalsh((K + K.T) / 2)[0])) / scale
 
 
-def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
+def _residuals(system: Subject, x: jax.Array) -> dict[str, jax.Array]:
     """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix.
 
     Of a system whose energy depends on time at a point with the time behind it.
@@ -181,7 +210,7 @@ def _residuals(system: System, x: jax.Array) -> dict[str, jax.Array]:
     return found | system.own_residuals(x)
 
 
-def _of_dissipations(system: System, x) -> dict[str, jax.Array]:
+def _of_dissipations(system: Subject, x) -> dict[str, jax.Array]:
     """Residuals of what the dissipations were given, the largest of each name."""
     found: dict[str, jax.Array] = {}
     for part in () if system.dissipation is None else system.dissipation.terms:
@@ -190,7 +219,7 @@ def _of_dissipations(system: System, x) -> dict[str, jax.Array]:
     return found
 
 
-def _matrix_residuals(system: System, around: System | None, x, dH, dS):
+def _matrix_residuals(system: Subject, around: Subject | None, x, dH, dS):
     """Residuals of the axioms on the matrices Pi and K; and the size of the motion, for what cancels in it.
 
     The motion itself may vanish at every point. On a manifold ``around`` is the system in a chart that is not centred.

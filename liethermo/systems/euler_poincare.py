@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Dissipation
 from ..dissipation.force import EulerPoincareForce

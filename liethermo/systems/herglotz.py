@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrix_functions import inverse
+from manifolds.matrices.linear import inverse
 
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,9 @@ import numpy as np
 
 from .._arrays import as_numeric, at, first, is_traced
 from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError, SpaceError
-from ..lie_group import MEMBERSHIP_TOLERANCE
+from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
 
-__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "registered_spaces", "safe_sqrt"]
+__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "makes", "register", "registered_spaces", "safe_sqrt"]
 
 CUT_MARGIN = 1e-8
 """A logarithm is taken up to this relative distance from the cut locus; beyond, its direction is decided by noise."""
@@ -511,14 +511,24 @@ class Space(ABC):
         return f"<{self.name}: dim {self.dim}, points of shape {self.shape}, {self.metric} metric>"
 
     def __mul__(self, other: Space) -> Space:
-        from .product import Product
-
-        return Product(self, other) if isinstance(other, Space) else NotImplemented
+        return self._product(self, other) if isinstance(other, Space) else NotImplemented
 
     def __pow__(self, count: int) -> Space:
-        from .product import Power
+        return self._power(self, count)
 
-        return Power(self, count)
+    _product: ClassVar[Callable[..., Space]]
+    _power: ClassVar[Callable[..., Space]]
+    """Products are spaces themselves, of classes that are defined after this one: they enter by :func:`makes`."""
+
+
+def makes(operation: str) -> Callable[[type[Space]], type[Space]]:
+    """Decorator: spaces of this class are what the operation of spaces makes, ``"_product"`` or ``"_power"``."""
+
+    def entered(space: type[Space]) -> type[Space]:
+        setattr(Space, operation, space)
+        return space
+
+    return entered
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from ..catalogue import _size
+from .._sizes import checked_size
 from .base import Space, register
 
 
@@ -24,7 +24,7 @@ class Euclidean(Space):
     exp_of_group = True
 
     def __init__(self, *sizes: int):
-        object.__setattr__(self, "sizes", tuple(_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))
+        object.__setattr__(self, "sizes", tuple(checked_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))
 
     @property
     def name(self):

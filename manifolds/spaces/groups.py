@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import as_numeric
-from ..catalogue import _size
-from ..closed_forms import affine
+from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
-from ..lie_group import MEMBERSHIP_TOLERANCE, SE, SL, SO, SU, Heisenberg, MatrixGroup, _log
-from ..matrix_functions import determinant, polar, solve, spectral_radius
-from ..symmetric import orthonormal_columns
+from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
+from ..groups.closed_forms import affine
+from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
+from ..matrices.linear import determinant, polar, solve, spectral_radius
+from ..matrices.symmetric import orthonormal_columns
 from .base import Space, register
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
@@ -254,7 +255,7 @@ class SpecialOrthogonal(BiInvariantSpace):
     n: int
 
     def __post_init__(self):
-        _size(self.n, 2, "SpecialOrthogonal(n)")
+        checked_size(self.n, 2, "SpecialOrthogonal(n)")
 
     @property
     def group(self):
@@ -284,7 +285,7 @@ class SpecialUnitary(BiInvariantSpace):
     dtype = np.dtype(np.complex128)
 
     def __post_init__(self):
-        _size(self.n, 2, "SpecialUnitary(n)")
+        checked_size(self.n, 2, "SpecialUnitary(n)")
 
     @property
     def group(self):
@@ -326,7 +327,7 @@ class SpecialEuclidean(GroupSpace):
     exp_of_group = False
 
     def __post_init__(self):
-        _size(self.n, 2, "SpecialEuclidean(n)")
+        checked_size(self.n, 2, "SpecialEuclidean(n)")
         if not 0.0 < self.length < math.inf:
             raise ParameterError(f"SpecialEuclidean(n, length): the length is a positive number, not {self.length!r}")
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..catalogue import _size
-from ..closed_forms import hyperbolic_arc, hyperbolic_stumpff
+from .._sizes import checked_size
+from ..matrices.stumpff import hyperbolic_arc, hyperbolic_stumpff
 from .base import Space, register, safe_sqrt
 
 
@@ -27,7 +27,7 @@ class Hyperbolic(Space):
     metric = "curvature -1"
 
     def __post_init__(self):
-        _size(self.n, 1, "Hyperbolic(n)")
+        checked_size(self.n, 1, "Hyperbolic(n)")
 
     @property
     def name(self):

@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..catalogue import _size
+from .._sizes import checked_size
 from ..errors import SpaceError
-from .base import Space, random_key, register
+from .base import Space, makes, random_key, register
 from .euclidean import Euclidean
 from .groups import SpecialOrthogonal
 from .sphere import Sphere
 
 
+@makes("_product")
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Product(Space):
@@ -185,6 +186,7 @@ class Product(Space):
         raise AssertionError("the logarithm is defined in every factor")
 
 
+@makes("_power")
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Power(Space):
@@ -200,7 +202,7 @@ class Power(Space):
     def __post_init__(self):
         if not isinstance(self.base, Space):
             raise SpaceError(f"a power is that of a state space, not of {type(self.base).__name__}")
-        _size(self.count, 1, "Power(base, count)", "count")
+        checked_size(self.count, 1, "Power(base, count)", "count")
 
     @property
     def name(self):

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..catalogue import _size
-from ..matrix_functions import expm, largest
-from ..symmetric import cholesky, solve_lower, spd_log, symmetrized
+from .._sizes import checked_size
+from ..matrices.exponential import expm
+from ..matrices.linear import largest
+from ..matrices.symmetric import cholesky, solve_lower, spd_log, symmetrized
 from .base import Space, register
 
 
@@ -30,7 +31,7 @@ class SPD(Space):
     metric = "affine-invariant"
 
     def __post_init__(self):
-        _size(self.n, 1, "SPD(n)")
+        checked_size(self.n, 1, "SPD(n)")
 
     @property
     def name(self):

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from ..catalogue import _size
-from ..closed_forms import arc, stumpff
-from ..matrix_functions import complement
+from .._sizes import checked_size
+from ..matrices.linear import complement
+from ..matrices.stumpff import arc, stumpff
 from .base import CUT_MARGIN, Space, register, safe_sqrt
 
 
@@ -28,7 +28,7 @@ class Sphere(Space):
     metric = "round"
 
     def __post_init__(self):
-        _size(self.n, 1, "Sphere(n)")
+        checked_size(self.n, 1, "Sphere(n)")
 
     @property
     def name(self):

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..catalogue import _size
+from .._sizes import checked_size
 from ..errors import ParameterError
-from ..matrix_functions import complement, expm, largest, orthonormalized, polar, solve
-from ..symmetric import orthonormal_columns
+from ..matrices.exponential import expm
+from ..matrices.linear import complement, largest, orthonormalized, polar, solve
+from ..matrices.symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
 
 _MOST_STEPS = 30
@@ -38,8 +39,8 @@ class Stiefel(Space):
     metric = "canonical"
 
     def __post_init__(self):
-        _size(self.n, 2, "Stiefel(n, p)")
-        _size(self.p, 1, "Stiefel(n, p)", "p")
+        checked_size(self.n, 2, "Stiefel(n, p)")
+        checked_size(self.p, 1, "Stiefel(n, p)", "p")
         if self.p >= self.n:
             raise ParameterError(
                 f"Stiefel(n, p): p must be less than n, not {self.p} >= {self.n}; for n = p take SpecialOrthogonal(n)"

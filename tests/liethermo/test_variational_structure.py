@@ -10,7 +10,7 @@ import pytest
 
 import liethermo as lt
 from liethermo.integrators.variational.discrete import Pair
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from .closed_systems import MECHANICAL, OPEN, SCHEMES, X0
 

@@ -12,9 +12,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import manifolds as mf
-from manifolds import _null_space as linear
-from manifolds import casimirs as module
-from manifolds.polynomial import Polynomial
+from manifolds.algebras import _null_space as linear
+from manifolds.algebras import polynomial_casimirs as module
+from manifolds.algebras.polynomial import Polynomial
 
 REGISTERED = list(mf.registered())
 INVARIANCE_TOLERANCE = 1e-15

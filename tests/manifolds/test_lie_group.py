@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import manifolds as mf
-from manifolds import matrix_functions
-from manifolds.closed_forms import stumpff
+from manifolds.groups import maps
+from manifolds.matrices import exponential, linear
+from manifolds.matrices.stumpff import stumpff
 
 TOLERANCES = {
     # name: (bound, what was measured and why)
@@ -192,7 +193,7 @@ def test_adjoint_cayley(G):
     nu = np.asarray(G.Ad_star(g, mu))
     assert close(nu, mu + G.algebra.ad_star(x, (mu + nu) / 2), "product")  # a step of the midpoint scheme
     if not G.algebra.is_abelian():  # where every map will do; else the same by way of the exponential
-        assert close(G.adjoint_cayley(x / 2), matrix_functions.adjoint_cayley(G.algebra, x / 2), "product")
+        assert close(G.adjoint_cayley(x / 2), maps.adjoint_cayley(G.algebra, x / 2), "product")
     gaps = np.abs(G.adjoint_cayley(x[:1] * SIZES[:, None]) - G.exp(x[:1] * SIZES[:, None])).max(axis=(-2, -1))
     assert gaps[-1] < 2e-15 or abs(slope(SIZES, gaps) - 3) < 0.2
     assert G.cayley_is_adjoint() == bool(close(G.cayley(x), g, "product"))
@@ -405,7 +406,7 @@ def test_batches_equal_loops(group):
 
 @each_program
 def test_compiled_programs_make_no_lapack_calls(group):
-    """Two of them in one program can wait for each other forever (see matrix_functions.solve)."""
+    """Two of them in one program can wait for each other forever (see manifolds.matrices.linear.solve)."""
 
     def everything(x):
         return group.Ad(group.inverse(group.cayley(group.log(group.exp(x)))))
@@ -545,7 +546,7 @@ def test_stumpff_functions():
 
 def test_matrix_exponential_of_rotations():
     """``jax.scipy.linalg.expm`` is wrong by 1e-8 at 10.6."""
-    expm = jax.jit(matrix_functions.expm)
+    expm = jax.jit(exponential.expm)
     for angle in (1e-5, 1.0, 5.3, 5.5, 10.6, 21.0, 1000.0):
         g = expm(np.array([[0.0, -angle], [angle, 0.0]]))
         exact = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -558,14 +559,14 @@ def test_solve_and_determinant():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((2, 3, 5, 5)) + 1j * rng.standard_normal((2, 3, 5, 5))
     a[0, 0, 0] = 0.0  # needs a row exchange
-    assert np.abs(a @ jax.jit(matrix_functions.solve)(a, b) - b).max() < 1e-13
-    assert np.allclose(jax.jit(matrix_functions.determinant)(a), np.linalg.det(a), rtol=1e-13, atol=0.0)
-    assert not np.isfinite(jax.jit(matrix_functions.inverse)(np.zeros((2, 2)))).any()
+    assert np.abs(a @ jax.jit(linear.solve)(a, b) - b).max() < 1e-13
+    assert np.allclose(jax.jit(linear.determinant)(a), np.linalg.det(a), rtol=1e-13, atol=0.0)
+    assert not np.isfinite(jax.jit(linear.inverse)(np.zeros((2, 2)))).any()
 
     def gradient(solver):
         return jax.jit(jax.grad(lambda a, b: jnp.abs(solver(a, b)).sum(), argnums=(0, 1)))
 
-    ours, theirs = gradient(matrix_functions.solve), gradient(jnp.linalg.solve)
+    ours, theirs = gradient(linear.solve), gradient(jnp.linalg.solve)
     for x, y in zip(ours(a, b), theirs(a, b), strict=True):
         assert np.allclose(x, y, rtol=1e-11, atol=1e-11)
     assert "lapack" not in ours.lower(a, b).as_text()

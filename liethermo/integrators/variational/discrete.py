@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...systems import SimpleClosedSystem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from ...systems import SimpleClosedSystem, System
 from ..base import GaussMethod, checked_stages

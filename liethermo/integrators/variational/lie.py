@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds import matrix_functions
-from manifolds.matrix_functions import solve
+from manifolds.groups.maps import cayley
+from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...systems import EulerPoincareClosedSystem, System
@@ -144,6 +144,6 @@ def _turns(system: EulerPoincareClosedSystem, x, h):
             return xi - solve(jax.jacfwd(misfit)(xi), misfit(xi)[:, None])[:, 0]
 
         xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (before[:-1] + after[:-1]))
-        return matrix_functions.cayley(system.algebra, h * xi)
+        return cayley(system.algebra, h * xi)
 
     return jax.vmap(one)(x[:-1], x[1:])

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds.matrix_functions import solve
+from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...systems import SimpleClosedSystem, System

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 import manifolds as mf
+from manifolds.structures.contact import Places
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
@@ -167,7 +168,7 @@ class ComposedSystem(System):
     # -- how it is put together -----------------------------------------------------------------------------------
 
     @property
-    def _places(self) -> mf.contact.Places:
+    def _places(self) -> Places:
         return self.poisson.places
 
     @property

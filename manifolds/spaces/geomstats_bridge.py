@@ -22,10 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .errors import ParameterError, SpaceError
-from .matrix_functions import solve
-from .spaces.base import CUT_MARGIN, MEMBERSHIP_TOLERANCE, Space, random_key
-from .symmetric import cholesky, solve_lower
+from ..errors import ParameterError, SpaceError
+from ..matrices.linear import solve
+from ..matrices.symmetric import cholesky, solve_lower
+from .base import CUT_MARGIN, MEMBERSHIP_TOLERANCE, Space, random_key
 
 _STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 """Weights of f(x + k h) - f(x - k h) in h f'(x), to order 8."""

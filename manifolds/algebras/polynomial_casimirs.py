@@ -1,15 +1,8 @@
-"""Casimirs: how many independent ones an algebra has, and which polynomials they are.
-
-A Casimir is a function F on g* with ``ad*_{grad F(mu)} mu = 0`` for every mu. It is enough that F Poisson-commutes
-with elements that generate the algebra, by the Jacobi identity; on the coefficients of a homogeneous polynomial each
-of these conditions is linear. Where the structure constants are rational, perhaps after a scaling of the basis, the
-polynomials found are exact and proved to be all there are.
-"""
+"""Polynomial Casimirs by linear algebra: how many there are, and those of a degree."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from fractions import Fraction
 from functools import lru_cache
@@ -19,18 +12,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ._null_space import (
-    numerical_null_space,
-    numerical_rank,
-    prime,
-    rational_null_space,
-    reduced,
-    row_echelon,
-)
-from .errors import JacobiError, LieAlgebraError, ParameterError
-from .invariants import TracePolynomial, fundamental_invariants
-from .lie_algebra import LieAlgebra
+from ..errors import JacobiError, LieAlgebraError
+from ._null_space import numerical_null_space, numerical_rank, prime, rational_null_space, reduced, row_echelon
 from .polynomial import Polynomial
+from .structure import Structure
 
 LARGEST_MONOMIAL_COUNT = 20000
 LARGEST_BLOCK = 2000
@@ -41,12 +26,8 @@ random basis all monomials form one block.
 """
 
 
-class NoPolynomialCasimirWarning(UserWarning):
-    """The algebra has Casimirs, but none found is a polynomial."""
-
-
 @lru_cache(maxsize=256)
-def casimir_count(g: LieAlgebra) -> int:
+def casimir_count(g: Structure) -> int:
     """Number of independent Casimir functions near a generic point of g*; they need not be polynomials.
 
     It is dim minus the generic rank of the Lie-Poisson tensor ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, taken as the
@@ -72,76 +53,17 @@ def casimir_count(g: LieAlgebra) -> int:
     return g.dim - max(ranks)
 
 
-def casimirs(g: LieAlgebra, degree: int) -> list[Polynomial | TracePolynomial]:
-    """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
-
-    The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
-    basis in the lexicographic order of monomials, less the elements whose leading monomial is that of a combination
-    of products.
-
-    Parameters
-    ----------
-    g : LieAlgebra
-    degree : int
-        At least 1.
-
-    Returns
-    -------
-    list of Polynomial or TracePolynomial
-        Coprime integer coefficients with a positive leading one, exact, where the structure constants are rational;
-        otherwise floats with leading coefficient 1, correct to the last digit where a scaling of the basis makes the
-        constants rational (su(n)). Where there are more than 20000 monomials of this degree, or more than 2000 coupled
-        ones, and the algebra is semisimple or reductive: traces of powers of matrices, and Pfaffians, proved to be all
-        by the number and the degrees of the generators (see :mod:`manifolds.invariants`).
-
-    Raises
-    ------
-    ParameterError
-        If the degree is not a positive integer.
-    LieAlgebraError
-        If there are too many monomials and no set of traces is complete; or if the constants
-        cannot be made rational and the singular values show no clear gap.
-
-    Warns
-    -----
-    NoPolynomialCasimirWarning
-        If the algebra has Casimirs but no polynomial one of this degree or below. A semisimple algebra gives no
-        warning: its Casimirs are polynomials, of degree 2 and more [Chevalley].
-    """
-    if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
-        raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
-    found: list[Polynomial | TracePolynomial]
-    try:
-        found = list(_new_casimirs(g, int(degree)))
-    except _TooLargeError:
-        generators = fundamental_invariants(g)
-        if generators is None:
-            raise
-        found = [F for F in generators if F.degree == degree]
-    number = 0 if found or g.is_semisimple() else casimir_count(g)
-    if number and not any(_new_casimirs(g, d) for d in range(1, int(degree) + 1)):
-        warnings.warn(
-            f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
-            f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
-            "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
-            "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
-            NoPolynomialCasimirWarning,
-            stacklevel=3,  # the caller of LieAlgebra.casimirs
-        )
-    return found
-
-
 @lru_cache(maxsize=256)
-def _new_casimirs(g: LieAlgebra, degree: int) -> tuple[Polynomial, ...]:
+def new_casimirs(g: Structure, degree: int) -> tuple[Polynomial, ...]:
     if casimir_count(g) == 0:
         return ()
     scaled, squares = _rational_form(g)
     if g.rational_constants is None and scaled.rational_constants is not None:
-        return tuple(_rescaled(F, squares) for F in _new_casimirs(scaled, degree))
+        return tuple(_rescaled(F, squares) for F in new_casimirs(scaled, degree))
     if g.rational_constants is None and (scaled := _balanced_form(g)) != g:
-        return tuple(_weighted(F, g._balanced[1]) for F in _new_casimirs(scaled, degree))
+        return tuple(_weighted(F, g._balanced[1]) for F in new_casimirs(scaled, degree))
     invariants = _invariants(g, degree)
-    lower = [F for d in range(1, degree) for F in _new_casimirs(g, d)]
+    lower = [F for d in range(1, degree) for F in new_casimirs(g, d)]
     products = [dict(F.terms) for F in _products(lower, degree)]
     # The invariants are in reduced echelon form, so the coordinates of a product are its coefficients at their
     # leading monomials, up to the scale of each; and an invariant vanishes at the leading monomials of the others.
@@ -161,7 +83,7 @@ def _products(factors: list[Polynomial], degree: int) -> Iterator[Polynomial]:
             yield from (F * rest for rest in _products(factors[i:], degree - F.degree))
 
 
-def _invariants(g: LieAlgebra, degree: int) -> list[Polynomial]:
+def _invariants(g: Structure, degree: int) -> list[Polynomial]:
     """The reduced row echelon basis of all homogeneous polynomial Casimirs of this degree, leading monomials first."""
     size = math.comb(g.dim + degree - 1, degree)
     _check_size(size, LARGEST_MONOMIAL_COUNT, f"{g.name} has {size} monomials of degree {degree}")
@@ -187,13 +109,13 @@ def _invariants(g: LieAlgebra, degree: int) -> list[Polynomial]:
 
 def _check_size(size: int, limit: int, what: str) -> None:
     if size > limit:
-        raise _TooLargeError(
+        raise TooLargeError(
             f"{what}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
             "are known to generate them all: ask for a lower degree, or build a reductive algebra from matrices"
         )
 
 
-class _TooLargeError(LieAlgebraError):
+class TooLargeError(LieAlgebraError):
     """More monomials than the linear algebra is asked to take."""
 
 
@@ -256,7 +178,7 @@ def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 
 
 
 @lru_cache(maxsize=256)
-def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
+def _rational_form(g: Structure) -> tuple[Structure, tuple[int, ...]]:
     """The algebra in a basis ``sqrt(r_a) e_a`` with rational constants, and the integers r_a; else g itself.
 
     The constants become ``C[a, b, c] sqrt(r_a r_b / r_c)``, hence ``C**2 r_a r_b r_c`` must be a square wherever C is
@@ -287,19 +209,19 @@ def _rational_form(g: LieAlgebra) -> tuple[LieAlgebra, tuple[int, ...]]:
         root = Fraction(math.isqrt(square.numerator), math.isqrt(square.denominator))
         constants[a, b, c] = root if v > 0 else -root
     try:
-        return LieAlgebra.from_structure_constants(constants, g.name), tuple(r)
+        return type(g).from_structure_constants(constants, g.name), tuple(r)
     except JacobiError:  # fractions that were close to the constants by chance
         return unchanged
 
 
 @lru_cache(maxsize=256)
-def _balanced_form(g: LieAlgebra) -> LieAlgebra:
+def _balanced_form(g: Structure) -> Structure:
     """The algebra in the basis ``factors[a] e_a`` with balanced constants; g itself where it has them already."""
     constants, factors = g._balanced
     if np.abs(np.log(factors)).max() < 1e-12:
         return g
     try:
-        return LieAlgebra.from_structure_constants(constants, g.name)
+        return type(g).from_structure_constants(constants, g.name)
     except JacobiError:  # an axiom that holds to rounding of the largest constants only
         return g
 

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .matrix_functions import inverse
+from ..matrices.linear import inverse
+from ..spaces import Power, Product
 from .retraction import Chart
-from .spaces import Power, Product
 
 
 class Place(NamedTuple):

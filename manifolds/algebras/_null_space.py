@@ -9,7 +9,7 @@ from itertools import count
 
 import numpy as np
 
-from .errors import LieAlgebraError
+from ..errors import LieAlgebraError
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this, relative to the largest entry, are zeros: the axioms hold to 1e-12 only."""

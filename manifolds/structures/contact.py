@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._arrays import real_components
-from .errors import ParameterError, ShapeError
-from .matrix_functions import determinant, inverse, solve
+from .._arrays import real_components
+from ..errors import ParameterError, ShapeError
+from ..matrices.linear import determinant, inverse, solve
 from .poisson import PoissonStructure
 
 

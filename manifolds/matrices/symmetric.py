@@ -2,7 +2,7 @@
 
 Beside them the logarithm of rotations, whose symmetric part shows the planes that are turned by pi.
 
-Plain array operations of fixed length, for the reason given at :func:`manifolds.matrix_functions.solve` and so that
+Plain array operations of fixed length, for the reason given at :func:`manifolds.matrices.linear.solve` and so that
 small cases can be unrolled into scalar programs. Leading axes are batches.
 """
 
@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .closed_forms import HALF_TURN_MARGIN, hyperbolic_stumpff, leading_sign
-from .lie_algebra import LieAlgebra
-from .matrix_functions import expm, largest, log, orthonormalized
+from .exponential import expm
+from .linear import largest, orthonormalized
+from .stumpff import hyperbolic_stumpff
 
 _NEARLY_ONE = 0.5
 """Largest entry of w - I up to which the logarithm of w takes the eigenvalues of w - I, not those of w."""
@@ -116,32 +116,3 @@ def _log_derivative(primals, tangents):
 
     # The derivative of exp is self-adjoint, and a linear solve has derivatives of its own: hence those of higher order.
     return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(dw), in_eigenvectors, symmetric=True)
-
-
-def rotation_log(algebra: LieAlgebra, g) -> jax.Array:
-    """Logarithm in SO(n), defined also where one plane is turned by pi: there with the sign of ``leading_sign``.
-
-    With J the quarter turn of that plane, g times its half turn has a principal logarithm, which commutes with J:
-    ``log g = log(g exp(-pi J)) + pi J``. Where more than one plane is turned by pi, J may be any element of a
-    continuum, and the result is NaN.
-    """
-    values, vectors = eigh(symmetrized(g))
-    first = _least(values)
-    second = _least(jnp.where(first, jnp.inf, values))
-    third = jnp.where(first | second, jnp.inf, values).min(axis=-1, keepdims=True)
-    u, v = ((vectors * column[..., None, :]).sum(axis=-1) for column in (first, second))
-    J = v[..., :, None] * u[..., None, :] - u[..., :, None] * v[..., None, :]
-    sine = (J * (g - g.swapaxes(-1, -2))).sum(axis=(-2, -1))[..., None] / 4
-    sign = jnp.where(jnp.abs(sine) > HALF_TURN_MARGIN, jnp.sign(sine), leading_sign(algebra.vee(J)))
-    is_turned = (jnp.where(second, values, 0.0).min(axis=-1, keepdims=True) < _TURNED) & (third > _TURNED)
-    J = jnp.where(is_turned[..., None], sign[..., None] * J, 0.0)
-    return log(algebra, g @ (jnp.eye(g.shape[-1]) + 2 * J @ J)) + jnp.pi * algebra.vee(J)
-
-
-_TURNED = -1.0 + 2e-15
-"""Cosines below this are those of a half turn: angles that differ by less than 6e-8, and rounding."""
-
-
-def _least(values):
-    """Where the first of the smallest entries along the last axis is."""
-    return jnp.arange(values.shape[-1]) == jnp.argmin(values, axis=-1)[..., None]  # no index that varies

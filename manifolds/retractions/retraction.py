@@ -20,12 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._arrays import at, first, is_traced
-from .errors import DomainError, ParameterError, SpaceError
-from .lie_group import MEMBERSHIP_TOLERANCE, MatrixGroup
-from .matrix_functions import solve
-from .spaces import GroupSpace
-from .spaces.base import Space, run
+from .._arrays import at, first, is_traced
+from ..errors import DomainError, ParameterError, SpaceError
+from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup
+from ..matrices.linear import solve
+from ..spaces import GroupSpace
+from ..spaces.base import Space, run
 
 
 class Retraction(ABC):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .errors import DomainError, ParameterError
-from .spaces.base import Space
+from ..errors import DomainError, ParameterError
+from .base import Space
 
 LIMIT = 200
 """Iterations: each of them gains a digit or more within the ball in which the mean is known to be one point."""

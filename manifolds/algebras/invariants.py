@@ -24,12 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._arrays import real_components
-from ._names import checked_names
+from .._arrays import real_components
+from .._names import checked_names
+from ..errors import LieAlgebraError, ShapeError
 from ._null_space import numerical_null_space
-from .errors import LieAlgebraError, ShapeError
-from .lie_algebra import LieAlgebra
 from .polynomial import Polynomial
+from .polynomial_casimirs import casimir_count, new_casimirs
+from .structure import Structure
 
 LARGEST_COMMUTANT = 40
 """Matrices up to this size are searched for others that commute with them."""
@@ -176,7 +177,7 @@ def _power(X, exponent: int):
 
 
 @lru_cache(maxsize=64)
-def fundamental_invariants(g: LieAlgebra) -> tuple[TracePolynomial | Polynomial, ...] | None:
+def fundamental_invariants(g: Structure) -> tuple[TracePolynomial | Polynomial, ...] | None:
     """Casimirs that generate all polynomial ones, in the order of their degrees; None where no such set is found."""
     sources: list[_Source] = []
     for source in _sources(g):
@@ -187,9 +188,7 @@ def fundamental_invariants(g: LieAlgebra) -> tuple[TracePolynomial | Polynomial,
     return None
 
 
-def _independent_invariants(g: LieAlgebra, sources: list[_Source]) -> tuple[TracePolynomial | Polynomial, ...] | None:
-    from .casimirs import casimir_count
-
+def _independent_invariants(g: Structure, sources: list[_Source]) -> tuple[TracePolynomial | Polynomial, ...] | None:
     count = casimir_count(g)
     total = (g.dim + count) // 2
     points = np.random.default_rng(0).standard_normal((3, g.dim))
@@ -214,7 +213,7 @@ def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
     return F._gradient(mu) if isinstance(F, TracePolynomial) else np.asarray(jax.grad(F)(mu))
 
 
-def _is_invariant(g: LieAlgebra, gradient: np.ndarray, mu: np.ndarray) -> bool:
+def _is_invariant(g: Structure, gradient: np.ndarray, mu: np.ndarray) -> bool:
     motion = np.einsum("abc,a,c->b", g.structure_constants, gradient, mu)
     size = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
     return bool(np.linalg.norm(motion) <= 1e-10 * size)
@@ -244,7 +243,7 @@ class _Source(NamedTuple):
             yield self.pfaffian
 
 
-def _sources(g: LieAlgebra) -> Iterator[_Source]:
+def _sources(g: Structure) -> Iterator[_Source]:
     """The cheap ones first: the matrices of the algebra, the adjoint ones, the second derivatives of cubic Casimirs."""
     if g.basis is not None:
         basis = _real_matrices(g.basis)
@@ -261,11 +260,9 @@ def _sources(g: LieAlgebra) -> Iterator[_Source]:
         yield _Source(f"D{i + 1}", D, [np.eye(g.dim)])
 
 
-def _cubics(g: LieAlgebra) -> list[Polynomial]:
-    from .casimirs import _new_casimirs
-
+def _cubics(g: Structure) -> list[Polynomial]:
     try:
-        return list(_new_casimirs(g, 3))
+        return list(new_casimirs(g, 3))
     except LieAlgebraError:  # too many monomials, or no clear rank
         return []
 

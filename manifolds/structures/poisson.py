@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._arrays import real_components
-from .errors import ParameterError, ShapeError
-from .lie_algebra import LieAlgebra
+from .._arrays import real_components
+from ..algebras.lie_algebra import LieAlgebra
+from ..errors import ParameterError, ShapeError
 
 
 class PoissonStructure(eqx.Module):

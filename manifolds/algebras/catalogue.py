@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from .._sizes import checked_size
+from ..errors import ParameterError
 from ._null_space import rational_null_space
-from .errors import ParameterError
 from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum
 
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
@@ -40,7 +41,7 @@ def registered() -> Iterator[LieAlgebra]:
 @register((1,), (3,))
 def abelian(n: int) -> LieAlgebra:
     """The abelian algebra R^n, as translations."""
-    n = _size(n, 1, "abelian(n)")
+    n = checked_size(n, 1, "abelian(n)")
     basis = np.zeros((n, n + 1, n + 1))
     basis[np.arange(n), np.arange(n), n] = 1.0
     return _named(basis, f"abelian({n})")
@@ -53,8 +54,8 @@ def so(p: int, q: int = 0) -> LieAlgebra:
     so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
     ``E_ij g - E_ji g`` for i < j in lexicographic order, g the form.
     """
-    p, q = _size(p, 0, "so(p, q)"), _size(q, 0, "so(p, q)")
-    n = _size(p + q, 2, "so(p, q)", "p + q")
+    p, q = checked_size(p, 0, "so(p, q)"), checked_size(q, 0, "so(p, q)")
+    n = checked_size(p + q, 2, "so(p, q)", "p + q")
     if (p, q) == (3, 0):
         i, j, k = np.eye(3)
         return _named([_e(k, j) - _e(j, k), _e(i, k) - _e(k, i), _e(j, i) - _e(i, j)], "so(3)")
@@ -69,7 +70,7 @@ def su(n: int) -> LieAlgebra:
 
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
     """
-    n = _size(n, 2, "su(n)")
+    n = checked_size(n, 2, "su(n)")
     basis = []
     for k in range(1, n):
         for j in range(k):
@@ -86,7 +87,7 @@ def sl(n: int) -> LieAlgebra:
 
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
     """
-    n = _size(n, 2, "sl(n)")
+    n = checked_size(n, 2, "sl(n)")
     diagonal = [_unit(n, i, i) - _unit(n, i + 1, i + 1) for i in range(n - 1)]
     upper = [_unit(n, i, j) for i in range(n) for j in range(i + 1, n)]
     lower = [_unit(n, j, i) for i in range(n) for j in range(i + 1, n)]
@@ -96,7 +97,7 @@ def sl(n: int) -> LieAlgebra:
 @register((1,), (2,))
 def sp(n: int) -> LieAlgebra:
     """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
-    n = _size(n, 1, "sp(n)")
+    n = checked_size(n, 1, "sp(n)")
     zero = np.zeros((n, n))
     blocks = [np.block([[_unit(n, i, j), zero], [zero, -_unit(n, j, i)]]) for i in range(n) for j in range(n)]
     symmetric = [_unit(n, i, j) + (i != j) * _unit(n, j, i) for i in range(n) for j in range(i, n)]
@@ -137,14 +138,14 @@ _OCTONIONS = (
 @register((1,), (2,))
 def gl(n: int) -> LieAlgebra:
     """All real matrices, basis E_ij row by row."""
-    n = _size(n, 1, "gl(n)")
+    n = checked_size(n, 1, "gl(n)")
     return _named([_unit(n, i, j) for i in range(n) for j in range(n)], f"gl({n})")
 
 
 @register((2,), (3,))
 def se(n: int) -> LieAlgebra:
     """Rigid motions of R^n: the rotations so(n) first, then the translations."""
-    n = _size(n, 2, "se(n)")
+    n = checked_size(n, 2, "se(n)")
     rotations = so(n)
     return semidirect_sum(rotations, rotations.basis, name=f"se({n})")
 
@@ -152,7 +153,7 @@ def se(n: int) -> LieAlgebra:
 @register((1,), (2,))
 def heisenberg(n: int = 1) -> LieAlgebra:
     """Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, upper triangular matrices."""
-    n = _size(n, 1, "heisenberg(n)")
+    n = checked_size(n, 1, "heisenberg(n)")
     q = [_unit(n + 2, 0, i + 1) for i in range(n)]
     p = [_unit(n + 2, i + 1, n + 1) for i in range(n)]
     return _named([*q, *p, _unit(n + 2, 0, n + 1)], f"heisenberg({n})")
@@ -161,7 +162,7 @@ def heisenberg(n: int = 1) -> LieAlgebra:
 @register((2,), (3,))
 def galilei(n: int) -> LieAlgebra:
     """Galilei algebra of R^n: rotations J, boosts K, translations P, time translation H; ``[K_i, H] = P_i``."""
-    n = _size(n, 2, "galilei(n)")
+    n = checked_size(n, 2, "galilei(n)")
     rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
     rotations[:, :n, :n] = so(n).basis
     boosts = [_unit(n + 2, i, n) for i in range(n)]
@@ -172,7 +173,7 @@ def galilei(n: int) -> LieAlgebra:
 @register((1,), (2,))
 def aff(n: int = 1) -> LieAlgebra:
     """Affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``."""
-    n = _size(n, 1, "aff(n)")
+    n = checked_size(n, 1, "aff(n)")
     return semidirect_sum(gl(n), gl(n).basis, name=f"aff({n})")
 
 
@@ -246,14 +247,6 @@ for _kind, _h in [("VI", 0.0), ("VI", -0.25), ("VI", -0.5), ("VII", 0.0), ("VII"
     _registry.append((bianchi, (_kind,), {"h": _h}))
 _registry.append((lambda: direct_sum(so(3), heisenberg(1)), (), {}))
 _registry.append((lambda: semidirect_sum(sl(2), sl(2).basis, name="sl(2) x R^2"), (), {}))
-
-
-def _size(value: int, least: int, name: str, what: str = "n") -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ParameterError(f"{name}: {what} must be an integer, not {value!r}")
-    if value < least:
-        raise ParameterError(f"{name}: {what} must be at least {least}, not {value}")
-    return int(value)
 
 
 def _e(row: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._arrays import real_components
-from ._names import checked_names, component_names
-from .errors import ComponentError, ShapeError
+from .._arrays import real_components
+from .._names import checked_names, component_names
+from ..errors import ComponentError, ShapeError
 
 Coefficient = Fraction | float
 

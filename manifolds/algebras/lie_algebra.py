@@ -16,11 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from ._arrays import is_traced, real_components, square_matrices
-from ._balance import STRUCTURE_TOLERANCE, balanced
-from ._exact import RationalArray, jacobi_sums, rational_array
-from ._names import checked_names
-from .errors import (
+from .._arrays import is_traced, real_components, square_matrices
+from .._names import checked_names
+from ..errors import (
     AntisymmetryError,
     ClosureError,
     ComponentError,
@@ -29,6 +27,10 @@ from .errors import (
     RepresentationError,
     ShapeError,
 )
+from ._balance import STRUCTURE_TOLERANCE, balanced
+from ._exact import RationalArray, jacobi_sums, rational_array
+from .casimirs import casimirs
+from .polynomial_casimirs import casimir_count
 
 AXIOM_TOLERANCE = 1e-12
 """Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
@@ -303,8 +305,6 @@ class LieAlgebra:
 
         That is dim minus the generic rank of the Lie-Poisson tensor; they need not be polynomials.
         """
-        from .casimirs import casimir_count
-
         return casimir_count(self)
 
     def casimirs(self, degree: int):
@@ -314,8 +314,6 @@ class LieAlgebra:
         ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational. Where there
         are too many monomials and the algebra is semisimple or reductive, :class:`manifolds.TracePolynomial`.
         """
-        from .casimirs import casimirs
-
         found = casimirs(self, degree)
         return found if self.basis_names is None else [F.with_names(*self.basis_names) for F in found]
 

@@ -1,7 +1,7 @@
 """Matrix Lie groups: exponential, logarithm, Cayley map, adjoint and coadjoint action.
 
 Conventions: an element of the group is a matrix, shape (..., m, m), an element of its algebra its components, shape
-(..., dim), in the basis of the :mod:`manifolds.catalogue`; leading axes are batches. ``Ad_star(g, mu)`` is the
+(..., dim), in the basis of the :mod:`manifolds.algebras.catalogue`; leading axes are batches. ``Ad_star(g, mu)`` is the
 transpose of ``Ad(g)``, with no inverse, so that its derivative at the identity is ``ad_star``. Derivatives of paths are
 left-trivialised: ``g' = g hat(x)``.
 
@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import catalogue
+from .._arrays import at, first, is_traced, real_components, square_matrices
+from ..algebras.lie_algebra import LieAlgebra
+from ..errors import ComponentError, DomainError, LieAlgebraError
+from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of
+from ..matrices.linear import inverse, largest, solve
+from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
-from . import matrix_functions as general
-from ._arrays import at, first, is_traced, real_components, square_matrices
-from .errors import ComponentError, DomainError, LieAlgebraError
-from .lie_algebra import LieAlgebra
-from .symmetric import rotation_log
+from . import maps
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
@@ -34,7 +35,7 @@ LEAVES_TOLERANCE = 1e-10
 """How far from the group, relative to its size, a map may end that is said to stay in it."""
 
 _LOG_NEEDS = (
-    f"principal logarithm needs angles below pi - {closed.HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
+    f"principal logarithm needs angles below pi - {HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
     "to choose from (not where one plane of SO(n), SE(2) or SE(3) is turned by pi)"
 )
 
@@ -92,12 +93,12 @@ class MatrixGroup:
     name: str
     algebra: LieAlgebra
     defect: Callable
-    inverse_map: Callable = general.inverse
-    exp_map: Callable = general.exp
-    log_map: Callable = general.log
-    cayley_map: Callable | None = general.cayley
-    inverse_cayley_map: Callable = general.inverse_cayley
-    adjoint_cayley_map: Callable | None = general.adjoint_cayley
+    inverse_map: Callable = inverse
+    exp_map: Callable = maps.exp
+    log_map: Callable = maps.log
+    cayley_map: Callable | None = maps.cayley
+    inverse_cayley_map: Callable = maps.inverse_cayley
+    adjoint_cayley_map: Callable | None = maps.adjoint_cayley
     restore_map: Callable = closed.unchanged
 
     @property
@@ -387,7 +388,7 @@ class MatrixGroup:
         nearest = eigenvalues[np.abs(eigenvalues**2 - 4).argmin()]
         return (
             f"has the eigenvalue {nearest:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
-            f"number {general.CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
+            f"number {CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
         )
 
 
@@ -397,120 +398,6 @@ _MAPS = {
     "adjoint_cayley": ("the map that makes Cayley's of ad x an adjoint action", "use exp"),
 }
 """The maps from the algebra to the group, and what to do where one leaves it."""
-
-
-# -- the groups -----------------------------------------------------------------------------------------------------
-
-
-@register((2,), (3,), (4,))
-def SO(n: int) -> MatrixGroup:
-    """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
-    group = MatrixGroup(
-        f"SO({n})",
-        catalogue.so(n),
-        closed.unitary_defect,
-        closed.unitary_inverse,
-        log_map=rotation_log,
-        adjoint_cayley_map=None,
-        restore_map=general.orthonormalized,
-    )
-    if n == 2:
-        return replace(
-            group, exp_map=closed.so2_exp, log_map=closed.so2_log, adjoint_cayley_map=general.cayley
-        )  # abelian: any map will do
-    if n == 3:
-        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log, adjoint_cayley_map=closed.so3_cayley)
-        return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
-    return replace(group, adjoint_cayley_map=closed.so4_adjoint_cayley) if n == 4 else group
-
-
-@register((2,), (3,))
-def SE(n: int) -> MatrixGroup:
-    """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
-    group = MatrixGroup(
-        f"SE({n})",
-        catalogue.se(n),
-        closed.rigid_defect,
-        closed.rigid_inverse,
-        adjoint_cayley_map=general.cayley if n == 2 else None,
-        restore_map=closed.rigid_restored,
-    )
-    if n == 2:
-        return replace(group, log_map=closed.rigid_log)
-    if n == 3:
-        group = replace(
-            group, exp_map=closed.se3_exp, log_map=closed.rigid_log, adjoint_cayley_map=closed.se3_adjoint_cayley
-        )
-        return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
-    return group
-
-
-@register((2,), (3,))
-def SU(n: int) -> MatrixGroup:
-    """Unitary complex matrices of determinant 1."""
-    group = MatrixGroup(
-        f"SU({n})",
-        catalogue.su(n),
-        closed.unitary_defect,
-        closed.unitary_inverse,
-        restore_map=closed.unitary_restored,
-    )
-    if n == 2:
-        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
-        return replace(
-            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
-        )
-    return replace(group, cayley_map=None, adjoint_cayley_map=None)
-
-
-@register((2,), (3,))
-def SL(n: int) -> MatrixGroup:
-    """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
-    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.unimodular_restored)
-    if n == 2:
-        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley)
-    return replace(group, cayley_map=None, adjoint_cayley_map=None)
-
-
-@register((2,))
-def Sp(n: int) -> MatrixGroup:
-    """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
-    return MatrixGroup(
-        f"Sp({n})",
-        catalogue.sp(n),
-        closed.symplectic_defect,
-        closed.symplectic_inverse,
-        adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
-        restore_map=closed.symplectic_restored,
-    )
-
-
-@register((2,))
-def GL(n: int) -> MatrixGroup:
-    """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
-    return MatrixGroup(
-        f"GL({n})",
-        catalogue.gl(n),
-        closed.invertible_defect,
-        adjoint_cayley_map={1: general.cayley, 2: closed.plane_adjoint_cayley}.get(n),
-    )
-
-
-@register((1,), (2,))
-def Heisenberg(n: int = 1) -> MatrixGroup:
-    """Upper triangular matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``. Here the Cayley map is the exponential."""
-    return MatrixGroup(
-        f"Heisenberg({n})",
-        catalogue.heisenberg(n),
-        closed.heisenberg_defect,
-        closed.heisenberg_inverse,
-        closed.heisenberg_exp,
-        closed.heisenberg_log,
-        closed.heisenberg_exp,
-        closed.heisenberg_log,
-        closed.heisenberg_exp,
-        closed.heisenberg_restored,
-    )
 
 
 # -- compiled maps --------------------------------------------------------------------------------------------------
@@ -548,7 +435,7 @@ def _leaves(group: MatrixGroup, kind: str) -> float:
     x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._known_basis()), axis=(-2, -1))[:, None]
     if kind == "adjoint_cayley" and not (miss := _automorphism_residual(algebra, x)) <= LEAVES_TOLERANCE:
         return miss
-    move = getattr(group, f"{kind}_map") or getattr(general, kind)
+    move = getattr(group, f"{kind}_map") or getattr(maps, kind)
 
     @jax.jit
     def misses(x):
@@ -556,8 +443,8 @@ def _leaves(group: MatrixGroup, kind: str) -> float:
         miss = group.defect(g)
         if kind != "adjoint_cayley":
             return miss
-        wanted = general.cayley_of(algebra.ad(x))
-        return jnp.maximum(miss, general.largest(_adjoint_action(group, g) - wanted) / general.largest(wanted))
+        wanted = cayley_of(algebra.ad(x))
+        return jnp.maximum(miss, largest(_adjoint_action(group, g) - wanted) / largest(wanted))
 
     with jax.ensure_compile_time_eval():  # it may be asked for while a program is being traced
         return float(np.nan_to_num(np.asarray(misses(x)), nan=np.inf).max())
@@ -584,7 +471,7 @@ def _log_derivative(group: MatrixGroup, primals, tangents):
     (g,), (dg,) = primals, tangents
     x = _principal_log(group, g)
     velocity = group.algebra.vee(group.inverse_map(g) @ dg)
-    return x, general.solve(general.dexp(group.algebra, x), velocity[..., None])[..., 0]
+    return x, solve(maps.dexp(group.algebra, x), velocity[..., None])[..., 0]
 
 
 _log = jax.jit(_principal_log, static_argnums=0)

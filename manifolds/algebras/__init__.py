@@ -1,0 +1,1 @@
+"""Lie algebras: definition and checks, sums, Casimirs, the catalogue."""

@@ -1,0 +1,82 @@
+"""Casimirs: how many independent ones an algebra has, and which polynomials they are.
+
+A Casimir is a function F on g* with ``ad*_{grad F(mu)} mu = 0`` for every mu. It is enough that F Poisson-commutes
+with elements that generate the algebra, by the Jacobi identity; on the coefficients of a homogeneous polynomial each
+of these conditions is linear. Where the structure constants are rational, perhaps after a scaling of the basis, the
+polynomials found are exact and proved to be all there are.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from ..errors import ParameterError
+from .invariants import TracePolynomial, fundamental_invariants
+from .polynomial import Polynomial
+from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
+from .structure import Structure
+
+
+class NoPolynomialCasimirWarning(UserWarning):
+    """The algebra has Casimirs, but none found is a polynomial."""
+
+
+def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
+    """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
+
+    The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
+    basis in the lexicographic order of monomials, less the elements whose leading monomial is that of a combination
+    of products.
+
+    Parameters
+    ----------
+    g : Structure
+    degree : int
+        At least 1.
+
+    Returns
+    -------
+    list of Polynomial or TracePolynomial
+        Coprime integer coefficients with a positive leading one, exact, where the structure constants are rational;
+        otherwise floats with leading coefficient 1, correct to the last digit where a scaling of the basis makes the
+        constants rational (su(n)). Where there are more than 20000 monomials of this degree, or more than 2000 coupled
+        ones, and the algebra is semisimple or reductive: traces of powers of matrices, and Pfaffians, proved to be all
+        by the number and the degrees of the generators (see :mod:`manifolds.algebras.invariants`).
+
+    Raises
+    ------
+    ParameterError
+        If the degree is not a positive integer.
+    LieAlgebraError
+        If there are too many monomials and no set of traces is complete; or if the constants
+        cannot be made rational and the singular values show no clear gap.
+
+    Warns
+    -----
+    NoPolynomialCasimirWarning
+        If the algebra has Casimirs but no polynomial one of this degree or below. A semisimple algebra gives no
+        warning: its Casimirs are polynomials, of degree 2 and more [Chevalley].
+    """
+    if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
+        raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
+    found: list[Polynomial | TracePolynomial]
+    try:
+        found = list(new_casimirs(g, int(degree)))
+    except TooLargeError:
+        generators = fundamental_invariants(g)
+        if generators is None:
+            raise
+        found = [F for F in generators if F.degree == degree]
+    number = 0 if found or g.is_semisimple() else casimir_count(g)
+    if number and not any(new_casimirs(g, d) for d in range(1, int(degree) + 1)):
+        warnings.warn(
+            f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
+            f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
+            "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
+            "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
+            NoPolynomialCasimirWarning,
+            stacklevel=3,  # the caller of LieAlgebra.casimirs
+        )
+    return found

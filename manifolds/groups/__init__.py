@@ -1,0 +1,1 @@
+"""Matrix Lie groups and the maps between a group and its algebra."""

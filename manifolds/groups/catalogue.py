@@ -1,0 +1,125 @@
+"""The classical groups."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..algebras import catalogue
+from ..matrices.linear import orthonormalized
+from . import closed_forms as closed
+from . import maps
+from .matrix_group import MatrixGroup, register
+from .rotations import rotation_log
+
+# -- the groups -----------------------------------------------------------------------------------------------------
+
+
+@register((2,), (3,), (4,))
+def SO(n: int) -> MatrixGroup:
+    """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
+    group = MatrixGroup(
+        f"SO({n})",
+        catalogue.so(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        log_map=rotation_log,
+        adjoint_cayley_map=None,
+        restore_map=orthonormalized,
+    )
+    if n == 2:
+        return replace(
+            group, exp_map=closed.so2_exp, log_map=closed.so2_log, adjoint_cayley_map=maps.cayley
+        )  # abelian: any map will do
+    if n == 3:
+        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log, adjoint_cayley_map=closed.so3_cayley)
+        return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
+    return replace(group, adjoint_cayley_map=closed.so4_adjoint_cayley) if n == 4 else group
+
+
+@register((2,), (3,))
+def SE(n: int) -> MatrixGroup:
+    """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
+    group = MatrixGroup(
+        f"SE({n})",
+        catalogue.se(n),
+        closed.rigid_defect,
+        closed.rigid_inverse,
+        adjoint_cayley_map=maps.cayley if n == 2 else None,
+        restore_map=closed.rigid_restored,
+    )
+    if n == 2:
+        return replace(group, log_map=closed.rigid_log)
+    if n == 3:
+        group = replace(
+            group, exp_map=closed.se3_exp, log_map=closed.rigid_log, adjoint_cayley_map=closed.se3_adjoint_cayley
+        )
+        return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
+    return group
+
+
+@register((2,), (3,))
+def SU(n: int) -> MatrixGroup:
+    """Unitary complex matrices of determinant 1."""
+    group = MatrixGroup(
+        f"SU({n})",
+        catalogue.su(n),
+        closed.unitary_defect,
+        closed.unitary_inverse,
+        restore_map=closed.unitary_restored,
+    )
+    if n == 2:
+        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
+        return replace(
+            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
+        )
+    return replace(group, cayley_map=None, adjoint_cayley_map=None)
+
+
+@register((2,), (3,))
+def SL(n: int) -> MatrixGroup:
+    """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
+    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.unimodular_restored)
+    if n == 2:
+        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley)
+    return replace(group, cayley_map=None, adjoint_cayley_map=None)
+
+
+@register((2,))
+def Sp(n: int) -> MatrixGroup:
+    """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
+    return MatrixGroup(
+        f"Sp({n})",
+        catalogue.sp(n),
+        closed.symplectic_defect,
+        closed.symplectic_inverse,
+        adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
+        restore_map=closed.symplectic_restored,
+    )
+
+
+@register((2,))
+def GL(n: int) -> MatrixGroup:
+    """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
+    return MatrixGroup(
+        f"GL({n})",
+        catalogue.gl(n),
+        closed.invertible_defect,
+        adjoint_cayley_map={1: maps.cayley, 2: closed.plane_adjoint_cayley}.get(n),
+    )
+
+
+@register((1,), (2,))
+def Heisenberg(n: int = 1) -> MatrixGroup:
+    """Upper triangular matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``. Here the Cayley map is the exponential."""
+    return MatrixGroup(
+        f"Heisenberg({n})",
+        catalogue.heisenberg(n),
+        closed.heisenberg_defect,
+        closed.heisenberg_inverse,
+        closed.heisenberg_exp,
+        closed.heisenberg_log,
+        closed.heisenberg_exp,
+        closed.heisenberg_log,
+        closed.heisenberg_exp,
+        closed.heisenberg_restored,
+    )

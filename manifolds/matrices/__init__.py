@@ -1,0 +1,1 @@
+"""Functions of matrices that can be traced, batched and differentiated."""

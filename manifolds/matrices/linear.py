@@ -1,0 +1,158 @@
+"""Linear algebra of small matrices: elimination, frames, the polar decomposition."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def polar(a) -> jax.Array:
+    """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
+    _, inverse_root, success = _square_root(a.conj().swapaxes(-1, -2) @ a)
+    u = a @ inverse_root
+    for _ in range(2):  # the root squares the condition number of a
+        u = orthonormalized(u)
+    success &= largest(u.conj().swapaxes(-1, -2) @ u - jnp.eye(a.shape[-1])) < 1e-12
+    return jnp.where(success[..., None, None], u, jnp.nan)
+
+
+def orthonormalized(u) -> jax.Array:
+    """One step of Newton and Schulz towards :func:`polar`: it squares the distance of ``u^H u`` from I."""
+    return 1.5 * u - 0.5 * u @ (u.conj().swapaxes(-1, -2) @ u)
+
+
+def complement(u) -> jax.Array:
+    """Columns that complete the orthonormal ones of u, shape (..., n, p), to a basis, shape (..., n, n - p).
+
+    By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
+    """
+    n, p = u.shape[-2:]
+    axes, normals = jnp.eye(n), []
+
+    def reflect(a, normal):
+        normal = normal[..., :, None]
+        weights = (normal * a).sum(axis=-2, keepdims=True) * (2 / (normal**2).sum(axis=-2, keepdims=True))
+        return a - normal * weights
+
+    for k in range(p):
+        column = jnp.where(jnp.arange(n) < k, 0.0, u[..., :, k])
+        size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
+        normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
+        u = reflect(u, normals[-1])
+    rest = axes[:, p:]
+    for normal in reversed(normals):
+        rest = reflect(rest, normal)
+    return rest
+
+
+def _square_root(a):
+    """Principal square root, its inverse, whether they converged: Denman and Beavers' iteration.
+
+    The iterates (y, z) tend to (a^1/2, a^-1/2) [Higham 2008, eq. 6.15]. An eigenvalue at the angle pi - d costs
+    log2(1/d) steps more and loses as many bits.
+    """
+
+    def unfinished(state):
+        _, change, steps = state
+        return ((change > 1e-8) & (steps < _MOST_ROOT_STEPS)).any()
+
+    def newton(state):
+        roots, _, steps = state
+        new = (roots + inverse(roots[::-1])) / 2
+        return new, largest(new[0] - roots[0]) / largest(new[0]), steps + 1
+
+    roots = jnp.stack([a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)])
+    roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
+    return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
+
+
+_MOST_ROOT_STEPS = 33
+"""Enough for every angle up to pi - HALF_TURN_MARGIN, and little more."""
+
+
+def solve(a, b) -> jax.Array:
+    """Solution x of ``a x = b``, shapes (..., m, m) and (..., m, k): Gauss-Jordan elimination with partial pivoting.
+
+    Plain array operations, on purpose. ``jnp.linalg.solve`` calls LAPACK, and on a CPU two calls that do not depend on
+    each other, in one compiled program, can wait for each other forever (jax 0.10.2, batches from about 1000).
+    """
+    return jax.lax.custom_linear_solve(
+        lambda x: a @ x,
+        b,
+        solve=lambda _, b: _eliminate(a, b)[0],
+        transpose_solve=lambda _, b: _eliminate(a.swapaxes(-1, -2), b)[0],
+    )
+
+
+def solve_near_identity(a, b) -> jax.Array:
+    """Solution x of ``a x = b`` without a search for pivots, for matrices whose symmetric part is positive definite.
+
+    In a program of scalars that search is most of the work.
+    """
+
+    def step(_, table):
+        pivot_row = table[..., :1, :] / table[..., :1, :1]
+        rest = table[..., 1:, :] - table[..., 1:, :1] * pivot_row
+        table = jnp.concatenate([rest, pivot_row], axis=-2)[..., 1:]
+        return jnp.concatenate([table, jnp.zeros_like(table[..., :1])], axis=-1)
+
+    return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
+
+
+def inverse(a) -> jax.Array:
+    """Inverse matrix, with entries that are not finite where a is singular."""
+    return solve(a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape))
+
+
+def spectral_radius(X) -> jax.Array:
+    """Upper bound ``|X^64|^(1/64)`` on the size of the eigenvalues, and little above it."""
+    total = jnp.zeros(X.shape[:-2])
+    for k in range(7):
+        size = jnp.sqrt((jnp.abs(X) ** 2).sum(axis=(-2, -1)))
+        total = total + jnp.log(size) / 2.0**k
+        X = X / jnp.where(size > 0.0, size, 1.0)[..., None, None]
+        X = X @ X
+    return jnp.exp(total)
+
+
+def determinant(a) -> jax.Array:
+    """Determinant, the signed product of the pivots."""
+    det = _eliminate(a, a[..., :0])[1]
+    # a matrix of numbers leads to NaN only by way of a pivot of zero
+    return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
+
+
+def largest(matrix) -> jax.Array:
+    """Largest absolute value of the entries."""
+    return jnp.abs(matrix).max(axis=(-2, -1))
+
+
+def _norm(matrix) -> jax.Array:
+    return jnp.abs(matrix).sum(axis=-2).max(axis=-1)
+
+
+def _eliminate(a, b):
+    """Solution of ``a x = b`` and determinant of a.
+
+    In each step the pivot column leaves the table on the left and the pivot row enters at the bottom, so that the
+    program needs no indices that vary.
+    """
+    m = a.shape[-1]
+    row = jnp.arange(m)
+
+    def step(k, state):
+        table, det = state
+        column = table[..., 0]
+        best = jnp.argmax(jnp.where(row < m - k, jnp.abs(column), -1.0), axis=-1)[..., None]
+        chosen = (row == best)[..., None]
+        pivot_row = jnp.where(chosen, table, 0.0).sum(axis=-2, keepdims=True)
+        pivot = pivot_row[..., :1]
+        pivot_row = pivot_row / pivot
+        rest = jnp.where(chosen, table[..., :1, :], table)[..., 1:, :]
+        table = jnp.concatenate([rest - rest[..., :1] * pivot_row, pivot_row], axis=-2)
+        table = jnp.concatenate([table[..., 1:], jnp.zeros_like(table[..., :1])], axis=-1)
+        return table, det * jnp.where(best == 0, pivot[..., 0], -pivot[..., 0])[..., 0]
+
+    start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
+    table, det = jax.lax.fori_loop(0, m, step, start)
+    return table[..., : b.shape[-1]], det

@@ -1,0 +1,1 @@
+"""Retractions: maps from tangent vectors to points, and charts around a point."""

@@ -1,0 +1,1 @@
+"""Poisson structures and contact structures."""
