@@ -1,1 +1,0 @@
-"""Engines: how the definition of a step becomes fast code."""
