@@ -8,8 +8,9 @@ from . import _precision  # noqa: F401
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
 from .algebras.invariants import TracePolynomial
-from .algebras.lie_algebra import LieAlgebra, direct_sum, semidirect_sum
+from .algebras.lie_algebra import LieAlgebra
 from .algebras.polynomial import Polynomial
+from .algebras.sums import direct_sum, semidirect_sum
 from .errors import (
     AntisymmetryError,
     ClosureError,

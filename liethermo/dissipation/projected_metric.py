@@ -9,7 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..functions.energy import Energy, as_energy, recognised
+from ..functions.checks import recognised
+from ..functions.energy import Energy, as_energy
 
 if TYPE_CHECKING:
     pass

@@ -13,7 +13,8 @@ import scipy.sparse
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import settled
-from .energy import Energy, Function, check_scalar, recognised
+from .checks import check_scalar, recognised
+from .energy import Energy, Function
 from .indices import Indices, cliques
 
 

@@ -21,8 +21,7 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..errors import FunctionError, InputError
-from ..tracing.interpret import at_points, polynomial_degree
-from ..tracing.traced import converted
+from ..tracing.interpret import at_points
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
 
@@ -463,7 +462,7 @@ def as_energy(function, role: str) -> Energy:
     if isinstance(function, Energy):
         return function
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
-        return _quadratic(function)
+        return quadratic_of(function)
     if callable(function):
         return TimeDependent(function) if needed_arguments(function) == 2 else Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
@@ -476,154 +475,6 @@ def needed_arguments(function: Callable) -> int | None:
     except (TypeError, ValueError):
         return None
     return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)
-
-
-class OfPoint(Energy):
-    """A function of the points of a space, as a function of their vectors, shape (n,)."""
-
-    energy: Energy
-    space: mf.Space = eqx.field(static=True)
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(self.space.from_vector(x))
-
-
-class InChart(Energy):
-    """A function of state vectors, as one of coordinates."""
-
-    energy: Energy
-    coordinates: mf.Coordinates
-    space: mf.Space = eqx.field(static=True)
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
-
-
-def on_points(energy: Energy, space: mf.Space | None) -> Energy:
-    """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
-    if space is None or space.shape == (space.size,):
-        return energy
-    terms = tuple(_on_points(term, space) for term in energy.terms)
-    return terms[0] if len(terms) == 1 else Sum(terms)
-
-
-def _on_points(term: Energy, space: mf.Space) -> Energy:
-    if isinstance(term, TimeDependent):
-        return TimeDependent(_OfPointAndTime(term.function, space))
-    return term if isinstance(term, Quadratic) else OfPoint(term, space)
-
-
-class _OfPointAndTime(eqx.Module):
-    function: Callable
-    space: mf.Space = eqx.field(static=True)
-
-    def __call__(self, x, t):
-        return self.function(self.space.from_vector(x), t)
-
-
-def _quadratic(polynomial: mf.Polynomial) -> Quadratic:
-    A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
-    for power, coefficient in polynomial.terms:
-        factors = np.repeat(np.arange(polynomial.dim), power)
-        if len(factors) == 2:
-            A[factors[0], factors[1]] += float(coefficient)
-            A[factors[1], factors[0]] += float(coefficient)
-        elif len(factors) == 1:
-            b[factors[0]] += float(coefficient)
-        else:
-            c += float(coefficient)
-    return Quadratic(A, b if b.any() else None, c)
-
-
-def recognised(energy: Energy, dim: int) -> Energy:
-    """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
-    if isinstance(energy, Sum):
-        return Sum(tuple(recognised(term, dim) for term in energy.summands))
-    if isinstance(energy, Negative):
-        return Negative(recognised(energy.term, dim))
-    if isinstance(energy, WithTime):
-        return WithTime(recognised(energy.energy, dim))
-    if isinstance(energy, Pullback):
-        (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-        return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
-    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
-        return Function(energy.function, quadratic=True)
-    return energy
-
-
-def _value(energy: Energy, x):
-    return energy.value(x)
-
-
-def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> Energy:
-    """The energy with its plain functions traced, so that closures with other numbers are alike.
-
-    With ``timed`` it may depend on the time too.
-
-    Raises
-    ------
-    FunctionError, InputError
-        Unless it maps a state of this dimension to one real number, each term in coordinates that it has.
-    """
-    if energy.depends_on_time and not timed:
-        raise InputError(
-            f"{role} depends on time, or is a function of two arguments, which only the energy of a system may be "
-            "(and the Lagrangian of an EulerPoincareSystem, and couplings of a ComposedSystem)"
-        )
-    try:
-        energy, result = converted(energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ())
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
-        for term in energy.terms:
-            term.check_places(dim, role)  # says which term, where the fault is in its coordinates
-        message = f"{type(error).__name__}: {error}".rstrip(".")
-        raise FunctionError(
-            f"{role} could not be evaluated on a state of shape ({dim},): {message}. "
-            "It must be written with jax.numpy and accept one array"
-        ) from error
-    for term in energy.terms:
-        term.check_places(dim, role)
-    if result.shape != ():
-        raise FunctionError(
-            f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?"
-        )
-    if not jnp.issubdtype(result.dtype, jnp.floating):
-        raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
-    return energy
-
-
-def traced_energies(tree, dim: int, role: str | None = None):
-    """A pytree with the energies in it checked as :func:`check_scalar` does; one that occurs twice stays one object.
-
-    Without a role, those that are no functions of a state are left as they are.
-    """
-    found: dict[int, Energy] = {}
-
-    def checked(part):
-        if not isinstance(part, Energy):
-            return part
-        if id(part) not in found:
-            try:
-                found[id(part)] = check_scalar(part, dim, role or "a function")
-            except (FunctionError, InputError):
-                if role is not None:
-                    raise
-                found[id(part)] = part
-        return found[id(part)]
-
-    return jax.tree_util.tree_map(checked, tree, is_leaf=lambda part: isinstance(part, Energy))
-
-
-def check_shape(
-    function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str
-) -> Callable:
-    """A function of arrays of these shapes, traced; FunctionError unless it gives ``shape``; ``at`` names them."""
-    try:
-        function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
-    if found.shape != shape:
-        raise FunctionError(f"{what} has shape {shape}, not {found.shape}")
-    return function
 
 
 def is_traced(tree) -> bool:
@@ -661,3 +512,28 @@ def _chord(term: Pullback, ends):
     """The coordinates of two random states, and their difference as a quadratic map would have it."""
     x, d = jnp.split(ends, 2)
     return term.of(x), term.of(x + d), jax.jvp(term.of, (x + 0.5 * d,), (d,))[1]
+
+
+class InChart(Energy):
+    """A function of state vectors, as one of coordinates."""
+
+    energy: Energy
+    coordinates: mf.Coordinates
+    space: mf.Space = eqx.field(static=True)
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
+
+
+def quadratic_of(polynomial: mf.Polynomial) -> Quadratic:
+    A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
+    for power, coefficient in polynomial.terms:
+        factors = np.repeat(np.arange(polynomial.dim), power)
+        if len(factors) == 2:
+            A[factors[0], factors[1]] += float(coefficient)
+            A[factors[1], factors[0]] += float(coefficient)
+        elif len(factors) == 1:
+            b[factors[0]] += float(coefficient)
+        else:
+            c += float(coefficient)
+    return Quadratic(A, b if b.any() else None, c)

@@ -14,9 +14,11 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation, portions
 from ..errors import InputError
-from ..functions.energy import Energy, as_energy, check_scalar, on_points, recognised
+from ..functions.checks import check_scalar, recognised
+from ..functions.energy import Energy, as_energy
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
+from ..functions.on_spaces import on_points
 from ..systems import ChartSystem, System
 from ..tracing.interpret import at_points
 from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..engines import array, implicit
-from ..functions.energy import traced_energies
+from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import DrivenSystem, System, driven
 from ..tracing.programs import program

@@ -19,7 +19,7 @@ from ..engines import array
 from ..engines.compiled import stepper as compiled
 from ..engines.sparse.newton import SparseEngine
 from ..errors import InputError
-from ..functions.energy import traced_energies
+from ..functions.checks import traced_energies
 from ..integrators import OneStepMethod, Reference, WithAttitude
 from ..results.dense import Dense
 from ..results.evidence import MEASURED, Witness, spread

@@ -16,7 +16,9 @@ from manifolds._arrays import real_array
 
 from ..dissipation.base import Dissipation, Law
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
-from ..functions.energy import Energy, as_energy, check_scalar, is_traced, on_points, recognised, traced_energies
+from ..functions.checks import check_scalar, recognised, traced_energies
+from ..functions.energy import Energy, as_energy, is_traced
+from ..functions.on_spaces import on_points
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system

@@ -13,7 +13,9 @@ import manifolds as mf
 
 from ..dissipation.base import Carried, Several
 from ..errors import InputError
-from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime, on_points, recognised
+from ..functions.checks import recognised
+from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime
+from ..functions.on_spaces import on_points
 from .base import System
 
 UNIT = 2.0**-100

@@ -15,7 +15,8 @@ from manifolds.matrices.linear import solve
 from ..dissipation.base import Dissipation
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
-from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, check_scalar, is_traced
+from ..functions.checks import check_scalar
+from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, is_traced
 from .lie_poisson import LiePoissonSystem
 
 NEWTON_STEPS = 50

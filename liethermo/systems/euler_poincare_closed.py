@@ -14,7 +14,8 @@ from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
-from ..functions.energy import Energy, as_energy, check_scalar, check_shape, is_traced, recognised
+from ..functions.checks import check_scalar, check_shape, recognised
+from ..functions.energy import Energy, as_energy, is_traced
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .base import System

@@ -12,7 +12,8 @@ import manifolds as mf
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
-from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, recognised
+from ..functions.checks import check_scalar, recognised
+from ..functions.energy import Energy, Quadratic, as_energy
 from ..functions.mechanics import is_mechanical
 from .base import System
 

@@ -14,7 +14,8 @@ import manifolds as mf
 from manifolds.matrices.linear import inverse
 
 from ..errors import InputError
-from ..functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ..functions.checks import check_scalar, recognised
+from ..functions.energy import Energy, Quadratic, as_energy, is_traced
 from ..functions.mechanics import Kinetic, is_free_of_momenta, is_mechanical
 from ..tracing.interpret import at_points
 from ..tracing.programs import program

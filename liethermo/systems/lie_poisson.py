@@ -15,7 +15,8 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.energy import Energy, as_energy, check_scalar
+from ..functions.checks import check_scalar
+from ..functions.energy import Energy, as_energy
 from .base import System
 
 RECORDED_MONOMIALS = 400

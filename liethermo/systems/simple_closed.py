@@ -16,7 +16,8 @@ from manifolds.matrices.linear import solve
 from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
-from ..functions.energy import Energy, Quadratic, check_shape, is_traced, needed_arguments
+from ..functions.checks import check_shape
+from ..functions.energy import Energy, Quadratic, is_traced, needed_arguments
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities

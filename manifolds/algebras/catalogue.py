@@ -14,7 +14,8 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ._null_space import rational_null_space
-from .lie_algebra import LieAlgebra, direct_sum, semidirect_sum
+from .lie_algebra import LieAlgebra
+from .sums import direct_sum, semidirect_sum
 
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
 

@@ -19,21 +19,17 @@ import scipy.linalg
 from .._arrays import is_traced, real_components, square_matrices
 from .._names import checked_names
 from ..errors import (
-    AntisymmetryError,
     ClosureError,
     ComponentError,
-    JacobiError,
     LieAlgebraError,
-    RepresentationError,
     ShapeError,
 )
 from ._balance import STRUCTURE_TOLERANCE, balanced
-from ._exact import RationalArray, jacobi_sums, rational_array
+from ._exact import RationalArray, rational_array
+from .axioms import AXIOM_TOLERANCE, check_axioms, checked_constants, real_columns, without_rounding
 from .casimirs import casimirs
+from .killing import cartan_involution_of, row_space
 from .polynomial_casimirs import casimir_count
-
-AXIOM_TOLERANCE = 1e-12
-"""Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
 
 
 @jax.tree_util.register_static
@@ -63,7 +59,7 @@ class LieAlgebra:
     """
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
-        constants = _checked_constants(structure_constants)
+        constants = checked_constants(structure_constants)
         exact = rational_array(constants)
         machine_size = exact is not None and exact.numerator.dtype != object
         self.rational_constants: RationalArray | None = exact if machine_size else None
@@ -72,7 +68,7 @@ class LieAlgebra:
         self.name = name
         self.basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
         self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
-        _check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
+        check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
 
     # -- construction -------------------------------------------------------------------------------------------
 
@@ -125,7 +121,7 @@ class LieAlgebra:
         if not sizes.all():
             raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
         matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
-        columns = _real_columns(matrices)
+        columns = real_columns(matrices)
         singular = scipy.linalg.svdvals(columns)
         if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
             raise ClosureError(
@@ -135,7 +131,7 @@ class LieAlgebra:
                 tolerance=float(1e-10 * singular[0]),
             )
         products = np.einsum("aij,bjk->abik", matrices, matrices)
-        commutators = _real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
+        commutators = real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
         commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
         coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
         residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
@@ -152,7 +148,7 @@ class LieAlgebra:
         constants = coordinates.T.reshape(dim, dim, dim)
         constants = (constants - constants.swapaxes(0, 1)) / 2
         scales = sizes[:, None, None] * sizes[:, None] / sizes
-        constants = _without_rounding(constants, scales, columns, commutators)
+        constants = without_rounding(constants, scales, columns, commutators)
         return cls(constants, name=name, basis=given, basis_names=basis_names)
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
@@ -215,7 +211,7 @@ class LieAlgebra:
 
     def killing_signature(self) -> tuple[int, int, int]:
         """Numbers of positive, negative and zero eigenvalues of the Killing form, the same in every basis."""
-        eigenvalues = np.linalg.eigvalsh(_killing_form(self._balanced[0]))
+        eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced[0]))
         positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
         return positive, negative, self.dim - positive - negative
 
@@ -237,7 +233,7 @@ class LieAlgebra:
         flat = jnp.concatenate([flat.real, flat.imag], axis=-1)
         components = jnp.einsum("ai,...i->...a", self._left_inverse, flat)
         if not is_traced(flat):
-            residual = float(jnp.max(jnp.abs(components @ _real_columns(basis).T - flat), initial=0.0))
+            residual = float(jnp.max(jnp.abs(components @ real_columns(basis).T - flat), initial=0.0))
             tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(flat), initial=0.0)))
             if not residual <= tolerance:
                 raise LieAlgebraError(
@@ -346,11 +342,11 @@ class LieAlgebra:
 
     @cached_property
     def _left_inverse(self) -> np.ndarray:
-        return np.linalg.pinv(_real_columns(self._known_basis()))
+        return np.linalg.pinv(real_columns(self._known_basis()))
 
     @cached_property
     def _killing_form(self) -> np.ndarray:
-        return _frozen(_killing_form(self.structure_constants))
+        return _frozen(killing_form_of(self.structure_constants))
 
     @cached_property
     def _balanced(self) -> tuple[np.ndarray, np.ndarray]:
@@ -364,7 +360,7 @@ class LieAlgebra:
         if self.is_compact_type():
             return _frozen(np.eye(self.dim))
         constants, factors = self._balanced
-        theta = _cartan_involution(constants, self.name) * factors[:, None] / factors
+        theta = cartan_involution_of(constants, self.name) * factors[:, None] / factors
         snapped = np.asarray(np.round(theta))
         return _frozen(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
 
@@ -373,290 +369,12 @@ class LieAlgebra:
         while True:
             left, right = factors(ideal)
             products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced[0], optimize=True)
-            ideal = _row_space(products.reshape(-1, self.dim))
+            ideal = row_space(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims
             dims.append(len(ideal))
             if not len(ideal):
                 return dims
-
-
-def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
-    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute."""
-    if not algebras:
-        raise ShapeError("direct_sum needs at least one algebra")
-    dim = sum(g.dim for g in algebras)
-    constants = np.zeros((dim, dim, dim))
-    start = 0
-    for g in algebras:
-        block = slice(start, start + g.dim)
-        constants[block, block, block] = g.structure_constants
-        start += g.dim
-    bases = [g.basis for g in algebras]
-    known = [basis for basis in bases if basis is not None]
-    basis = None
-    if len(known) == len(bases):
-        basis = np.array(
-            [
-                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
-                for i, own in enumerate(known)
-                for e in own
-            ]
-        )
-    return LieAlgebra(
-        constants, name=" + ".join(g.name for g in algebras), basis=basis, basis_names=_joined_names(*algebras)
-    )
-
-
-def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
-    """Semidirect sum of g with what it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
-
-    Parameters
-    ----------
-    g : LieAlgebra
-    representation : array, shape (g.dim, m, m), or callable
-        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal its
-        derivations: the columns of ``rho(e_a)`` are the images of the basis elements.
-    name : str, optional
-    ideal : LieAlgebra, of dimension m, optional
-        The algebra that u and v are in; by default the abelian one of a vector space.
-
-    Returns
-    -------
-    LieAlgebra
-        Dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
-        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful. With an ideal
-        they are the adjoint ones where its centre is zero, and unknown otherwise.
-
-    Raises
-    ------
-    RepresentationError
-        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, or ``rho(e_a) [u, v]`` is not
-        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; they are named.
-    """
-    if ideal is not None and not isinstance(ideal, LieAlgebra):
-        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
-    if callable(representation):
-        representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
-    rho = np.asarray(representation, dtype=np.float64)
-    m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
-    if rho.shape != (g.dim, m, m):
-        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
-    _check_representation(g, rho)
-    dim = g.dim + m
-    constants = np.zeros((dim, dim, dim))
-    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
-    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
-    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
-    if ideal is None:
-        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
-    _check_derivations(g, rho, ideal)
-    constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
-    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=_joined_names(g, ideal))
-    adjoint = total._balanced[0].reshape(dim, -1)
-    faithful = adjoint.any() and len(_row_space(adjoint)) == dim
-    return LieAlgebra(
-        constants,
-        name=total.name,
-        basis=total.structure_constants.swapaxes(1, 2) if faithful else None,
-        basis_names=total.basis_names,
-    )
-
-
-def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
-    products = np.einsum("aij,bjk->abik", rho, rho)
-    defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
-    residuals = np.abs(defect).max(axis=(2, 3))
-    images = float(np.abs(g.structure_constants).max() * np.abs(rho).max())
-    tolerance = AXIOM_TOLERANCE * max(float(np.abs(products).max()), images)
-    if residuals.max() > tolerance:
-        a, b = np.unravel_index(residuals.argmax(), residuals.shape)
-        raise RepresentationError(
-            f"not a representation of {g.name}: [rho(e{a + 1}), rho(e{b + 1})] differs from rho([e{a + 1}, e{b + 1}]) "
-            f"by {residuals.max():.3g} (tolerance {tolerance:.1g})",
-            residual=float(residuals.max()),
-            tolerance=tolerance,
-            indices=(int(a), int(b)),
-        )
-
-
-def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> None:
-    C = ideal.structure_constants
-    defect = np.einsum("ijk,alk->aijl", C, rho)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
-    defect -= np.einsum("aki,kjl->aijl", rho, C) + np.einsum("akj,ikl->aijl", rho, C)
-    residuals = np.abs(defect).max(axis=3)
-    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(rho).max())
-    if residuals.max() > tolerance:
-        a, i, j = (int(index) for index in np.unravel_index(residuals.argmax(), residuals.shape))
-        raise RepresentationError(
-            f"rho(e{a + 1}) of {g.name} is not a derivation D of {ideal.name}: D [u{i + 1}, u{j + 1}] differs from "
-            f"[D u{i + 1}, u{j + 1}] + [u{i + 1}, D u{j + 1}] by {residuals.max():.3g} (tolerance {tolerance:.1g})",
-            residual=float(residuals.max()),
-            tolerance=tolerance,
-            indices=(a, i, j),
-        )
-
-
-def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
-    m, dim = rho.shape[1], g.dim + rho.shape[1]
-    affine = np.zeros((dim, m + 1, m + 1))
-    affine[: g.dim, :m, :m] = rho
-    affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
-    sizes = np.linalg.norm(rho, axis=(1, 2))
-    if sizes.all() and len(_row_space(rho.reshape(g.dim, -1) / sizes[:, None])) == g.dim:
-        return affine
-    if g.basis is None:
-        return None
-    upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
-    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
-
-
-# -- helpers ------------------------------------------------------------------------------------------------------
-
-
-def _joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
-    """The names of all basis elements, where all have some and no two the same."""
-    names = [name for g in algebras for name in g.basis_names or ()]
-    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
-
-
-def _checked_constants(values) -> np.ndarray:
-    try:
-        array = np.asarray(values)
-        numeric = array.astype(np.complex128 if np.iscomplexobj(array) else np.float64)
-    except (TypeError, ValueError) as error:
-        raise ComponentError(f"the structure constants are not a rectangular array of numbers: {error}") from None
-    if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
-        raise ShapeError(f"structure constants have shape (dim, dim, dim), not {array.shape}")
-    if np.iscomplexobj(numeric):
-        raise ComponentError("structure constants must be real: use a real basis of the algebra")
-    if not np.isfinite(numeric).all():
-        a, b, c = np.argwhere(~np.isfinite(numeric))[0]
-        raise ComponentError(f"the structure constant C[{a}, {b}, {c}] is {numeric[a, b, c]}")
-    return array
-
-
-def _check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
-    """Antisymmetry and Jacobi; ``constants`` are the integer numerators where ``exact`` is given."""
-    unit = 1.0 if exact is None else 1.0 / exact.denominator
-    how = "checked exactly" if exact is not None else "tolerance {:.1g}"
-    scale = float(np.abs(constants).max())
-    symmetric = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
-    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale
-    if symmetric.max() > tolerance:
-        a, b = (int(i) for i in np.unravel_index(symmetric.argmax(), symmetric.shape))
-        raise AntisymmetryError(
-            f"{name}: [e{a + 1}, e{b + 1}] + [e{b + 1}, e{a + 1}] has a component of size "
-            f"{symmetric.max() * unit:.3g} ({how.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
-            residual=float(symmetric.max() * unit),
-            tolerance=tolerance,
-            indices=(a, b),
-        )
-    sums = jacobi_sums(constants)
-    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
-    worst = int(np.abs(sums.data).argmax()) if sums.nnz else -1
-    if worst >= 0 and abs(sums.data[worst]) > tolerance:
-        residual = abs(float(sums.data[worst])) * unit**2
-        a, b, c = sorted(int(i) for i in np.unravel_index(sums.coords[0][worst], constants.shape))
-        raise JacobiError(
-            f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
-            f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
-            f"({how.format(tolerance)})",
-            residual=residual,
-            tolerance=tolerance,
-            indices=(a, b, c),
-        )
-
-
-def _without_rounding(
-    constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
-) -> np.ndarray:
-    """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.
-
-    The constants are those of matrices of norm 1, the ``columns``.
-    """
-    scaled = constants * scales
-    snapped = _nearest_fractions(scaled, 1e-12 * np.maximum(scales, np.abs(scaled)))
-    defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
-    return snapped if defect <= 4 * np.finfo(float).eps else scaled
-
-
-def _nearest_fractions(values: np.ndarray, within: np.ndarray) -> np.ndarray:
-    """Each value, or the nearest fraction of denominator 64 or less where that is nearer than ``within``."""
-    found, least = values, within
-    for denominator in range(1, 65):
-        fractions = np.round(values * denominator) / denominator
-        distances = np.abs(fractions - values)
-        found = np.where(distances < least, fractions, found)
-        least = np.minimum(distances, least)
-    return found
-
-
-def _real_columns(matrices: np.ndarray) -> np.ndarray:
-    """Each matrix as a column of its real and imaginary parts: linear algebra over the reals."""
-    flat = matrices.reshape(len(matrices), -1)
-    return np.concatenate([flat.real, flat.imag], axis=1).T
-
-
-def _killing_form(constants: np.ndarray) -> np.ndarray:
-    return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
-
-
-def _row_space(rows: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the span of rows of size 1; what is smaller than STRUCTURE_TOLERANCE is rounding."""
-    _, singular, basis = np.linalg.svd(rows, full_matrices=False)
-    return basis[singular > STRUCTURE_TOLERANCE]
-
-
-def _cartan_involution(constants: np.ndarray, name: str) -> np.ndarray:
-    """Newton's method for the inner product of least bracket norm (see LieAlgebra.cartan_involution)."""
-    dim = len(constants)
-    upper = np.triu_indices(dim)
-    directions = np.zeros((len(upper[0]), dim, dim))
-    directions[np.arange(len(upper[0])), upper[0], upper[1]] = 1.0
-    directions = (directions + directions.swapaxes(1, 2)) / 2
-    directions -= np.einsum("kaa->k", directions)[:, None, None] * np.eye(dim) / dim  # volume is kept
-    change = np.eye(dim)  # columns: the current basis in terms of the given one
-
-    def transported(basis: np.ndarray) -> np.ndarray:
-        return np.einsum("ai,bj,abc,kc->ijk", basis, basis, constants, np.linalg.inv(basis), optimize=True)
-
-    current = transported(change)
-    for _ in range(100):
-        # d/dt of the constants when the basis moves by exp(t S), for each symmetric direction S
-        moved = (
-            np.einsum("kai,abc->kibc", directions, current, optimize=True)
-            + np.einsum("kbj,abc->kajc", directions, current, optimize=True)
-            - np.einsum("kdc,abc->kabd", directions, current, optimize=True)
-        )
-        # |exp(tS) C|^2 = |C|^2 + 2t <C, SC> + 2 t^2 |SC|^2 + …, minimised by -1/2 of a least-squares solution.
-        # Near the minimum the derivations in p move nothing (S C -> 0); the cut-off keeps such directions out.
-        weights, *_ = np.linalg.lstsq(moved.reshape(len(moved), -1).T, current.ravel(), rcond=1e-3)
-        newton = -np.einsum("k,kij->ij", weights, directions) / 2
-        size = np.abs(newton).max()
-        if size < 1e-15 * dim:
-            break
-        change = change @ scipy.linalg.expm(newton * min(1.0, 0.5 / size))
-        current = transported(change)
-        if size < 1e-13:
-            break
-    # In the adapted basis ad_x^T = -ad_{theta x}: solve for theta, then return to the given basis.
-    ad = current.swapaxes(1, 2)  # ad[a] is the matrix of e_a
-    theta, *_ = np.linalg.lstsq(ad.reshape(dim, -1).T, -ad.swapaxes(1, 2).reshape(dim, -1).T, rcond=None)
-    theta = change @ theta @ np.linalg.inv(change)
-    automorphism = np.einsum("abd,cd->abc", constants, theta) - np.einsum(
-        "da,eb,dec->abc", theta, theta, constants, optimize=True
-    )
-    residual = max(np.abs(automorphism).max(), np.abs(theta @ theta - np.eye(dim)).max())
-    tolerance = 1e-9 * max(1.0, float(np.abs(constants).max()), float(np.abs(theta).max()) ** 2)
-    if not residual <= tolerance:
-        raise LieAlgebraError(
-            f"no Cartan involution of {name} was found (residual {residual:.2g}, tolerance {tolerance:.1g}); "
-            "rescale the basis so that the structure constants are of order one",
-            residual=float(residual),
-            tolerance=tolerance,
-        )
-    return theta
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -11,8 +11,9 @@ import numpy as np
 
 from ...dissipation.checks import semidefinite
 from ...errors import InputError
+from ...functions.checks import check_scalar, recognised
 from ...functions.each import Each
-from ...functions.energy import Energy, Quadratic, as_energy, check_scalar, is_traced, recognised
+from ...functions.energy import Energy, Quadratic, as_energy, is_traced
 from ...tracing.traced import converted
 
 

@@ -1,0 +1,105 @@
+"""Functions that users give: evaluated once, traced, and refused with reasons where they are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..errors import FunctionError, InputError
+from ..tracing.interpret import polynomial_degree
+from ..tracing.traced import converted
+from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
+
+
+def recognised(energy: Energy, dim: int) -> Energy:
+    """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
+    if isinstance(energy, Sum):
+        return Sum(tuple(recognised(term, dim) for term in energy.summands))
+    if isinstance(energy, Negative):
+        return Negative(recognised(energy.term, dim))
+    if isinstance(energy, WithTime):
+        return WithTime(recognised(energy.energy, dim))
+    if isinstance(energy, Pullback):
+        (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
+    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
+        return Function(energy.function, quadratic=True)
+    return energy
+
+
+def _value(energy: Energy, x):
+    return energy.value(x)
+
+
+def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> Energy:
+    """The energy with its plain functions traced, so that closures with other numbers are alike.
+
+    With ``timed`` it may depend on the time too.
+
+    Raises
+    ------
+    FunctionError, InputError
+        Unless it maps a state of this dimension to one real number, each term in coordinates that it has.
+    """
+    if energy.depends_on_time and not timed:
+        raise InputError(
+            f"{role} depends on time, or is a function of two arguments, which only the energy of a system may be "
+            "(and the Lagrangian of an EulerPoincareSystem, and couplings of a ComposedSystem)"
+        )
+    try:
+        energy, result = converted(energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ())
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        for term in energy.terms:
+            term.check_places(dim, role)  # says which term, where the fault is in its coordinates
+        message = f"{type(error).__name__}: {error}".rstrip(".")
+        raise FunctionError(
+            f"{role} could not be evaluated on a state of shape ({dim},): {message}. "
+            "It must be written with jax.numpy and accept one array"
+        ) from error
+    for term in energy.terms:
+        term.check_places(dim, role)
+    if result.shape != ():
+        raise FunctionError(
+            f"{role} must return one number, but it returns shape {result.shape}; did you mean jnp.sum?"
+        )
+    if not jnp.issubdtype(result.dtype, jnp.floating):
+        raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
+    return energy
+
+
+def traced_energies(tree, dim: int, role: str | None = None):
+    """A pytree with the energies in it checked as :func:`check_scalar` does; one that occurs twice stays one object.
+
+    Without a role, those that are no functions of a state are left as they are.
+    """
+    found: dict[int, Energy] = {}
+
+    def checked(part):
+        if not isinstance(part, Energy):
+            return part
+        if id(part) not in found:
+            try:
+                found[id(part)] = check_scalar(part, dim, role or "a function")
+            except (FunctionError, InputError):
+                if role is not None:
+                    raise
+                found[id(part)] = part
+        return found[id(part)]
+
+    return jax.tree_util.tree_map(checked, tree, is_leaf=lambda part: isinstance(part, Energy))
+
+
+def check_shape(
+    function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str
+) -> Callable:
+    """A function of arrays of these shapes, traced; FunctionError unless it gives ``shape``; ``at`` names them."""
+    try:
+        function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
+    except (TypeError, ValueError, IndexError) as error:
+        raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
+    if found.shape != shape:
+        raise FunctionError(f"{what} has shape {shape}, not {found.shape}")
+    return function

@@ -1,0 +1,94 @@
+"""Structure constants: read, checked, and freed from rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import (
+    AntisymmetryError,
+    ComponentError,
+    JacobiError,
+    ShapeError,
+)
+from ._exact import RationalArray, jacobi_sums
+
+AXIOM_TOLERANCE = 1e-12
+"""Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
+
+
+def checked_constants(values) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+        numeric = array.astype(np.complex128 if np.iscomplexobj(array) else np.float64)
+    except (TypeError, ValueError) as error:
+        raise ComponentError(f"the structure constants are not a rectangular array of numbers: {error}") from None
+    if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
+        raise ShapeError(f"structure constants have shape (dim, dim, dim), not {array.shape}")
+    if np.iscomplexobj(numeric):
+        raise ComponentError("structure constants must be real: use a real basis of the algebra")
+    if not np.isfinite(numeric).all():
+        a, b, c = np.argwhere(~np.isfinite(numeric))[0]
+        raise ComponentError(f"the structure constant C[{a}, {b}, {c}] is {numeric[a, b, c]}")
+    return array
+
+
+def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
+    """Antisymmetry and Jacobi; ``constants`` are the integer numerators where ``exact`` is given."""
+    unit = 1.0 if exact is None else 1.0 / exact.denominator
+    how = "checked exactly" if exact is not None else "tolerance {:.1g}"
+    scale = float(np.abs(constants).max())
+    symmetric = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
+    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale
+    if symmetric.max() > tolerance:
+        a, b = (int(i) for i in np.unravel_index(symmetric.argmax(), symmetric.shape))
+        raise AntisymmetryError(
+            f"{name}: [e{a + 1}, e{b + 1}] + [e{b + 1}, e{a + 1}] has a component of size "
+            f"{symmetric.max() * unit:.3g} ({how.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
+            residual=float(symmetric.max() * unit),
+            tolerance=tolerance,
+            indices=(a, b),
+        )
+    sums = jacobi_sums(constants)
+    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
+    worst = int(np.abs(sums.data).argmax()) if sums.nnz else -1
+    if worst >= 0 and abs(sums.data[worst]) > tolerance:
+        residual = abs(float(sums.data[worst])) * unit**2
+        a, b, c = sorted(int(i) for i in np.unravel_index(sums.coords[0][worst], constants.shape))
+        raise JacobiError(
+            f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
+            f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
+            f"({how.format(tolerance)})",
+            residual=residual,
+            tolerance=tolerance,
+            indices=(a, b, c),
+        )
+
+
+def without_rounding(
+    constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
+) -> np.ndarray:
+    """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.
+
+    The constants are those of matrices of norm 1, the ``columns``.
+    """
+    scaled = constants * scales
+    snapped = _nearest_fractions(scaled, 1e-12 * np.maximum(scales, np.abs(scaled)))
+    defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
+    return snapped if defect <= 4 * np.finfo(float).eps else scaled
+
+
+def _nearest_fractions(values: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Each value, or the nearest fraction of denominator 64 or less where that is nearer than ``within``."""
+    found, least = values, within
+    for denominator in range(1, 65):
+        fractions = np.round(values * denominator) / denominator
+        distances = np.abs(fractions - values)
+        found = np.where(distances < least, fractions, found)
+        least = np.minimum(distances, least)
+    return found
+
+
+def real_columns(matrices: np.ndarray) -> np.ndarray:
+    """Each matrix as a column of its real and imaginary parts: linear algebra over the reals."""
+    flat = matrices.reshape(len(matrices), -1)
+    return np.concatenate([flat.real, flat.imag], axis=1).T

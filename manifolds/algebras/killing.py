@@ -1,0 +1,72 @@
+"""The Killing form, ranks, and the Cartan involution."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from ..errors import (
+    LieAlgebraError,
+)
+from ._balance import STRUCTURE_TOLERANCE
+
+
+def killing_form_of(constants: np.ndarray) -> np.ndarray:
+    return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
+
+
+def row_space(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the span of rows of size 1; what is smaller than STRUCTURE_TOLERANCE is rounding."""
+    _, singular, basis = np.linalg.svd(rows, full_matrices=False)
+    return basis[singular > STRUCTURE_TOLERANCE]
+
+
+def cartan_involution_of(constants: np.ndarray, name: str) -> np.ndarray:
+    """Newton's method for the inner product of least bracket norm (see LieAlgebra.cartan_involution)."""
+    dim = len(constants)
+    upper = np.triu_indices(dim)
+    directions = np.zeros((len(upper[0]), dim, dim))
+    directions[np.arange(len(upper[0])), upper[0], upper[1]] = 1.0
+    directions = (directions + directions.swapaxes(1, 2)) / 2
+    directions -= np.einsum("kaa->k", directions)[:, None, None] * np.eye(dim) / dim  # volume is kept
+    change = np.eye(dim)  # columns: the current basis in terms of the given one
+
+    def transported(basis: np.ndarray) -> np.ndarray:
+        return np.einsum("ai,bj,abc,kc->ijk", basis, basis, constants, np.linalg.inv(basis), optimize=True)
+
+    current = transported(change)
+    for _ in range(100):
+        # d/dt of the constants when the basis moves by exp(t S), for each symmetric direction S
+        moved = (
+            np.einsum("kai,abc->kibc", directions, current, optimize=True)
+            + np.einsum("kbj,abc->kajc", directions, current, optimize=True)
+            - np.einsum("kdc,abc->kabd", directions, current, optimize=True)
+        )
+        # |exp(tS) C|^2 = |C|^2 + 2t <C, SC> + 2 t^2 |SC|^2 + …, minimised by -1/2 of a least-squares solution.
+        # Near the minimum the derivations in p move nothing (S C -> 0); the cut-off keeps such directions out.
+        weights, *_ = np.linalg.lstsq(moved.reshape(len(moved), -1).T, current.ravel(), rcond=1e-3)
+        newton = -np.einsum("k,kij->ij", weights, directions) / 2
+        size = np.abs(newton).max()
+        if size < 1e-15 * dim:
+            break
+        change = change @ scipy.linalg.expm(newton * min(1.0, 0.5 / size))
+        current = transported(change)
+        if size < 1e-13:
+            break
+    # In the adapted basis ad_x^T = -ad_{theta x}: solve for theta, then return to the given basis.
+    ad = current.swapaxes(1, 2)  # ad[a] is the matrix of e_a
+    theta, *_ = np.linalg.lstsq(ad.reshape(dim, -1).T, -ad.swapaxes(1, 2).reshape(dim, -1).T, rcond=None)
+    theta = change @ theta @ np.linalg.inv(change)
+    automorphism = np.einsum("abd,cd->abc", constants, theta) - np.einsum(
+        "da,eb,dec->abc", theta, theta, constants, optimize=True
+    )
+    residual = max(np.abs(automorphism).max(), np.abs(theta @ theta - np.eye(dim)).max())
+    tolerance = 1e-9 * max(1.0, float(np.abs(constants).max()), float(np.abs(theta).max()) ** 2)
+    if not residual <= tolerance:
+        raise LieAlgebraError(
+            f"no Cartan involution of {name} was found (residual {residual:.2g}, tolerance {tolerance:.1g}); "
+            "rescale the basis so that the structure constants are of order one",
+            residual=float(residual),
+            tolerance=tolerance,
+        )
+    return theta

@@ -1,0 +1,154 @@
+"""Sums of Lie algebras: direct, and semidirect by matrices or by derivations."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from ..errors import (
+    ComponentError,
+    RepresentationError,
+    ShapeError,
+)
+from .axioms import AXIOM_TOLERANCE
+from .killing import row_space
+from .lie_algebra import LieAlgebra
+
+
+def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
+    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute."""
+    if not algebras:
+        raise ShapeError("direct_sum needs at least one algebra")
+    dim = sum(g.dim for g in algebras)
+    constants = np.zeros((dim, dim, dim))
+    start = 0
+    for g in algebras:
+        block = slice(start, start + g.dim)
+        constants[block, block, block] = g.structure_constants
+        start += g.dim
+    bases = [g.basis for g in algebras]
+    known = [basis for basis in bases if basis is not None]
+    basis = None
+    if len(known) == len(bases):
+        basis = np.array(
+            [
+                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
+                for i, own in enumerate(known)
+                for e in own
+            ]
+        )
+    return LieAlgebra(
+        constants, name=" + ".join(g.name for g in algebras), basis=basis, basis_names=_joined_names(*algebras)
+    )
+
+
+def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
+    """Semidirect sum of g with what it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
+
+    Parameters
+    ----------
+    g : LieAlgebra
+    representation : array, shape (g.dim, m, m), or callable
+        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal its
+        derivations: the columns of ``rho(e_a)`` are the images of the basis elements.
+    name : str, optional
+    ideal : LieAlgebra, of dimension m, optional
+        The algebra that u and v are in; by default the abelian one of a vector space.
+
+    Returns
+    -------
+    LieAlgebra
+        Dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
+        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful. With an ideal
+        they are the adjoint ones where its centre is zero, and unknown otherwise.
+
+    Raises
+    ------
+    RepresentationError
+        If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, or ``rho(e_a) [u, v]`` is not
+        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; they are named.
+    """
+    if ideal is not None and not isinstance(ideal, LieAlgebra):
+        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
+    if callable(representation):
+        representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
+    rho = np.asarray(representation, dtype=np.float64)
+    m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
+    if rho.shape != (g.dim, m, m):
+        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
+    _check_representation(g, rho)
+    dim = g.dim + m
+    constants = np.zeros((dim, dim, dim))
+    constants[: g.dim, : g.dim, : g.dim] = g.structure_constants
+    constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
+    constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
+    if ideal is None:
+        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
+    _check_derivations(g, rho, ideal)
+    constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
+    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=_joined_names(g, ideal))
+    adjoint = total._balanced[0].reshape(dim, -1)
+    faithful = adjoint.any() and len(row_space(adjoint)) == dim
+    return LieAlgebra(
+        constants,
+        name=total.name,
+        basis=total.structure_constants.swapaxes(1, 2) if faithful else None,
+        basis_names=total.basis_names,
+    )
+
+
+def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
+    products = np.einsum("aij,bjk->abik", rho, rho)
+    defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
+    residuals = np.abs(defect).max(axis=(2, 3))
+    images = float(np.abs(g.structure_constants).max() * np.abs(rho).max())
+    tolerance = AXIOM_TOLERANCE * max(float(np.abs(products).max()), images)
+    if residuals.max() > tolerance:
+        a, b = np.unravel_index(residuals.argmax(), residuals.shape)
+        raise RepresentationError(
+            f"not a representation of {g.name}: [rho(e{a + 1}), rho(e{b + 1})] differs from rho([e{a + 1}, e{b + 1}]) "
+            f"by {residuals.max():.3g} (tolerance {tolerance:.1g})",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(int(a), int(b)),
+        )
+
+
+def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> None:
+    C = ideal.structure_constants
+    defect = np.einsum("ijk,alk->aijl", C, rho)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
+    defect -= np.einsum("aki,kjl->aijl", rho, C) + np.einsum("akj,ikl->aijl", rho, C)
+    residuals = np.abs(defect).max(axis=3)
+    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(rho).max())
+    if residuals.max() > tolerance:
+        a, i, j = (int(index) for index in np.unravel_index(residuals.argmax(), residuals.shape))
+        raise RepresentationError(
+            f"rho(e{a + 1}) of {g.name} is not a derivation D of {ideal.name}: D [u{i + 1}, u{j + 1}] differs from "
+            f"[D u{i + 1}, u{j + 1}] + [u{i + 1}, D u{j + 1}] by {residuals.max():.3g} (tolerance {tolerance:.1g})",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(a, i, j),
+        )
+
+
+def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
+    m, dim = rho.shape[1], g.dim + rho.shape[1]
+    affine = np.zeros((dim, m + 1, m + 1))
+    affine[: g.dim, :m, :m] = rho
+    affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
+    sizes = np.linalg.norm(rho, axis=(1, 2))
+    if sizes.all() and len(row_space(rho.reshape(g.dim, -1) / sizes[:, None])) == g.dim:
+        return affine
+    if g.basis is None:
+        return None
+    upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
+    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
+
+
+# -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def _joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
+    """The names of all basis elements, where all have some and no two the same."""
+    names = [name for g in algebras for name in g.basis_names or ()]
+    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
