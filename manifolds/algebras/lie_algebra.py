@@ -28,7 +28,7 @@ from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, rational_array
 from .axioms import AXIOM_TOLERANCE, check_axioms, checked_constants, real_columns, without_rounding
 from .casimirs import casimirs
-from .killing import cartan_involution_of, row_space
+from .killing import cartan_involution_of, killing_form_of, row_space
 from .polynomial_casimirs import casimir_count
 
 
