@@ -10,7 +10,7 @@ import manifolds as mf
 from liethermo.tracing.interpret import at_points
 from tests.cases import DISSIPATIONS, build, slow
 from tests.liethermo.closed_systems import ISOLATED
-from tests.liethermo.test_convergence import SYSTEMS
+from tests.liethermo.integrators.test_convergence import SYSTEMS
 
 
 def rebuilt(tree):

@@ -10,8 +10,7 @@ import pytest
 import liethermo as lt
 from liethermo.tracing.interpret import at_points
 from tests.cases import tolerance
-
-from .closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl
+from tests.liethermo.closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl
 
 KINDS = {"isolated": ISOLATED, "open": OPEN}
 

@@ -10,7 +10,7 @@ import manifolds as mf
 from liethermo.integrators.tableaus import gauss
 from tests.cases import EPS, TRANSCENDENTAL
 from tests.liethermo import random_systems
-from tests.liethermo.test_orders import nonlinear_systems
+from tests.liethermo.integrators.test_orders import nonlinear_systems
 
 ENTROPY = 4 * EPS
 """Largest fall of the entropy in a step, relative to max |S|: roundings of S itself."""

@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from tests.manifolds.test_own_spaces import MINE, Ellipsoid
+from tests.manifolds.spaces.test_own_spaces import MINE, Ellipsoid
 
 
 def on_the_group():

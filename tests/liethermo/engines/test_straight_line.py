@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from liethermo.engines.compiled.straight_line import OF_NUMBERS, OF_TESTS, TESTS, is_plain, straight_line
 from liethermo.tracing.primitives import Instruction
 from liethermo.tracing.scalarize import Program
-from tests.liethermo.test_scalarize import STEPS, program_of, shapes, steps
+from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
 
 LANES = 3
 

@@ -11,8 +11,7 @@ import pytest
 import liethermo as lt
 from liethermo.integrators.variational.discrete import Pair
 from manifolds.matrices.linear import solve
-
-from .closed_systems import MECHANICAL, OPEN, SCHEMES, X0
+from tests.liethermo.closed_systems import MECHANICAL, OPEN, SCHEMES, X0
 
 H = 0.1
 

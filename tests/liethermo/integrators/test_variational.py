@@ -10,8 +10,7 @@ import pytest
 import liethermo as lt
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import at_points
-
-from .closed_systems import ISOLATED, OPEN, SCHEMES, X0
+from tests.liethermo.closed_systems import ISOLATED, OPEN, SCHEMES, X0
 
 H = 1e-3
 TABLE = {  # EQUATIONS §7: largest |E - E_0| / E_0 over 5-20 thousand steps, for lambda = 0, 0.2, 5, 10

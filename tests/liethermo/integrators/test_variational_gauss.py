@@ -7,8 +7,7 @@ import pytest
 
 import liethermo as lt
 from liethermo.models.mass_spring_gas import mass_spring_gas_solution
-
-from .closed_systems import OPEN, X0
+from tests.liethermo.closed_systems import OPEN, X0
 
 HOT = {"friction": 2.0, "moles": 0.001}
 """So little gas that the friction heats it from 300 K to 366 K: nothing is nearly quadratic."""
