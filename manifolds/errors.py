@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
+
 
 class ManifoldsError(Exception):
     """Base class of every error raised on purpose by :mod:`manifolds`."""
@@ -71,3 +74,11 @@ class ClosureError(LieAlgebraError):
 
 class RepresentationError(LieAlgebraError):
     """Matrices ``rho_a`` with ``[rho_a, rho_b] != rho([e_a, e_b])``."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """A warning that points to the line of the user's that led to it, however deep inside the library it arises."""
+    frame, depth = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("liethermo", "manifolds"):
+        frame, depth = frame.f_back, depth + 1
+    warnings.warn(message, category, stacklevel=depth)

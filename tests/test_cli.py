@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import liethermo as lt
 from liethermo.cli import app
-from liethermo.engines.compiled import stepper as compiled
+from liethermo.engines.compiled.stepper import CompiledEngine
 from liethermo.integrators import METHODS
 from liethermo.spec import FIGURES
 
@@ -171,7 +171,7 @@ def test_a_run_that_stops_early_is_kept(folder):
 
 
 def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
-    advance, calls = compiled.advance, []
+    advance, calls = CompiledEngine.advance, []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -179,7 +179,7 @@ def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
             raise KeyboardInterrupt
         return advance(*arguments)
 
-    monkeypatch.setattr(compiled, "advance", interrupted)
+    monkeypatch.setattr(CompiledEngine, "advance", interrupted)
     result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), NO_FIGURES))
     assert result.exit_code == 1
     assert "stopped by the user" in result.stdout

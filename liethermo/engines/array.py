@@ -372,9 +372,22 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
     return jax.lax.scan(one_save, state, jnp.arange(capacity))
 
 
-def stepping(system: System, method: OneStepMethod) -> Callable:
-    """The function (state, h) -> state after one step, or as it was with the status of a failure."""
-    return lambda state, h: _one_step(system, method, state, jnp.asarray(h))
+class ArrayEngine:
+    """The array engine for one system and method: an :class:`.choice.Engine`."""
+
+    name = "array"
+
+    def __init__(self, system: System, method: OneStepMethod):
+        self.system, self.method = system, method
+
+    def begin(self, x) -> State:
+        return begin(self.system, self.method, x)
+
+    def advance(self, state: State, h, saves, every, capacity: int):
+        return advance(self.system, self.method, state, h, saves, every, capacity)
+
+    def step(self, state: State, h) -> State:
+        return _one_step(self.system, self.method, state, jnp.asarray(h))
 
 
 @program

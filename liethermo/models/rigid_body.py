@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import jax
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.errors import warn
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
@@ -71,10 +71,9 @@ def _inertia(inertia) -> np.ndarray | jax.Array:
     if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())
         if largest > others * (1 + 1e-12):
-            warnings.warn(
+            warn(
                 f"no rigid body has the moments of inertia {moments.tolist()}: the largest, {largest:g}, is more than "
                 f"the sum of the others, {others:g}. The equations hold all the same",
                 InertiaWarning,
-                stacklevel=3,
             )
     return moments

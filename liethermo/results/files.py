@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from manifolds.errors import warn
 
 from ..errors import FileError
 
@@ -73,7 +74,7 @@ def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]
             f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
         )
     if attributes["format"] in WITHOUT_CHECKSUM:
-        warnings.warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show", stacklevel=3)
+        warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show")
     elif attributes.get("sha256") != checksum(series, attributes):
         raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     return series, attributes

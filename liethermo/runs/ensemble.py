@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..engines import array
+from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.stepper import Form
 from ..errors import InputError
@@ -39,7 +40,7 @@ from ..tracing.interpret import at_points
 from ..tracing.programs import program
 from ..tracing.scalarize import UnsupportedPrimitive
 from .family import Family, common_size
-from .run import COMPILED_DIM, NO_GROUP, as_run, check_choice, is_small, laws_of, warn_of_fallback
+from .preparation import NO_GROUP, as_run, check_choice, laws_of
 from .timetable import CHUNK_STEPS, Timetable
 
 LANES = 16
@@ -277,7 +278,7 @@ def ensemble(
         except UnsupportedPrimitive as error:
             if engine == "compiled":
                 raise
-            warn_of_fallback(error, stacklevel=3)
+            warn_of_fallback(error)
             chosen = "array"
     if chosen == "array":
         _run_array(family, method, states, times, record)

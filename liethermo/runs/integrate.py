@@ -12,8 +12,9 @@ from ..results.solution import Solution
 from ..systems import AttitudeSystem, DrivenSystem, System
 from .adaptive import Adaptive
 from .events import Relaxed
+from .preparation import NO_GROUP, as_run, check_choice, prepared
 from .progress import Progress
-from .run import NO_GROUP, Run, as_run, check_choice, prepared
+from .run import Run
 from .timetable import Timetable
 
 

@@ -52,7 +52,8 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
 
     span = (0.0, 1e6 * max(size, 1e-300) / speed)
     with contextlib.suppress(_EnoughError):
-        state, advance = array.begin(system, method, x), array.stepping(system, method)
+        engine = array.ArrayEngine(system, method)
+        state, advance = engine.begin(x), engine.step
         run(system, method, advance, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
         raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")

@@ -8,11 +8,9 @@ polynomials found are exact and proved to be all there are.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from ..errors import ParameterError
+from ..errors import ParameterError, warn
 from .invariants import TracePolynomial, fundamental_invariants
 from .polynomial import Polynomial
 from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
@@ -71,12 +69,11 @@ def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
         found = [F for F in generators if F.degree == degree]
     number = 0 if found or g.is_semisimple() else casimir_count(g)
     if number and not any(new_casimirs(g, d) for d in range(1, int(degree) + 1)):
-        warnings.warn(
+        warn(
             f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
             f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
             "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
             "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
             NoPolynomialCasimirWarning,
-            stacklevel=3,  # the caller of LieAlgebra.casimirs
         )
     return found

@@ -69,41 +69,45 @@ CONSTANTS = """FIXED_POINT_LIMIT FLOOR HALVINGS HARD IDLE ITERATING NEWTON_LIMIT
 PLATEAU SHRINKING SLOW SOLVED VANISHED"""
 
 
-def begin(system: System, method: OneStepMethod, x) -> State:
-    """The state of a run about to start at x; as :func:`.array.begin`."""
-    stepper, parameters = stepper_for(system, method)
-    blocks = stepper.begin(parameters, np.asarray(x, dtype=np.float64)[None])
-    return State(**{name: value[0] for name, value in stepper.fields(blocks).items()})
-
-
-def advance(system: System, method: OneStepMethod, state: State, h, saves: int, every: int, capacity: int):
-    """Up to ``saves`` times ``every`` steps of size h; as :func:`.array.advance`, and with the same result.
+class CompiledEngine:
+    """The compiled engine for one system and method: an :class:`..choice.Engine`, with the results of the array engine.
 
     Raises
     ------
     UnsupportedPrimitive
-        If the system or the method uses what cannot be unrolled.
+        If the system or the method uses what cannot be unrolled; of Newton's method, when a step first needs it.
     """
-    del capacity  # nothing is compiled for a number of saves
-    stepper, parameters = stepper_for(system, method)
-    blocks = stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
-    out = stepper.run(parameters, blocks, h, saves, every)[0]
-    fields: dict[str, Any] = {name: value[0] for name, value in stepper.fields(blocks).items()}
-    reached = np.arange(saves) < (int(fields["step"]) - int(state.step)) // every
-    return State(**fields), (out[:, :-2], out[:, -2], out[:, -1], reached)
 
+    name = "compiled"
 
-def stepping(system: System, method: OneStepMethod) -> Callable:
-    """The function (state, h) -> state after one step; as :func:`.array.stepping`."""
-    stepper, parameters = stepper_for(system, method)
+    def __init__(self, system: System, method: OneStepMethod):
+        self._stepper, self._parameters = stepper_for(system, method)
 
-    def step(state: State, h) -> State:
-        blocks = stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
-        stepper.run(parameters, blocks, h, 1, 1)
-        fields: dict[str, Any] = {name: value[0] for name, value in stepper.fields(blocks).items()}
+    @property
+    def operations(self) -> int:
+        """Of a step."""
+        return self._stepper.operations
+
+    def begin(self, x) -> State:
+        return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None]))
+
+    def advance(self, state: State, h, saves: int, every: int, capacity: int):
+        del capacity  # nothing is compiled for a number of saves
+        new, out = self._run(state, h, saves, every)
+        reached = np.arange(saves) < (int(new.step) - int(state.step)) // every
+        return new, (out[:, :-2], out[:, -2], out[:, -1], reached)
+
+    def step(self, state: State, h) -> State:
+        return self._run(state, h, 1, 1)[0]
+
+    def _run(self, state: State, h, saves: int, every: int) -> tuple[State, np.ndarray]:
+        blocks = self._stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in (*VECTORS, *NUMBERS)})
+        out = self._stepper.run(self._parameters, blocks, h, saves, every)[0]
+        return self._state(blocks), out
+
+    def _state(self, blocks: np.ndarray) -> State:
+        fields: dict[str, Any] = {name: value[0] for name, value in self._stepper.fields(blocks).items()}
         return State(**fields)
-
-    return step
 
 
 class Stepper:

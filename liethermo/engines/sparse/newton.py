@@ -34,13 +34,15 @@ STALE = 0.1
 class SparseEngine:
     """The engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
 
-    It offers what the modules :mod:`.array` and :mod:`.compiled` do.
+    An :class:`..choice.Engine`.
 
     Raises
     ------
     ValueError
         If the system does not know its sparsity.
     """
+
+    name = "sparse"
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
@@ -52,13 +54,12 @@ class SparseEngine:
         self._inverse: Inverse | None = None
         self._h = np.nan
 
-    def begin(self, system: System, method: OneStepMethod, x) -> array.State:
-        """As :func:`.array.begin`."""
-        return array.begin(system, method, x)
+    def begin(self, x) -> array.State:
+        return array.begin(self.system, self.method, x)
 
-    def advance(self, system: System, method: OneStepMethod, state, h, saves, every, capacity: int):
-        """As :func:`.array.advance`; it keeps no more than it reaches."""
-        del system, method, capacity
+    def advance(self, state, h, saves, every, capacity: int):
+        """Keeps no more than it reaches."""
+        del capacity
         kept: list[array.State] = []
         for _ in range(int(saves)):
             for _ in range(int(every)):
@@ -71,11 +72,6 @@ class SparseEngine:
         x = np.array([np.asarray(s.x) for s in kept]).reshape(len(kept), self.system.dim)
         energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
-
-    def stepping(self, system: System, method: OneStepMethod):
-        """As :func:`.array.stepping`."""
-        del system, method
-        return self.step
 
     def step(self, state: array.State, h) -> array.State:
         """One step; where it fails the state is left as it was, with a status."""

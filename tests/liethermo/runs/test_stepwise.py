@@ -63,10 +63,10 @@ def test_the_error_follows_the_tolerance(stages, rtol, exact):
 def test_the_estimate_of_the_local_error(stages, h):
     """Along a trajectory it is right to a factor of two in the mean, and nowhere far off."""
     method, exact = lt.MetriplecticGauss(stages), lt.MetriplecticGauss(5)
-    take, take_exactly = (array.stepping(SYSTEM, m) for m in (method, exact))
+    engines = [array.ArrayEngine(SYSTEM, m) for m in (method, exact)]
     ratios = []
     for x in lt.integrate(SYSTEM, START, (0.0, 20.0), 0.5, engine="array").x:
-        new, right = (f(array.begin(SYSTEM, m, x), h) for f, m in ((take, method), (take_exactly, exact)))
+        new, right = (f.step(f.begin(x), h) for f in engines)
         estimate = array.error_of_step(SYSTEM, method, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate / np.abs(new.x - right.x).max()))
     mean = np.exp(np.mean(np.log(ratios)))
@@ -83,7 +83,7 @@ def test_the_estimate_scales_with_the_motion():
     ratios = []
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
-        new, right = (compiled.stepping(free, m)(compiled.begin(free, m, x), h) for m in methods)
+        new, right = (e.step(e.begin(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
         estimate = array.error_of_step(free, method, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios

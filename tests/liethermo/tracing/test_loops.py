@@ -195,9 +195,9 @@ def test_a_family_built_by_a_new_function_each_time():
 
 def test_machine_code_that_cannot_be_unloaded_is_bounded(monkeypatch):
     """Of programs that do differ; "auto" goes on with the array engine, and says so."""
+    from liethermo.engines.choice import CompiledEngineWarning
     from liethermo.engines.compiled import module_cache
     from liethermo.engines.compiled import stepper as compiled
-    from liethermo.runs.run import CompiledEngineWarning
 
     monkeypatch.setattr(module_cache, "_names", {"another"})
     monkeypatch.setattr(module_cache, "MOST_MODULES", 1)

@@ -1,0 +1,142 @@
+"""Which engine runs a method on a system, and what takes over where it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from manifolds.errors import warn
+
+from ..errors import InputError
+from ..integrators import OneStepMethod
+from ..systems import System
+from ..tracing.scalarize import UnsupportedPrimitive
+from .array import ArrayEngine, State
+from .compiled.stepper import CompiledEngine
+from .sparse.newton import SparseEngine
+
+ENGINES = ("auto", "array", "compiled", "sparse")
+
+SMALL_DIM, SMALL_PROGRAM = 16, 4000
+"""Components of a state and operations of a step up to which it is compiled in about the time that XLA takes (two or
+three seconds), so that "auto" always takes it."""
+
+COMPILED_DIM = 40
+"""Components up to which unrolled scalar code is a good idea."""
+
+COMPILED_STEPS = 20_000
+"""Steps from which it is worth compiling for some seconds more."""
+
+SPARSE_DIM = 200
+"""Components from which a system that knows its sparsity is solved by it."""
+
+
+class Engine(Protocol):
+    """Takes the steps of one method on one system."""
+
+    name: str
+
+    def begin(self, x) -> State:
+        """The state of a run about to start at x."""
+        ...
+
+    def advance(self, state: State, h, saves: int, every: int, capacity: int) -> tuple[State, tuple]:
+        """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
+
+        Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
+        """
+        ...
+
+    def step(self, state: State, h) -> State:
+        """The state after one step, or as it was with the status of a failure."""
+        ...
+
+
+class CompiledEngineWarning(UserWarning):
+    """A system that the compiled engine cannot run, so that the array engine does."""
+
+
+class Chosen:
+    """The engine of a run, an :class:`Engine` itself: chosen when the run begins.
+
+    Where "auto" has taken the compiled engine and it meets what it cannot unroll, at the start or where a step first
+    needs Newton's method, the array engine goes on from the last good state, and says so.
+
+    Parameters
+    ----------
+    asked : one of ENGINES
+    steps : int
+        How many are to be taken.
+    """
+
+    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int):
+        self.system, self.method, self.asked, self.steps = system, method, asked, steps
+        self._engine: Engine = ArrayEngine(system, method)
+        self._begun = False
+
+    @property
+    def name(self) -> str:
+        return self._engine.name
+
+    def begin(self, x) -> State:
+        if not self._begun:
+            self._engine, self._begun = self._choose(), True
+        try:
+            return self._engine.begin(x)
+        except UnsupportedPrimitive as error:
+            self._fall_back(error)
+            return self._engine.begin(x)
+
+    def advance(self, state: State, h, saves: int, every: int, capacity: int) -> tuple[State, tuple]:
+        return self._attempt(lambda engine, state: engine.advance(state, h, saves, every, capacity), state)
+
+    def step(self, state: State, h) -> State:
+        return self._attempt(lambda engine, state: engine.step(state, h), state)
+
+    def _choose(self) -> Engine:
+        system, method, auto = self.system, self.method, self.asked == "auto"
+        if self.asked == "sparse" or (auto and system.dim >= SPARSE_DIM):
+            if system.sparsity() is not None:
+                return SparseEngine(system, method)
+            if not auto:
+                raise InputError(
+                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity: a "
+                    "ComposedSystem of lt.Copies joined by lt.Each does"
+                )
+        long = self.steps >= COMPILED_STEPS
+        if self.asked == "compiled" or (auto and is_small(system, COMPILED_DIM if long else SMALL_DIM)):
+            try:
+                compiled = CompiledEngine(system, method)
+            except UnsupportedPrimitive as error:
+                self._fall_back(error)
+            else:
+                if not auto or long or compiled.operations <= SMALL_PROGRAM:
+                    return compiled
+        return ArrayEngine(system, method)
+
+    def _attempt(self, call: Callable[[Engine, State], Any], state: State) -> Any:
+        try:
+            return call(self._engine, state)
+        except UnsupportedPrimitive as error:
+            self._fall_back(error)
+            like = self._engine.begin(jnp.asarray(state.x))
+            return call(self._engine, jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, like))
+
+    def _fall_back(self, error: UnsupportedPrimitive) -> None:
+        if self.asked != "auto":
+            raise error
+        warn_of_fallback(error)
+        self._engine = ArrayEngine(self.system, self.method)
+
+
+def is_small(system: System, most: int) -> bool:
+    """Whether a system is worth trying to compile: unrolled code, on the CPU, for ``most`` components at most."""
+    return system.unrollable and system.dim <= most and jax.default_backend() == "cpu"
+
+
+def warn_of_fallback(error: UnsupportedPrimitive) -> None:
+    """Say that the array engine takes over."""
+    warn(f"{error}; the array engine runs it instead", CompiledEngineWarning)

@@ -1,0 +1,58 @@
+"""What a run is made of: the system and the method as they are run, and the laws that it will be judged by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import InputError
+from ..functions.checks import traced_energies
+from ..integrators import OneStepMethod, WithAttitude
+from ..results.status import Laws
+from ..systems import AttitudeSystem, LiePoissonSystem, System, driven
+from ..tracing.remembered import remembered
+
+NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+
+
+def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
+    if given not in choices:
+        *others, last = map(repr, choices)
+        raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+
+
+@remembered
+def as_run(system: System, method) -> tuple[System, Any]:
+    """The system and the method as they are run.
+
+    With clock and work where the energy depends on time, with attitudes where there is a group, in charts on a
+    manifold.
+    """
+    if not isinstance(method, OneStepMethod):
+        return driven(system, unit=1.0), method  # its errors are measured component by component
+    system = driven(system)
+    method = traced_energies(method.pulled(system).on(system), system.dim)
+    if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
+        return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
+    return system, method
+
+
+@remembered
+def prepared(system: System, method) -> tuple[dict, Laws]:
+    """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
+    if isinstance(method, OneStepMethod):
+        method.check(system)
+    invariants = system.invariants()
+    return invariants, laws_of(system, method, invariants)
+
+
+def laws_of(system: System, method, invariants) -> Laws:
+    """What the system promises and, of its invariants, what the method keeps."""
+    keeps = method.keeps if isinstance(method, OneStepMethod) else lambda system, name: False
+    constants = [name for name, (_, kept) in invariants.items() if kept]
+    conserved = tuple(name for name in constants if keeps(system, name))
+    unpromised = tuple(name for name in constants if name not in conserved)
+    quadratic = system.entropy is not None and system.entropy.is_quadratic
+    exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
+    inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
+    ledger = tuple(system.ledger)
+    return Laws(system.energy_law, system.entropy_law, conserved, ledger, inexact, system.balance, unpromised)
