@@ -81,6 +81,7 @@ def test_the_rules_in_c_are_the_library_s():
     assert [getattr(array, name) for name in statuses[1].split(", ")] == [0, 1, 2]
 
 
+@pytest.mark.sampled(1)
 @needs_compiler
 @pytest.mark.parametrize(
     ("source", "parameters", "system"),

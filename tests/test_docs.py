@@ -42,6 +42,7 @@ def _pages():
             yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem in COSTLY else ())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::manifolds.NoPolynomialCasimirWarning")  # a page shows it
 @pytest.mark.parametrize("page", list(_pages()))
 def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
@@ -60,6 +61,7 @@ def _examples():
         yield pytest.param(path, id=_name(path), marks=() if path.stem in QUICK else pytest.mark.slow)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("example", list(_examples()))
 def test_an_example_runs_and_draws(example, scratch):
     runpy.run_path(str(example), run_name="__main__")

@@ -2,7 +2,7 @@
 
        Pi' = (Pi + rate dH x dS) x dH,   H = sum Pi_i^2 / (2 I_i) + (stiffness / 4) sum Pi_i^4,   S = log(1 + |Pi|^2).
 
-   The discrete gradient of H is Gonzalez's [BFM 4.3]. Compiled as it stands it is the one of liethermo/gradients.py:
+   The discrete gradient of H is Gonzalez's [BFM 4.3]. Compiled as it stands it is the one of liethermo/functions/gradients.py:
    the difference of H is predicted from the gradient at three Gauss nodes, and the defect of that prediction is let
    through where it exceeds rounding. With -DTEXTBOOK it is the formula as printed, which costs one gradient and one
    value and divides rounding noise by |d|^2 when the system comes to rest. */

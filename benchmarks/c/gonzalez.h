@@ -1,4 +1,4 @@
-/* Numbers and the gate of Gonzalez's gradient, as liethermo/gradients.py has them, where the reasons stand. */
+/* Numbers and the gate of Gonzalez's gradient, as liethermo/functions/gradients.py has them, where the reasons stand. */
 
 #ifndef GONZALEZ_H
 #define GONZALEZ_H

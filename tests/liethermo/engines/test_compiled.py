@@ -70,11 +70,13 @@ def test_the_body_of_the_paper():
     assert b.entropy[-1] == pytest.approx(10 * b.energy[0], rel=1e-14)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("every", [7, 10_000])
 def test_save_every(every):
     assert_same(*both(BODY, X0, (0.0, 30.05), 0.1, save_every=every))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("spelled_out", [1000, 10])
 def test_newton_on_demand(spelled_out, monkeypatch):
     """Run by Python at first, compiled where steps go on asking for it, in the middle of a save interval too."""
@@ -88,6 +90,7 @@ def test_newton_on_demand(spelled_out, monkeypatch):
     assert b.audit().passed
 
 
+@pytest.mark.slow
 def test_failures_are_the_same():
     too_large = lt.LiePoissonSystem(
         mf.so(3), lambda p: jnp.sum(jnp.sin(40.0 * p)), lt.Quadratic(np.ones(3)), lt.KillingDissipation()
@@ -115,6 +118,7 @@ def test_one_iteration_is_not_enough_and_says_so(monkeypatch):
     assert solution.status.code == "not_converged"
 
 
+@pytest.mark.slow
 def test_parameters_are_arguments(monkeypatch):
     """A sweep over inertias and rates compiles once; another pattern of zeros is another program."""
     loaded = []
@@ -175,6 +179,7 @@ fourth_power.defjvp(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adaptive", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_newtons_method_that_cannot_be_compiled(adaptive):
     """Its program is made when a step first needs it: with the second derivative of the energy."""
@@ -206,6 +211,7 @@ def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     assert chosen() == "array"
 
 
+@pytest.mark.slow
 def test_a_plain_function_that_is_quadratic_is_treated_as_one():
     """By what is written, not by its Hessian: that of ``|x|`` vanishes too."""
     matrix = np.array([[1.0, 0.3, 0.0], [0.3, 2.0, 0.1], [0.0, 0.1, 0.5]])
@@ -248,6 +254,7 @@ def in_a_process(folder):
     return result.stdout
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_cache_and_survives_damage(tmp_path):
     folder = tmp_path / "cache"
     first = in_a_process(folder)
@@ -263,6 +270,7 @@ def test_another_process_finds_the_cache_and_survives_damage(tmp_path):
     assert in_a_process(folder) == first
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_used(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")

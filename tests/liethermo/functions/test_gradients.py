@@ -18,6 +18,7 @@ seeds = st.integers(0, 10**6)
 each_gradient = pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=NAMES)
 
 
+@pytest.mark.sampled(2)
 @each_gradient
 @pytest.mark.parametrize("distance", [3.0, 1.0, 0.3, 0.03, 1e-3, 1e-6, 1e-9, 1e-13])
 @given(seed=seeds)
@@ -33,6 +34,7 @@ def test_identity_at_every_distance(gradient, distance, seed):
     assert abs(found - (after - before)) <= allowed
 
 
+@pytest.mark.sampled(1)
 @each_gradient
 @given(seed=seeds)
 def test_tends_to_the_gradient(gradient, seed):
@@ -62,6 +64,7 @@ def test_the_printed_quotient_is_noise_near_zero():
     assert errors["ours"] < 1e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", NAMES)
 def test_continuous_across_the_gate(name):
     """Along a ray in d the gradient moves by no more than its own variation: no jump where the defect is let in."""
@@ -73,6 +76,7 @@ def test_continuous_across_the_gate(name):
     assert (jumps <= 20 * np.diff(distances) + 1e-12).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["gonzalez", "mean_value", "symmetric_coordinate_increment"])
 @given(seed=seeds)
 def test_symmetric_in_its_end_points(name, seed):
@@ -100,6 +104,7 @@ def test_coordinate_increment_where_one_coordinate_rests(gradient):
         assert found[2] == pytest.approx(float(middle[2]), rel=0.2)
 
 
+@pytest.mark.sampled(1)
 @each_gradient
 @given(seed=seeds)
 def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
@@ -112,6 +117,7 @@ def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
     assert np.allclose(gradient(term, x, d), gradient(general, x, d), rtol=0, atol=1e-12)
 
 
+@pytest.mark.sampled(2)
 @each_gradient
 @pytest.mark.parametrize(
     "function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])]

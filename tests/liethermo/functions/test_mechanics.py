@@ -47,6 +47,7 @@ def discrete(gradient, term, x, d, low=0.0):
     return gradient(term, x, d, low), term.value(x + (low + d)) - term.value(x), term.gradient(x)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "gradient"),
     [*((name, "gonzalez") for name in TERMS), *(("sum", gradient) for gradient in GRADIENTS if gradient != "gonzalez")],
@@ -90,6 +91,7 @@ def test_invariances_of_coordinates_are_kept():
     assert min(sum_and_torque(lt.Function(root.on(squared).value))) > 1e-3  # control: the same function, not told
 
 
+@pytest.mark.sampled(3)
 @each_gradient
 def test_a_kinetic_energy_by_momenta_is_a_metric_times_their_mean(gradient):
     x, d = np.random.default_rng(2).standard_normal((2, DIM))

@@ -41,6 +41,7 @@ STEPS = {  # method, by its stages: the order it must have, and numbers of steps
 SO3, SE3_BODY = (case.values[0] for case in nonlinear_systems())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("system", "stages"),
     [

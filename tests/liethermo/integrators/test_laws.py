@@ -64,6 +64,7 @@ BY_DEFAULT = """so(3), so(4), sl(2), su(3), sp(2), gl(2), se(3), sl(2) x R^2, he
 bianchi('VI', h=-0.5), bianchi('VII', h=1)"""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "g", [g if g.name in BY_DEFAULT else slow(g) for g in ALGEBRAS if g.casimir_count() > 0], ids=lambda g: g.name
 )
@@ -72,6 +73,7 @@ def test_every_algebra(g):
     assert_laws(system, run(system, state_of(g, 0)), lt.MetriplecticMidpoint())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow, combinations([mf.se(3)]))])
 def test_every_dissipation(g, case):
     system = build(g, case)
@@ -79,6 +81,7 @@ def test_every_dissipation(g, case):
         assert_laws(system, run(system, state_of(g, seed)), lt.MetriplecticMidpoint())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", EACH_METHOD)
 @pytest.mark.parametrize(
     "name", ["killing", "projected_preserve", *map(slow, ["friction_operator", "double_bracket", "force"])]
@@ -89,6 +92,7 @@ def test_every_method(method, name):
     assert_laws(system, run(system, state_of(g, 1), method, h=STEP / 5), method)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", EACH_METHOD)
 def test_every_method_without_dissipation(method):
     """Energy and the quadratic Casimirs of a Lie-Poisson system, to rounding."""
@@ -110,6 +114,7 @@ def test_every_algebra_with_every_dissipation(g, case):
     assert_laws(system, run(system, state_of(g, 4), method), method)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("g", [mf.su(3), mf.so(4), mf.sl(2), mf.sl(3), mf.se(3)], ids=lambda g: g.name)
 def test_killing_dissipation_from_random_states(g):
     """The named algebras of the paper's reach: laws at every step, from several states."""
@@ -189,6 +194,7 @@ class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
         return system.vector_field(x + 0.5 * h * k[0])[None]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [FromTheWrongGradient(), WithoutDiscreteGradient()], ids=lambda m: type(m).__name__)
 def test_schemes_that_are_not_rebuilt_lose_energy_and_only_energy(method):
     system = build(mf.so(3), next(case for case in DISSIPATIONS if case.name == "projected"))

@@ -143,6 +143,7 @@ def final(system, x0, method, steps, T=2.0):
     return lt.integrate(system, x0, (0.0, T), T / steps, method, engine="array", save_every=steps)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "method"), RUNS)
 def test_orders_and_laws(build, name, method):
     """Order 2s against SciPy; then the laws at each of many steps, and points of the space at the end of them."""
@@ -211,6 +212,7 @@ def test_a_geomstats_space_gives_the_same_trajectory(method):
     assert np.abs(runs[0].x - runs[1].x).max() <= tolerance("twin")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -296,6 +298,7 @@ def test_a_point_off_the_manifold(build):
     assert np.allclose(build("spin").state(SPHERE.point(1.1 * START, project=True)), START)
 
 
+@pytest.mark.slow
 def test_a_step_beyond_the_injectivity_radius(build):
     fast = lt.MetriplecticSystem(SPIN, lambda s: 20.0 * s[2], space=SPHERE, validate=False)
     with pytest.raises(lt.NonFiniteError, match=r"as long as the domain.*injectivity radius 3\.14159") as failure:

@@ -39,6 +39,7 @@ def nonlinear_systems():
     ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("gradient", "order"), ORDERS)
 @pytest.mark.parametrize(("system", "x0"), nonlinear_systems())
 def test_observed_order(system, x0, gradient, order):

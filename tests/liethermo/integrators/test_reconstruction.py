@@ -58,6 +58,7 @@ def spatial(solution):
     return np.einsum("tij,tj->ti", solution.attitude, solution.x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "method"),
     [
@@ -90,6 +91,7 @@ def test_orders_of_a_relaxing_body(kind, method):
     assert (np.abs(slopes - method.order) < 0.2).all(), (errors, slopes)
 
 
+@pytest.mark.slow
 def test_the_spatial_momentum_of_a_free_body():
     """Kept to rounding by Cayley's map; control: by the exponential it is kept to the order of the method only."""
     runs = {
@@ -157,6 +159,7 @@ def momentum_drift(name, reconstruction, method, steps):
     return np.abs(M - M[0]).max()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "stages"),
     [
@@ -232,6 +235,7 @@ def unimodular(algebra, **maps):
     return mf.MatrixGroup("mine", algebra, lambda g: jnp.abs(jnp.linalg.det(g) - 1.0), **maps)
 
 
+@pytest.mark.slow
 def test_an_attitude_stays_in_a_group_of_ones_own():
     """Cayley's map leaves SL(3), and nobody has said so: the default is the exponential, the other is refused."""
     group, H = unimodular(mf.sl(3)), lt.Quadratic(np.arange(1.0, 9.0))
@@ -336,6 +340,7 @@ def test_what_is_refused():
 # -- ensembles --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
 def test_ensembles_carry_attitudes(engine):
     """Each as a run of its own; one attitude may be for all, and states that are not kept have none."""

@@ -62,6 +62,7 @@ def _printed(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
     return np.array(x), np.array(S)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "engine"),
     [
@@ -84,6 +85,7 @@ def test_the_printed_schemes(name, engine):
     assert np.abs(solution.x[:, 2] - S).max() < 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
@@ -163,6 +165,7 @@ def _momenta(discrete, x):
 # -- the paper's tests ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("case", CASES)
 @each_scheme
 def test_the_table_of_energies(case, name):
@@ -255,6 +258,7 @@ def test_orders_on_a_system_of_no_special_form(name):
     assert (np.abs(_slopes(defects) - order) < 0.2).all(), defects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["scheme 3", *(pytest.param(n, marks=pytest.mark.slow) for n in ("scheme 1", "scheme 2", "alpha = 0.3"))]
 )
@@ -294,6 +298,7 @@ def test_inconsistent_first_steps():
 # -- failures ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_a_temperature_that_reaches_zero_stops_the_run(engine):
     """T = 1 - S: friction heats the body until it has none left."""

@@ -18,6 +18,7 @@ def _slopes(errors):
     return np.log2(np.array(errors[:-1]) / errors[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stages", "order"), [(2, 4), pytest.param(3, 6, marks=pytest.mark.slow)])
 def test_orders_against_the_exact_solution(stages, order):
     """2s by hand, of the states and of the energy; the entropy grows at every step, however coarse."""
@@ -34,6 +35,7 @@ def test_orders_against_the_exact_solution(stages, order):
     assert (np.abs(_slopes(drifts) - order) < 0.6).all(), drifts
 
 
+@pytest.mark.slow
 def test_one_stage_is_scheme_2():
     system = lt.models.mass_spring_gas(**HOT)
     methods = lt.VariationalGauss(1), lt.VariationalIntegrator.midpoint()

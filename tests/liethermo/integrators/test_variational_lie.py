@@ -46,6 +46,7 @@ def residuals(system, x):
     }, rate[-1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("make", [body, tangled_system], ids=["body with wheels", "tangled"])
 def test_the_equations(make):
     system = make()
@@ -85,6 +86,7 @@ def _errors(system, x0, steps, t=2.0):
     return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "x0"), [(tangled_system, [0.5, 1.0, -0.4, 0.1]), pytest.param(body, X0, marks=pytest.mark.slow)]
 )
@@ -119,6 +121,7 @@ def test_a_control_that_does_not_keep_the_spatial_momentum():
     assert np.abs(size - size[0]).max() > 1e-8
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("build", "error", "words"),
     [

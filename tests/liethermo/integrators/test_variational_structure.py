@@ -109,6 +109,7 @@ def test_another_flow_does_not_have_the_structure():
     assert np.abs(defect).max() > 1e-6 * np.abs(forms[:, :2]).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "scheme 2" else pytest.mark.slow) for n in SCHEMES])
 def test_symplecticity_without_heat(name):
     """L = K(q, v) - U(q) - S and no forces: the map (q, p) -> (q', p') is symplectic; with friction it is not."""

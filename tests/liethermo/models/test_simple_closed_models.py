@@ -66,6 +66,7 @@ def test_the_heat_is_the_printed_one():
     assert np.abs(heat * (T - T[0]) - f).max() < 1e-11
 
 
+@pytest.mark.slow
 def test_a_gas_under_a_piston():
     """It rests where its pressure is the one outside; pushed away it comes back, warmer."""
     gas, rest = lt.models.cylinder(mass=20.0, friction=150.0, pressure=1e5), cylinder_rest(1e5, T=300.0)

@@ -73,6 +73,7 @@ def test_figures_1_and_2():
     assert errors[1] == pytest.approx([0.06120, 0.06130, 0.6104], rel=1e-3)  # of (39), iterated by itself
 
 
+@pytest.mark.slow
 def test_figures_3_and_4():
     """273.15 and 300: temperatures as in the picture, equal at the end; entropy from 11.3138 to 11.3160."""
     system = lt.models.thermo_particles()

@@ -59,6 +59,7 @@ def separatrix():
     ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("case", [heavy_top, three_particles, pendulum, separatrix])
 def test_laws_of_what_starts_at_zero(case, tmp_path):
     system, x0 = case()
@@ -204,6 +205,7 @@ class Slow(lt.MetriplecticMidpoint):
         return 0.999 * super().slopes(system, x, low, h, k)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "passed"), [(Late(), True), (Slow(), False)], ids=["late", "slow"])
 def test_consistency_is_judged_by_short_steps(method, passed):
     solution = lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 4.0), 0.4, method)

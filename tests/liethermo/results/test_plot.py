@@ -191,6 +191,7 @@ def test_a_falling_energy_is_drawn_on_the_conserved_casimir():
     assert "energy at start" not in labels(lt.plot.momentum_sphere(solution))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("algebra", "casimir"),
     [(mf.se(2), lambda m: m[1] ** 2 + m[2] ** 2), (mf.bianchi("VIII"), lambda m: m[0] ** 2 + m[1] ** 2 - m[2] ** 2)],

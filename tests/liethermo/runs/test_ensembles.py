@@ -62,6 +62,7 @@ def test_outputs():
     assert np.allclose(summary.least_entropy_increment, np.diff(path.entropy).min(axis=1), rtol=1e-12, atol=0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_named_parameters(engine):
     rates, x0 = np.linspace(0.1, 2.0, 20), [0.3, 1.0, 0.2]
@@ -71,6 +72,7 @@ def test_named_parameters(engine):
         assert np.abs(one.x[-1] - many.x[i]).max() <= 1e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_function_that_builds_systems(engine):
     """Some parameters one for each, some one for all; initial states too."""
@@ -84,6 +86,7 @@ def test_a_function_that_builds_systems(engine):
         assert np.abs(one.x[-1] - many.x[i]).max() <= 1e-13
 
 
+@pytest.mark.slow
 def test_parameters_of_user_functions():
     class Quartic(eqx.Module):
         strength: jax.Array
@@ -127,6 +130,7 @@ def test_a_failure_stays_where_it_is(engine):
     assert f"non_finite: trajectory 7, after step {one.status.step}" in str(many)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_newton_where_a_lane_needs_it(engine):
     """One stiff body among soft ones."""

@@ -31,6 +31,7 @@ def nonlinear(parameters):
     )
 
 
+@pytest.mark.slow
 def test_the_same_steps_as_integrate():
     """5.05 is no multiple of the step."""
     path = lt.flow(body(PARAMETERS), X0, (0.0, 5.05), 0.1, save_every=10)
@@ -101,6 +102,7 @@ def closed(p, entropy=True):
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("entropy", [True, False], ids=["relaxing", "conservative"])
 def test_a_system_that_closes_over_tracers(entropy):
     """It is built under every transformation, and is what it is with numbers in their place."""
@@ -122,6 +124,7 @@ def test_a_system_that_closes_over_tracers(entropy):
     assert seen == [False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entropy", [pytest.param(True, marks=pytest.mark.slow), False], ids=["relaxing", "free"])
 def test_derivatives_by_parameters_in_a_closure(entropy):
     """Outside of jit, backwards; against differences of the flow."""
@@ -172,6 +175,7 @@ MODELS = {
 HEAVY = ("body_with_wheels", "gas_piston", "cylinder", "mass_spring_gas")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in MODELS]
 )
@@ -257,6 +261,7 @@ def unrolled(p):
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
 
 
+@pytest.mark.slow
 def test_a_loop_of_unknown_length_in_an_energy():
     """It has no derivative backwards in JAX; here its derivatives are taken forwards, whatever is asked for."""
     modes = jax.jacfwd, jax.jacrev
@@ -276,6 +281,7 @@ def test_a_flow_with_a_loop_of_unknown_length():
     assert np.abs(solution.x[-1, 0] - a[0]) < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [

@@ -126,6 +126,7 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
     assert lt.integrate(stiff, [0.3, 1.0, -0.2], (0.0, advised), advised).status.ok  # half the step would not do
 
 
+@pytest.mark.slow
 def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
     """The message says what was tried: with too few iterations shorter steps cannot be solved either."""
     monkeypatch.setattr(array, "FIXED_POINT_LIMIT", 1)
@@ -149,6 +150,7 @@ def test_huge_steps_either_keep_the_laws_or_fail(h, x0):
     assert np.abs(solution.x).max() < 1e3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", list(lt.registered_methods()), ids=str)
 def test_one_iteration_is_not_enough_and_says_so(method, monkeypatch):
     """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
@@ -210,6 +212,7 @@ def test_the_reference_method_reports_failure_too():
         lt.Reference(scheme="Euler")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_ctrl_c_returns_what_exists(engine):
     lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine=engine)  # nothing is left to compile

@@ -22,6 +22,7 @@ def test_free_body_energy_after_a_million_steps(h):
     assert solution.audit().energy_drift < 2e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", GRADIENTS)
 def test_relaxing_to_rounding_and_staying_there(name):
     """A body with a non-quadratic energy relaxes until |x' - x| is at rounding, and stays for a million steps."""
@@ -43,6 +44,7 @@ def test_relaxing_to_rounding_and_staying_there(name):
     assert late.stats.newton_iterations == 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_the_energy_of_a_motion_that_goes_on(engine):
     """A general energy, hardly relaxing: each step rounds anew, and the errors must not add up (they came to 1e-11)."""

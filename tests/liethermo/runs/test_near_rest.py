@@ -34,6 +34,7 @@ def test_the_size_at_which_a_function_is_rounded():
     assert array.noise_of(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_two_bodies_of_temperature_one(engine):
     solution = lt.integrate(two(), WARM, (0.0, 60.0), 0.1, engine=engine)
@@ -74,6 +75,7 @@ def test_flow_to_rest():
     assert np.abs(lt.flow(two(), WARM, (0.0, 30.0), 0.1)).max() < 1e-13
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("x0", [WARM, np.zeros(2)], ids=["warm", "at rest"])
 def test_adaptive_steps_to_rest(x0):
     """Some tens of steps, and the last of them long: rounding is no error."""
@@ -110,6 +112,7 @@ def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
     assert lt.integrate(body, x0, (0.0, 5.0), lt.Adaptive(1e-8), save_at=[1.0], **few).status.ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticGauss(2), slow(lt.MetriplecticMidpoint()), slow(lt.MetriplecticMidpoint("mean_value"))]
 )

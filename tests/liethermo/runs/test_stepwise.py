@@ -44,6 +44,7 @@ SIZES = {1: 0.1, 2: 0.4, 3: 0.6, 4: 1.0}
 # -- adaptive steps ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("stages", "rtol"), [(2, 1e-4), (2, 1e-7), (3, 1e-4), (3, 1e-7), (3, 1e-10), (4, 1e-7), (4, 1e-10)]
 )
@@ -61,7 +62,10 @@ def test_the_error_follows_the_tolerance(stages, rtol, exact):
     ("stages", "h"), [(s, h) if s == 2 else pytest.param(s, h, marks=pytest.mark.slow) for s, h in SIZES.items()]
 )
 def test_the_estimate_of_the_local_error(stages, h):
-    """Along a trajectory it is right to a factor of two in the mean, and nowhere far off."""
+    """Along a trajectory it is right to a factor of two in the mean, nowhere far above, and hardly anywhere far below.
+
+    It is a vector that turns, and nearly vanishes where its parts cancel.
+    """
     method, exact = lt.MetriplecticGauss(stages), lt.MetriplecticGauss(5)
     engines = [array.ArrayEngine(SYSTEM, m) for m in (method, exact)]
     ratios = []
@@ -71,7 +75,7 @@ def test_the_estimate_of_the_local_error(stages, h):
         ratios.append(float(estimate / np.abs(new.x - right.x).max()))
     mean = np.exp(np.mean(np.log(ratios)))
     assert 0.5 < mean < 2.0, ratios
-    assert min(ratios) > 0.03, ratios
+    assert np.mean(np.array(ratios) < 0.1) <= 0.05, ratios
     assert max(ratios) < 100.0, ratios
 
 
@@ -118,6 +122,7 @@ def test_control():
     assert control.h == h
 
 
+@pytest.mark.slow
 def test_both_engines_take_the_same_steps():
     a, b = (
         lt.integrate(SYSTEM, START, (0.0, 5.0), lt.Adaptive(1e-6), lt.MetriplecticGauss(2), engine=engine)
@@ -141,6 +146,7 @@ def test_largest_and_first():
     assert steps.max() <= 0.3 * (1 + 1e-12)
 
 
+@pytest.mark.slow
 def test_a_tolerance_that_cannot_be_met():
     """A jump in the energy, which no step size gets over: the step underflows, and the status says why."""
     kinked = lt.LiePoissonSystem(
@@ -159,6 +165,7 @@ def test_a_tolerance_that_cannot_be_met():
         lt.integrate(kinked, [0.8, 0.5, 0.9], (0.0, 10.0), lt.Adaptive(1e-9), lt.MetriplecticGauss(2))
 
 
+@pytest.mark.slow
 def test_suggest_step(exact):
     for rtol in (1e-6, 1e-9):
         h = lt.suggest_step(SYSTEM, START, rtol, lt.MetriplecticGauss(3))
@@ -184,6 +191,7 @@ def relaxed_body(m):
     return np.cross(m, rates) + (rates @ rates) * m - (rates @ m) * rates
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("p", "rtol", "stages"), [(1e-6, 1e-4, 2), (1e-7, 1e-4, 3), (1e-10, 1e-6, 3), (1e-13, 1e-8, 4), (1e-15, 1e-6, 2)]
 )
@@ -244,6 +252,7 @@ def wells(n):
     return lt.MetriplecticSystem(mf.Canonical(n), energy)
 
 
+@pytest.mark.slow
 def test_suggested_steps_resolve_what_grows():
     """At the top of a saddle nothing seems to move, and any step would do for the estimate of the error."""
     h = lt.suggest_step(BODY, [1e-10, 1.0, 1e-10], 1e-6, lt.MetriplecticGauss(2))
@@ -314,6 +323,7 @@ def test_save_at(step):
         assert np.abs(x - reference).max() < 1e-6
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("stages", "order"), [(1, 2), (2, 3), (3, 4), (4, 5)])
 def test_order_of_dense_output(stages, order):
     """O(h^(s+1)) between the steps."""

@@ -144,6 +144,7 @@ def test_one_body_with_contact_friction_is_an_evolution_system():
 # -- both laws at every step ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(seed=seeds, h=st.floats(0.01, 1.0))
 def test_both_laws_or_a_reason(seed, h):
     """Random V(q, S), conductances, frictions and steps: the laws hold, or a status says why a step was refused."""
@@ -170,6 +171,7 @@ def test_observed_order_of_two_particles():
     assert (np.abs(slopes - 2.0) < 0.2).all(), errors
 
 
+@pytest.mark.slow
 def test_the_entropy_of_a_step():
     """``S' - S = h k (T_a - T_b)^2 / (T_a T_b)`` in discrete temperatures, for an H far from quadratic [Lemma 6.2]."""
     system, x, h = particles((0.3, 0.5), 2.0), np.array([-0.2, 0.4]), 0.2
@@ -229,6 +231,7 @@ class AtTheMidpoint(HeatConduction):
         return super().force(system, x, dH, dS, dL) * jnp.ones_like(x).at[S].set(dH[S] / T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("conduction", "energy", "entropy"),
     [pytest.param(ConstantFactor, True, False, marks=pytest.mark.slow), (AtTheMidpoint, False, True)],
@@ -317,6 +320,7 @@ def test_conductances_are_parameters():
     assert np.allclose(jax.grad(production)(3.0), swept[0], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_temperatures_that_are_not_positive():
     """At the start, an error that names the body; on the way, a status; at test points, left out."""
     odd = lt.Subsystem(lambda x: 0.5 * x[0] ** 2, 1, name="odd")  # T = S

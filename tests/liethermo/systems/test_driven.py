@@ -97,6 +97,7 @@ def ends():
 STEPS = {2: (30, 60, 120), 4: (15, 30, 60), 6: (8, 12, 18)}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("case", "method"),
     [
@@ -168,6 +169,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_does_not_change_does_no_work(method):
     """Written as H(x, t) it gives the steps of H(x), whatever the slopes handed to the method."""
@@ -178,6 +180,7 @@ def test_an_energy_that_does_not_change_does_no_work(method):
     assert np.abs(timed[..., -1]).max() == 0.0
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_time_is_exact(method):
     """Whatever the slopes handed to the method, t' = 1, where the entropy law and the energy are corrected too."""
@@ -266,6 +269,7 @@ def test_a_sweep_by_the_name_of_the_parameter(engine):
     assert np.array_equal(short.energy, found.energy)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_flow_by_the_amplitude():
     """The flow of a spring is affine in the amplitude of what pushes it, the discrete one too."""
 
@@ -331,6 +335,7 @@ def moving_wall(y, t):
     return 0.5 * (y[0] - 0.3 * jnp.sin(2.0 * t)) ** 2 + 0.1 * jnp.exp(y[1])
 
 
+@pytest.mark.slow
 def test_an_evolution_system_with_a_moving_wall():
     """The potential is a term of its own, along its own coordinates, so the entropy is monotone at coarse steps too."""
     wall = lt.TimeDependent(moving_wall).on([0, 2])

@@ -108,6 +108,7 @@ def test_the_report():
 # -- both laws at every step ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bent", [pytest.param(False, marks=pytest.mark.slow, id="G"), pytest.param(True, id="G(q)")])
 @given(seed=seeds, h=st.floats(0.01, 1.0))
 def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
@@ -170,6 +171,7 @@ def closed_form_39(q, p, S, h, gamma):
     return q1, p1, S1 + ((16 * S * gamma + 16 * p**2) * h + 16 * S) / D**2
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_39(engine):
     """The generic scheme is (39): 1000 steps, against (39) in extended precision."""
@@ -238,6 +240,7 @@ def contact_run(a_S, b, steps):
     )
 
 
+@pytest.mark.slow
 def test_the_contact_field_keeps_its_law_exactly():
     """``H' = -R(H) H`` becomes ``H(x') - H(x) = -h (dgrad H)_S H(z)``, to rounding, at every step."""
     energy, system, solution = contact_run(1.5, 1.0, 10)

@@ -74,6 +74,7 @@ def both_sides(L, x):
     return [*zeros, *more_zeros, heat - made, action - value], related, heat - value
 
 
+@pytest.mark.sampled(1)
 @each_lagrangian
 def test_herglotz_equations_and_the_legendre_transform(L):
     """(12) and (10); Gamma_L and E_H are FL-related with H = E_L o FL^-1 [SML §3.1], and so are xi_L and X_H."""
@@ -205,6 +206,7 @@ def test_observed_order_of_discrete_herglotz():
     assert (np.abs(slopes - lt.DiscreteHerglotz(quartic_action).order) < 0.2).all(), errors
 
 
+@pytest.mark.slow
 def test_discrete_herglotz_solves_40_and_41():
     """The states of a run satisfy the printed equations, for a discrete Lagrangian that makes them implicit."""
     h, solution = 0.05, quartic_run(40)

@@ -73,6 +73,7 @@ def all_of(energy, x, d, k):
     return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in GRADIENTS.values()), stages]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run", [pytest.param(True, marks=pytest.mark.slow, id="in order"), pytest.param(False, id="anywhere")]
 )
@@ -290,6 +291,7 @@ def heat_run(shape, h, steps, **options):
     return T, lt.integrate(system, np.log(T).ravel(), (0.0, steps * h), h, **options)
 
 
+@pytest.mark.slow
 def test_heat_grid():
     """To second order in steps that follow the heat, and with both laws in steps a thousand times as long."""
     errors = []
@@ -305,6 +307,7 @@ def test_heat_grid():
     assert_both_laws(stiff)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_stiff_steps_of_a_few_bodies(engine):
     """Whole Newton steps leave the domain of these; halved ones do not."""

@@ -31,6 +31,7 @@ def _field(system, x):
     return system.vector_field(x)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in each_system()])
 def test_fields_and_laws(make):
     system = make()
@@ -43,6 +44,7 @@ def test_fields_and_laws(make):
     assert list(system.functions()) == list(again.functions())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sum of frictions", slow("spin with a bath"), slow("warm top")])
 def test_trajectories(name):
     system = SYSTEMS[name]()
@@ -63,6 +65,7 @@ def test_a_sum_keeps_what_every_part_is_told_to_preserve():
     assert {"preserved 1", "preserved 2", "mu4**2 + mu5**2 + mu6**2"} == system.first_integrals()
 
 
+@pytest.mark.slow
 def test_a_sum_with_one_part_that_preserves_is_consistent():
     """The slopes of a step of no length are the vector field, where an entropy is not quadratic."""
 

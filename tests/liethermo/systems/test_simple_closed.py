@@ -40,6 +40,7 @@ def residuals(system, x):
     return found, energy_rate, -F @ v / -by_S
 
 
+@pytest.mark.sampled(1)
 @each_system
 def test_the_equations_and_both_balances(kind, name):
     system = KINDS[kind][name]
@@ -63,6 +64,7 @@ def small():
     )
 
 
+@pytest.mark.slow
 def test_the_metriplectic_schemes_run_a_small_one_and_keep_its_laws():
     _run_and_judge(small(), [0.4, 0.5, 0.2])
 

@@ -25,6 +25,7 @@ def quartic(xi):
     return 0.5 * jnp.sum(jnp.array([3.0, 2.0, 1.0]) * xi**2) + 0.1 * jnp.sum(xi**4)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6))
 def test_legendre_transform(seed):
     """mu = dl/dxi and xi = dH/dmu are inverse; H(mu) = <mu, xi> - l(xi); grad H and its Hessian are consistent."""
@@ -62,6 +63,7 @@ def test_quadratic_lagrangians_are_transformed_in_closed_form():
     assert np.allclose(diagonal.velocity([2.0, 1.0, 0.5]), 1.0)
 
 
+@pytest.mark.slow
 def test_an_euler_poincare_run_obeys_the_laws():
     solution = lt.integrate(_quartic_system(), [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
     assert solution.audit().passed, f"\n{solution.audit()}"

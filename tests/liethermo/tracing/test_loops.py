@@ -172,6 +172,7 @@ def test_what_was_compiled_is_unloaded(monkeypatch):
     assert len(programs._programs) == 2
 
 
+@pytest.mark.slow
 def test_a_family_built_by_a_new_function_each_time():
     def run(k):
         def family(rate):

@@ -272,6 +272,7 @@ def primitives_in(jaxpr) -> set[str]:
     return found
 
 
+@pytest.mark.sampled(46)
 @pytest.mark.parametrize("name", CASES)
 def test_every_primitive_agrees(name):
     f, *args = CASES[name]
@@ -423,6 +424,7 @@ steps = st.tuples(st.sampled_from(list(STEPS)), st.integers(0, 5), st.integers(0
 shapes = st.lists(st.integers(1, 4), max_size=2).map(tuple)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.lists(steps, min_size=1, max_size=7), st.sampled_from(list(SUMMARIES)), shapes, shapes, st.integers(0, 99))
 def test_random_programs_agree(steps, summary, shape_x, shape_y, seed):
@@ -649,12 +651,14 @@ def slopes(system, method):
     )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("case", DISSIPATIONS, ids=lambda case: case.name)
 def test_every_dissipation(case):
     f, args = slopes(build(mf.so(3), case), MetriplecticMidpoint())
     agrees(f, *args)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", list(registered_methods()), ids=str)
 def test_every_method(method):
     f, args = slopes(build(mf.so(3), DISSIPATIONS[0]), method)

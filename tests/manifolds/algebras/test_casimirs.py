@@ -94,6 +94,7 @@ DEGREES = [
 ]
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("g", "degrees"), DEGREES, ids=lambda value: getattr(value, "name", str(value)))
 def test_known_degrees_of_generators_which_are_independent(g, degrees):
     generators = [F for degree in (1, 2, 3, 4) for F in casimirs(g, degree)]
@@ -106,6 +107,7 @@ def test_known_degrees_of_generators_which_are_independent(g, degrees):
 # -- which ones ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("g", REGISTERED, ids=lambda g: g.name)
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_casimirs_are_invariant_and_perturbed_ones_are_not(g, degree):

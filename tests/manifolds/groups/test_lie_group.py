@@ -68,6 +68,7 @@ def G(request):
 # -- every registered group: exp, log, products -----------------------------------------------------------------------
 
 
+@pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_exp_lands_in_the_group(G, seed):
     for size in (1e-3, 1.0, 3.0):
@@ -77,6 +78,7 @@ def test_exp_lands_in_the_group(G, seed):
     assert np.array_equal(G.exp(np.zeros((BATCH, G.dim)))[0], G.identity)
 
 
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_log_inverts_exp(G, seed):
     for size in (1e-3, 0.5, 1.5):
@@ -117,6 +119,7 @@ def test_product_is_baker_campbell_hausdorff_to_second_order(G):
 # -- every registered group: adjoint and coadjoint action -------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_adjoint_action(G, seed):
     x, y, z = elements(G, seed, 3)
@@ -155,6 +158,7 @@ def test_derivative_of_the_coadjoint_action_is_ad_star(G):
 # -- every registered group: Cayley -----------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 def test_cayley(G):
     if G.name in ("SL(3)", "SU(3)"):
         for call in (lambda: G.cayley(np.zeros(G.dim)), lambda: G.inverse_cayley(G.identity)):
@@ -180,6 +184,7 @@ ADJOINT = ("SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "GL(2)
 """Groups in which Cayley's map of ad x is an adjoint action, by hand."""
 
 
+@pytest.mark.sampled(1)
 def test_adjoint_cayley(G):
     if G.name not in ADJOINT:
         with pytest.raises(mf.LieAlgebraError, match=r"an adjoint action does not take .* misses by 0\.0.*use exp"):
@@ -199,6 +204,7 @@ def test_adjoint_cayley(G):
     assert G.cayley_is_adjoint() == bool(close(G.cayley(x), g, "product"))
 
 
+@pytest.mark.sampled(2)
 def test_maps_stay_in_the_group(G):
     """What the constructor of a group says of its maps, measured."""
     tolerance = TOLERANCES["member"][0]
@@ -270,6 +276,7 @@ WITHOUT_LOG = {
 }
 
 
+@pytest.mark.sampled(3)
 def test_log_up_to_the_half_turn(G):
     """Exact to rounding in the compact directions; elsewhere the condition number of the logarithm itself is 1/gap."""
     if G.algebra.is_nilpotent() and not G.algebra.is_abelian():
@@ -295,6 +302,7 @@ def test_log_up_to_the_half_turn(G):
             G.log([matrix] * BATCH)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("group", "count"), [(mf.SO(2), 1), (mf.SO(3), 3), (mf.SO(4), 6), (mf.SE(2), 1), (mf.SE(3), 3)]
 )
@@ -377,6 +385,7 @@ PROGRAMS = [mf.SO(3), mf.SE(3), mf.SU(2), mf.Heisenberg(1), mf.SL(2)]
 each_program = pytest.mark.parametrize("group", PROGRAMS, ids=lambda group: group.name)
 
 
+@pytest.mark.sampled(1)
 @each_program
 def test_gradient_of_log_after_exp_is_that_of_the_identity(group):
     """At zero, next to it and elsewhere; mapped over a batch, so that maps and batches are compared too."""
@@ -392,6 +401,7 @@ def test_gradient_of_log_after_exp_is_that_of_the_identity(group):
         assert close(gradient, mu, "derivative")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("group", [mf.SO(3), mf.SL(2)], ids=lambda group: group.name)
 def test_batches_equal_loops(group):
     x, mu = elements(group, 5).reshape(2, 2, -1), duals(group, 5)[0]
@@ -431,6 +441,7 @@ def test_second_derivatives():
         assert close(hessian, hessian.T, "derivative")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("group", [mf.SO(3), mf.SL(2)], ids=lambda group: group.name)
 def test_log_is_nan_under_tracing_where_it_would_raise(group):
     g = np.array(group.exp(elements(group, 14)))
@@ -449,6 +460,7 @@ def test_poles_of_the_cayley_map(group, x, eigenvalue):
         group.cayley([np.zeros(group.dim), x])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_inverse_cayley_near_the_half_turn(n):
     """2 tan(a/2) grows without bound, and with it the condition of the map."""

@@ -26,6 +26,7 @@ CHARTS = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("chart", CHARTS)
 def test_vectors_and_covectors_in_coordinates(chart):
     """``lower`` undoes the derivative of the chart, ``lift`` is the transpose; at the centre both are the frame's."""

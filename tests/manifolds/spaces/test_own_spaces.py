@@ -119,6 +119,7 @@ def test_a_chart_of_ones_own():
         chart.carry(z, v, w)
 
 
+@pytest.mark.slow
 def test_a_group_of_ones_own_as_a_space():
     space = mf.GroupSpace(MINE, inner=np.diag([1.0, 4.0, 9.0]))
     assert (space.name, space.dim, space.shape) == ("mine", 3, (3, 3))

@@ -107,6 +107,7 @@ def S(request):
 # -- every registered space: points, vectors, metric ------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_points(S, seed):
     x = points(S, seed)
@@ -123,6 +124,7 @@ def test_points(S, seed):
         assert not bool(S.belongs(moved, 1e-4).all())
 
 
+@pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_tangent_vectors(S, seed):
     x, w = points(S, seed), ambient(S, seed)
@@ -160,6 +162,7 @@ def lengths(space):
     return (1e-3, 0.5, 0.9 * min(space.injectivity_radius(), 3.0))
 
 
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_exp_and_log(S, seed):
     x = points(S, seed)
@@ -571,6 +574,7 @@ def test_a_vector_that_is_not_tangent():
         space.transport(NORTH, 0 * NORTH, NORTH)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("space", "x", "y", "message"),
     [

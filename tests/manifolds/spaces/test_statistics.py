@@ -30,6 +30,7 @@ def twin(space):
     return (Hypersphere if isinstance(space, mf.Sphere) else Hyperboloid)(dim=2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
 def test_the_mean_is_that_of_geomstats(space):
     """To the accuracy of its descent; and by its logarithms ours is stationary to rounding."""

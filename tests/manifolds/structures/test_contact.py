@@ -112,6 +112,7 @@ def structure(M, x, u, v):
     }
 
 
+@pytest.mark.sampled(1)
 @each_structure
 @given(seed=seeds)
 def test_what_the_form_determines(M, seed):
@@ -128,6 +129,7 @@ def against_the_definition(M, x, alpha):
     return of_points | {name: getattr(M, name)(x, alpha) - getattr(D, name)(x, alpha) for name in sharps}
 
 
+@pytest.mark.sampled(1)
 @each_split
 @given(seed=seeds)
 def test_closed_forms_follow_from_the_form(M, seed):
@@ -186,6 +188,7 @@ def proposition_2_1(M, x, coefficients):
     }
 
 
+@pytest.mark.sampled(1)
 @each_structure
 @given(seed=seeds)
 def test_proposition_2_1(M, seed):
@@ -211,6 +214,7 @@ def test_fields_in_coordinates():
     assert np.allclose(M.hamiltonian_vector_field(H)([q, p, S]), evolution - [0, 0, energy], rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_lagrangian_in_coordinates():
     """``R_L = d/dS - W^ij L_{v_j S} d/dv_i``, the Hessian (8) and the energy, as printed in §3.1."""
     n, L = 2, lagrangian(2)
@@ -245,6 +249,7 @@ def brackets(M, x, coefficients):
     }
 
 
+@pytest.mark.sampled(1)
 @each_structure
 @given(seed=seeds)
 def test_brackets(M, seed):
@@ -261,6 +266,7 @@ def jacobi_structure(M, x):
     return {"[L, L] = 2 E ^ L": schouten - cyclic(jnp.einsum("i,jk->ijk", R, L)), "[L, E] = 0": moved}, schouten
 
 
+@pytest.mark.sampled(2)
 @each_structure
 def test_the_bivector_and_the_reeb_field_are_a_jacobi_structure(M):
     """Components of [Lambda, Lambda] = 2 E ^ Lambda and [Lambda, E] = 0, E = -R: Lambda by itself is not Poisson."""
@@ -301,6 +307,7 @@ def splitting(M, x, coefficients):
     return residuals, tensor
 
 
+@pytest.mark.sampled(1)
 @each_split
 @given(seed=seeds)
 def test_the_cartan_bracket_splits(M, seed):
@@ -341,6 +348,7 @@ def false_claims(M, x, coefficients):
     }
 
 
+@pytest.mark.sampled(1)
 @each_structure
 def test_false_claims_are_seen_to_be_false(M):
     assert_visible(false_claims(M, *data(M, 7)[:2]))
