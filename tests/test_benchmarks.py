@@ -40,6 +40,7 @@ def bare(monkeypatch):
     native.program.cache_clear()
 
 
+@pytest.mark.slow
 def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
     main(["work_precision", "--quick", "--out", str(tmp_path)])
     printed = capsys.readouterr().out
@@ -141,6 +142,7 @@ def test_the_reference_is_the_trajectory(monkeypatch):
     assert np.array_equal(reference.states(x0, 0.7, 5.0), exact)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not memory.STATUS.is_file(), reason="this system does not tell a process its largest size")
 def test_a_process_is_not_charged_its_parent_s_memory():
     """getrusage would: its figure survives the start of another program."""

@@ -157,6 +157,7 @@ def test_a_law_that_fails(folder):
     assert folder.call("audit", file).exit_code == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_early_is_kept(folder):
     spec = folder.spec(function("half_a_domain"), RUN.replace("2.0]", "50.0]"))
     result = folder.call("run", spec, "--out", "results")

@@ -110,6 +110,7 @@ def test_failures_are_the_same():
     assert np.abs(a.x - b.x).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_one_iteration_is_not_enough_and_says_so(monkeypatch):
     monkeypatch.setattr(step_loop, "FIXED_POINT_LIMIT", 1)
     monkeypatch.setattr(step_loop, "NEWTON_LIMIT", 1)
@@ -150,6 +151,7 @@ def unsupported():
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), validate=False)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compiled(monkeypatch):
     with pytest.raises(lt.LiethermoError, match="JAX primitive"):
         lt.integrate(unsupported(), [0.5, 1.0, 0.2], (0.0, 1.0), 0.1, engine="compiled")

@@ -181,6 +181,7 @@ def test_the_spatial_momentum_in_every_group_that_can_keep_it(name, stages):
         assert momentum_drift(name, "exp", method, 50) > 1e4 * SPATIAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SL(2)", *(pytest.param(n, marks=pytest.mark.slow) for n in ("SU(2)", "SE(3)"))])
 def test_cayley_on_the_matrices_does_not_keep_it(name):
     """What the default was before: "g mu" is the coadjoint action of SO(3) and SE(2) alone."""
@@ -293,6 +294,7 @@ def heavy_top():
     )
 
 
+@pytest.mark.slow
 def test_the_heavy_top():
     """The vertical, turned back by the attitude, stays where it is; so does the momentum about it."""
     start = np.array([0.2, 0.1, 1.5, 0.0, np.sin(0.4), np.cos(0.4)])

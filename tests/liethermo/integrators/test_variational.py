@@ -312,6 +312,7 @@ def test_a_temperature_that_reaches_zero_stops_the_run(engine):
     assert (np.asarray(system.temperature(kept.x)) > 0.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_a_degenerate_regularity_matrix_is_reported(engine):
     """-m/h - h U''/4 = 0 for m = 1, h = 1/2 and U'' = -16: the midpoint rule does not determine q_1."""

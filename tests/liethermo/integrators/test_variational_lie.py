@@ -121,7 +121,7 @@ def test_a_control_that_does_not_keep_the_spatial_momentum():
     assert np.abs(size - size[0]).max() > 1e-8
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("build", "error", "words"),
     [

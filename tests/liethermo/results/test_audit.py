@@ -80,6 +80,7 @@ def test_laws_of_what_starts_at_zero(case, tmp_path):
         assert many.energy_drift[0] < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "entropy",
     [
@@ -131,6 +132,7 @@ def test_the_size_of_a_function():
 # -- how accurate the run is ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_steps_that_do_not_resolve_the_motion(tmp_path):
     """One step of 300 over the paper's figure keeps every law."""
     solution = lt.integrate(BODY, X0, (0.0, 300.0), 300.0)

@@ -183,6 +183,7 @@ def test_what_cannot_be_known_without_the_system_is_left_out(free):
     assert labels(lt.plot.momentum_sphere(solution, system)) == ["energy $0.6525$", "invariant $0.98$", "start", "end"]
 
 
+@pytest.mark.slow
 def test_a_falling_energy_is_drawn_on_the_conserved_casimir():
     system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.1, 0.2, 1.0]), dissipation=lt.DoubleBracket(0.1))
     solution = lt.integrate(system, [0.1, 1.0, 0.5], (0.0, 10.0), 0.1)
@@ -208,6 +209,7 @@ def test_open_surfaces_and_energies_that_are_not_quadratic(algebra, casimir):
     assert labels(lt.plot.momentum_sphere(solution)) == ["start", "end"]
 
 
+@pytest.mark.slow
 def test_a_surface_met_twice_by_a_ray_is_left_out():
     system = lt.LiePoissonSystem(mf.so(3), lambda m: jnp.sin(3.0 * jnp.dot(m, m)) + m[0], lambda m: jnp.dot(m, m))
     solution = lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 1.0), 0.05)

@@ -159,6 +159,7 @@ def test_relaxation_time():
     assert np.isnan(still.relaxation_time).all()
 
 
+@pytest.mark.slow
 def test_double_bracket():
     """The energy falls and the entropy stays: the energy is what relaxes."""
     system = lt.LiePoissonSystem(
@@ -181,6 +182,7 @@ def test_interrupted(monkeypatch):
     assert not many.steps.any()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compiled():
     system = lt.LiePoissonSystem(
         mf.so(3), lambda mu: jnp.sum(jnp.sort(mu) ** 2 * jnp.array([1.0, 2.0, 3.0])), lt.Quadratic(np.ones(3)),

@@ -67,6 +67,7 @@ def test_derivatives_against_differences(build, method):
             assert np.abs(difference - a[:, i]).max() < 1e-7 * np.abs(a).max()
 
 
+@pytest.mark.slow
 def test_the_energy_is_conserved_in_every_derivative():
     """``dH(x(t)) / dx0 = dH / dx0``: the law holds for neighbouring trajectories too."""
     system = body(PARAMETERS)
@@ -206,6 +207,7 @@ def root(p, x):
     return jax.lax.scan(lambda x, _: (implicit.solution(solve, misfit, (p, x), x), None), x[None], length=3)[0][0]
 
 
+@pytest.mark.slow
 def test_implicit_functions_have_derivatives_of_derivatives():
     """In every combination of modes, through a loop and in a batch."""
     p, x = 0.7, np.array([0.3, 1.0])

@@ -53,6 +53,7 @@ def test_the_energy_of_a_motion_that_goes_on(engine):
     assert solution.audit(energy=8e-15).passed, str(solution.audit())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["gonzalez", pytest.param("mean_value", marks=pytest.mark.slow)])
 def test_the_energy_in_long_steps(gradient):
     """Where the difference of H is used at every step, it must not take back what steers it (the drift was 1e-13)."""

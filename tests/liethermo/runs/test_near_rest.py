@@ -17,6 +17,7 @@ two = functools.cache(lt.models.thermo_particles)
 WARM = np.log([0.5, 1.5])  # relaxes to T = 1, where both entropies vanish
 
 
+@pytest.mark.slow
 def test_the_size_at_which_a_function_is_rounded():
     """That of the terms that cancel, not of what is left; and none where nothing is rounded."""
     cases = [
@@ -61,6 +62,7 @@ def test_a_grid_that_cools_to_temperature_one(engine):
     assert solution.stats.worst_residual < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_an_ensemble_that_comes_to_rest(engine):
     starts = np.random.default_rng(0).uniform(0.5, 1.5, (5, 2))
@@ -93,6 +95,7 @@ def test_a_state_that_leaves_the_numbers():
         assert np.array_equal(solution.x[-1], x0)
 
 
+@pytest.mark.slow
 def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
     body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
     few = {"method": lt.MetriplecticGauss(2), "on_failure": "return"}

@@ -58,6 +58,7 @@ def test_the_error_follows_the_tolerance(stages, rtol, exact):
     assert solution.stats.rejected <= 2 + 0.05 * solution.stats.steps  # one or two until the first step is found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stages", "h"), [(s, h) if s == 2 else pytest.param(s, h, marks=pytest.mark.slow) for s, h in SIZES.items()]
 )
@@ -93,6 +94,7 @@ def test_the_estimate_scales_with_the_motion():
     assert max(ratios) < 1.5 * min(ratios), ratios
 
 
+@pytest.mark.slow
 def test_steps_grow_as_a_body_relaxes():
     """At most 300 steps to t = 10^4; the last are of the size of the whole relaxation."""
     solution = lt.integrate(BODY, X0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(4))
@@ -132,6 +134,7 @@ def test_both_engines_take_the_same_steps():
     assert np.abs(a.x - b.x).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_the_midpoint_scheme_can_be_adaptive_too(exact):
     solution = lt.integrate(SYSTEM, START, (0.0, 20.0), lt.Adaptive(1e-5))
     assert np.abs(solution.x[-1] - exact).max() < 1e-2
@@ -191,7 +194,7 @@ def relaxed_body(m):
     return np.cross(m, rates) + (rates @ rates) * m - (rates @ m) * rates
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("p", "rtol", "stages"), [(1e-6, 1e-4, 2), (1e-7, 1e-4, 3), (1e-10, 1e-6, 3), (1e-13, 1e-8, 4), (1e-15, 1e-6, 2)]
 )
@@ -205,6 +208,7 @@ def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages):
     assert found.stats.steps < 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pendulum", pytest.param("double well", marks=pytest.mark.slow)])
 def test_other_unstable_rests(name):
     """The top of a pendulum and of a double well; linear and cubic forces against each other."""
@@ -219,6 +223,7 @@ def test_other_unstable_rests(name):
     assert found.event_time == pytest.approx(exact, rel=0.01)
 
 
+@pytest.mark.slow
 def test_what_grows_in_a_larger_system():
     """Six wells in a row, coupled: the rates of growth from a Krylov space are those of the whole matrix."""
     system = wells(6)
@@ -263,6 +268,7 @@ def test_suggested_steps_resolve_what_grows():
 # -- events -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-9)])
 def test_relaxed(step):
     solution = lt.integrate(BODY, X0, (0.0, 1e4), step, lt.MetriplecticGauss(3), until=lt.Relaxed(1e-8))
@@ -312,6 +318,7 @@ def test_a_file_keeps_the_event(tmp_path):
 # -- outputs ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 def test_save_at(step):
     times = [0.37, 1.0, 1.05, 7.3]
@@ -323,7 +330,7 @@ def test_save_at(step):
         assert np.abs(x - reference).max() < 1e-6
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("stages", "order"), [(1, 2), (2, 3), (3, 4), (4, 5)])
 def test_order_of_dense_output(stages, order):
     """O(h^(s+1)) between the steps."""

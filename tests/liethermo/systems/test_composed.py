@@ -72,6 +72,7 @@ def assert_both_laws(solution):
 # -- the field --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_the_almost_poisson_tensor_of_the_paper(seed):
     """``x' = Lambda_K dH`` with the matrix printed in §5, for n_1 = 2 and n_2 = 1."""

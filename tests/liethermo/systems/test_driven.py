@@ -169,7 +169,7 @@ METHODS = [
 ]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_does_not_change_does_no_work(method):
     """Written as H(x, t) it gives the steps of H(x), whatever the slopes handed to the method."""
@@ -180,7 +180,7 @@ def test_an_energy_that_does_not_change_does_no_work(method):
     assert np.abs(timed[..., -1]).max() == 0.0
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_time_is_exact(method):
     """Whatever the slopes handed to the method, t' = 1, where the entropy law and the energy are corrected too."""
@@ -282,6 +282,7 @@ def test_the_derivative_of_a_flow_by_the_amplitude():
     assert np.abs(slope).max() > 0.1
 
 
+@pytest.mark.slow
 def test_what_the_user_sees():
     x, t = np.array([1.0, 0.2]), 0.9
     push = 0.4 * np.sin(RATE * t)

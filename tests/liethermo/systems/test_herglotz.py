@@ -91,6 +91,7 @@ def test_the_legendre_transform_has_the_type_of_its_side():
         assert type(_system(kind, LAGRANGIANS["quadratic"]).hamiltonian_system()) is image
 
 
+@pytest.mark.slow
 def test_closed_forms_stay_closed():
     """What is known of L is known of E_L and of H: their entropy cannot fall, and no equation is solved for v."""
     known = _system(lt.ThermodynamicHerglotz, LAGRANGIANS["kinetic minus potential"])
@@ -150,6 +151,7 @@ def L_d(q0, q1, S0, h):
     return (q1 - q0) @ (q1 - q0) / (2 * h) - h * (q1 + q0) @ (q1 + q0) / 8 - h * GAMMA * S0
 
 
+@pytest.mark.slow
 def test_42():
     """The generic scheme (40)-(41) is (42): 1000 steps, against (42) in extended precision."""
     method = lt.DiscreteHerglotz(L_d)

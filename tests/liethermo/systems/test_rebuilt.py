@@ -31,7 +31,7 @@ def _field(system, x):
     return system.vector_field(x)
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in each_system()])
 def test_fields_and_laws(make):
     system = make()

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import liethermo as lt
 import manifolds as mf
@@ -50,6 +51,7 @@ class Weighted(eqx.Module):
         return 0.5 * jnp.sum(self.weights * mu**2)
 
 
+@pytest.mark.slow
 def test_a_run_sees_parameters_that_were_changed_in_place():
     energy = Weighted(np.array([1.0, 2.0, 3.0]))
     system = lt.LiePoissonSystem(mf.so(3), energy)
@@ -69,6 +71,7 @@ def test_fingerprints():
     assert fingerprint({1}) is None
 
 
+@pytest.mark.slow
 def test_a_method_with_arrays_of_its_own_can_be_compiled():
     system = lt.LiePoissonSystem(mf.so(3), lambda mu: 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0])))
     method = lt.MetriplecticGauss(1, preserve=lt.Quadratic(np.ones(3)))

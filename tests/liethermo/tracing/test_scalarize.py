@@ -272,7 +272,7 @@ def primitives_in(jaxpr) -> set[str]:
     return found
 
 
-@pytest.mark.sampled(46)
+@pytest.mark.sampled(27)
 @pytest.mark.parametrize("name", CASES)
 def test_every_primitive_agrees(name):
     f, *args = CASES[name]
@@ -302,6 +302,7 @@ def test_every_operation_compiles():
         check(program, (a, b), program.evaluate(a, b), [out])
 
 
+@pytest.mark.sampled(25)
 @pytest.mark.parametrize("name", [*UNARY.split(), "acosh", "is_finite", "round", "clamp"])
 def test_special_values_of_one_argument(name):
     f = CASES[name][0] if name in ("round", "clamp", "is_finite") else getattr(lax, name)
@@ -651,14 +652,14 @@ def slopes(system, method):
     )
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", DISSIPATIONS, ids=lambda case: case.name)
 def test_every_dissipation(case):
     f, args = slopes(build(mf.so(3), case), MetriplecticMidpoint())
     agrees(f, *args)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", list(registered_methods()), ids=str)
 def test_every_method(method):
     f, args = slopes(build(mf.so(3), DISSIPATIONS[0]), method)

@@ -94,7 +94,7 @@ DEGREES = [
 ]
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("g", "degrees"), DEGREES, ids=lambda value: getattr(value, "name", str(value)))
 def test_known_degrees_of_generators_which_are_independent(g, degrees):
     generators = [F for degree in (1, 2, 3, 4) for F in casimirs(g, degree)]
@@ -107,7 +107,7 @@ def test_known_degrees_of_generators_which_are_independent(g, degrees):
 # -- which ones ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(9)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("g", REGISTERED, ids=lambda g: g.name)
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_casimirs_are_invariant_and_perturbed_ones_are_not(g, degree):
@@ -180,6 +180,7 @@ steps = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(g=st.sampled_from([mf.so(3), mf.se(2), mf.so(4), mf.gl(2), mf.heisenberg(2), mf.galilei(2)]), steps=steps)
 def test_casimirs_do_not_depend_on_the_basis(g, steps):
@@ -389,6 +390,7 @@ def test_arithmetic_agrees_with_values(F, G, c):
         np.testing.assert_allclose(combined(mu), np.asarray(expected, dtype=float), rtol=1e-11, atol=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(F=polynomials, mask=st.lists(st.sampled_from([0.0, 1.0]), min_size=3, max_size=3))
 def test_derivatives_at_vanishing_components(F, mask):

@@ -50,7 +50,7 @@ DEGREES = [
 """The degrees of the fundamental invariants [Bourbaki, Lie, V, VI]; u(n) and gl(n) have one of degree 1 besides."""
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("g", "degrees"), DEGREES, ids=lambda value: getattr(value, "name", ""))
 def test_generators(g, degrees):
     found = fundamental_invariants(g)

@@ -50,6 +50,7 @@ def test_vectors_and_covectors_in_coordinates(chart):
     assert close(centre, z)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("chart", CHARTS)
 def test_vectors_carried_along(chart):
     space = chart.space

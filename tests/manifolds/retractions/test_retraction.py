@@ -70,7 +70,7 @@ def both(kind, space):
     return chart, mf.retraction(space, "midpoint" if kind == "exp" else f"midpoint_{kind}")
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 def test_identity_at_zero(case):
     """``point(z, 0) = z``, with the derivative the identity: what makes a map a retraction."""
     kind, space, _ = case
@@ -144,7 +144,7 @@ def test_the_paper_s_two_maps():
 # -- domains ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("R", "limit"),
     [

@@ -65,6 +65,7 @@ def sample(space, length=0.7):
     return x, np.asarray(space.from_coordinates(x, c)), np.asarray(space.from_coordinates(x, d))
 
 
+@pytest.mark.slow
 def test_values(twins):
     native, other = twins
     assert (other.dim, other.shape) == (native.dim, native.shape)

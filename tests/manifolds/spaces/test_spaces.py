@@ -107,7 +107,7 @@ def S(request):
 # -- every registered space: points, vectors, metric ------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @given(seed=seeds)
 def test_points(S, seed):
     x = points(S, seed)
@@ -124,7 +124,7 @@ def test_points(S, seed):
         assert not bool(S.belongs(moved, 1e-4).all())
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_tangent_vectors(S, seed):
     x, w = points(S, seed), ambient(S, seed)
@@ -140,6 +140,7 @@ def test_tangent_vectors(S, seed):
     assert close(S.project_tangent(x, projected), projected, *tolerance)
 
 
+@pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_metric(S, seed):
     x, alpha = points(S, seed), ambient(S, seed)
@@ -162,7 +163,7 @@ def lengths(space):
     return (1e-3, 0.5, 0.9 * min(space.injectivity_radius(), 3.0))
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @given(seed=seeds)
 def test_exp_and_log(S, seed):
     x = points(S, seed)
@@ -181,6 +182,7 @@ def test_exp_and_log(S, seed):
     assert largest(S.distance(x, x)) < 1e-14
 
 
+@pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_parallel_transport(S, seed):
     x = points(S, seed)
@@ -373,6 +375,7 @@ def test_a_stiefel_manifold_of_single_columns_is_a_sphere():
 # -- accuracy where formulas break down -------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "space",
     [named(mf.Sphere(2)), named(mf.SpecialOrthogonal(3)), named(mf.SpecialUnitary(2), slow=True)],
@@ -574,7 +577,7 @@ def test_a_vector_that_is_not_tangent():
         space.transport(NORTH, 0 * NORTH, NORTH)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("space", "x", "y", "message"),
     [
@@ -598,6 +601,7 @@ def test_points_at_the_cut_locus(space, x, y, message):
         space.log(x, y)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("space", [mf.SpecialOrthogonal(3), mf.SpecialEuclidean(3, 0.5)], ids=lambda S: S.name)
 def test_a_rotation_by_pi_has_a_logarithm(space):
     n = space.shape[0]
