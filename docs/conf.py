@@ -1,7 +1,9 @@
 """Sphinx configuration."""
 
 import os
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
 
 # The gallery's examples draw without a screen and run on the CPU.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -12,6 +14,13 @@ author = "The liethermo authors"
 copyright = "2026, The liethermo authors"
 release = installed_version("liethermo")
 version = ".".join(release.split(".")[:2])
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+
+from rooms import draw  # noqa: E402
+
+draw(HERE / "generated" / "rooms.svg")
 
 extensions = [
     "sphinx.ext.autodoc",
