@@ -9,7 +9,7 @@ import importlib
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 
-from . import models
+from . import models, testing
 from .dissipation.base import Dissipation
 from .dissipation.double_bracket import DoubleBracket
 from .dissipation.force import EulerPoincareForce
@@ -152,6 +152,7 @@ __all__ = [
     "read_graph",
     "registered_methods",
     "suggest_step",
+    "testing",
 ]
 
 

@@ -4,7 +4,7 @@ Importing this package switches JAX to 64-bit floating point: the laws are kept 
 round them away.
 """
 
-from . import _precision  # noqa: F401
+from . import _precision, testing  # noqa: F401
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
 from .algebras.invariants import TracePolynomial
@@ -150,4 +150,5 @@ __all__ = [
     "so",
     "sp",
     "su",
+    "testing",
 ]

@@ -15,7 +15,7 @@ import manifolds as mf
 from ..dissipation.base import Dissipation, portions
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, as_energy, is_traced
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
 from ..functions.on_spaces import on_points
@@ -70,11 +70,14 @@ class MetriplecticGauss(GaussMethod):
         On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with the Casimirs that the system conserves.
+    moving : tuple of int, optional
+        Which of ``preserve`` are momentum maps, that move the state, and not Casimirs; a run finds out.
     """
 
     functions: tuple[Energy, ...]
     retraction: str | mf.Retraction | None = eqx.field(static=True)
     held: tuple[str, ...] = eqx.field(static=True)
+    moving: tuple[int, ...] | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -82,23 +85,29 @@ class MetriplecticGauss(GaussMethod):
         preserve: Sequence = (),
         retraction: str | mf.Retraction | None = None,
         held: tuple[str, ...] = (),
+        moving: tuple[int, ...] | None = None,
     ):
         self.number = checked_stages(stages)
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
         self.retraction = retraction
         self.held = held
+        self.moving = moving
 
     def on(self, system: System) -> OneStepMethod:
         held = tuple(sorted(system.first_integrals() & system.casimirs().keys()))
-        return in_charts(self._with(lambda C: _seen_on(system, C), held), system, self.retraction, "exp")
+        method = self._with(lambda C: _seen_on(system, C), held)
+        if self.functions and not is_traced((system, method)):
+            moved = at_points(_share_moved, (system, method.functions), system.samples(4)).max(axis=0)
+            method = method._with(lambda C: C, held, tuple(int(i) for i in np.flatnonzero(moved > STILL)))
+        return in_charts(method, system, self.retraction, "exp")
 
     def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled, self.held)
+        return self._with(local.pulled, self.held, self.moving)
 
-    def _with(self, change: Callable, held: tuple[str, ...]) -> MetriplecticGauss:
+    def _with(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
         """The method with its preserved functions changed, holding these of the system."""
-        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -165,7 +174,7 @@ class MetriplecticGauss(GaussMethod):
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
         gradients = [known[name] for name in functions]
-        if functions.keys() <= {ENTROPY, *system.casimirs()}:
+        if functions.keys() <= {ENTROPY, *self._casimirs(system)}:
             off = _projector(system, u, gradients)
             return off(system.poisson.sharp(u, off(dH)))
         off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
@@ -176,7 +185,7 @@ class MetriplecticGauss(GaussMethod):
         dL, lowers = tuple(known[name].discrete for name in own), part.energy_law != "conserved"
         functions = self._kept(system) | (_made_of(system) if lowers else {})
         exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
-        casimirs = {ENTROPY, *system.casimirs()} if part.keeps_casimirs else set()
+        casimirs = {ENTROPY, *self._casimirs(system)} if part.keeps_casimirs else set()
 
         def safe(name: str, C: Energy) -> bool:  # kept by construction
             return name in own or (C.is_quadratic and (exact or name in casimirs))
@@ -196,11 +205,16 @@ class MetriplecticGauss(GaussMethod):
         given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | given
 
+    def _casimirs(self, system: System) -> set[str]:
+        """Names of the Casimirs among what is held."""
+        given = range(len(self.functions)) if self.moving is not None else ()
+        return {*system.casimirs(), *(f"given {i + 1}" for i in given if i not in (self.moving or ()))}
+
     def _symmetries(self, system: System, u) -> jax.Array | None:
         """The directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
         if system.energy.is_quadratic:
             return None
-        casimirs = system.casimirs()
+        casimirs = self._casimirs(system)
         maps = [J for name, J in self._kept(system).items() if J.is_quadratic and name not in casimirs]
         if not maps:
             return None
@@ -224,6 +238,9 @@ class Gradients(NamedTuple):
 
 ENTROPY = "the entropy"
 
+STILL = 1e-10
+"""Largest ``|Pi grad C|``, relative to what Pi does to other covectors, of a function that is a Casimir."""
+
 
 def _made_of(system: System) -> dict[str, Energy]:
     """What the entropy is a function of, by name: Casimirs where all are known and that helps, itself otherwise."""
@@ -244,6 +261,19 @@ def _seen_on(system: System, C: Energy) -> Energy:
     """A preserved function as one of the state vectors of a system."""
     C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
     return recognised(C, system.dim) if system.space is None else C
+
+
+def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
+    """``|Pi grad C|`` of each function relative to ``|Pi grad H|`` and ``|grad C|``: rounding for Casimirs."""
+    system, functions = model
+    system = system.here(x)
+    found = []
+    for C in functions:
+        gradient, random = C.gradient(x), jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))
+        size = jnp.linalg.norm(gradient) * jnp.linalg.norm(system.poisson.sharp(x, random)) / jnp.linalg.norm(random)
+        moved = jnp.linalg.norm(system.poisson.sharp(x, gradient))
+        found.append(jnp.where(size > 0.0, moved / jnp.where(size > 0.0, size, 1.0), 0.0))
+    return jnp.nan_to_num(jnp.stack(found))
 
 
 def _gradients(functions: tuple[Energy, ...], x):

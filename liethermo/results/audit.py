@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from manifolds._tables import Row, table
+
 from ..errors import InputError
 
 if TYPE_CHECKING:
@@ -161,15 +163,8 @@ class Audit:
         return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __str__(self) -> str:
-        width = max(len(row.law) for row in self.rows)
-        verdict = {True: "ok", False: "FAILS", None: "-"}
-        lines = [f"{'law':<{width}}  {'measured':>10}  {'allowed':>9}"]
-        for row in self.rows:
-            allowed = " " * 9 if row.tolerance is None else f"{row.tolerance:9.1e}"
-            lines.append(
-                f"{row.law:<{width}}  {row.value:10.2e}  {allowed}  {verdict[row.passed]:<5} {row.note}".rstrip()
-            )
-        return "\n".join([*lines, self.verdict])
+        rows = (Row(row.law, row.value, row.tolerance, row.passed, row.note) for row in self.rows)
+        return table(rows, ("law", "measured", "allowed"), self.verdict)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._tables import Row, table
+
 from ..dissipation.base import Dissipation, Law
 from ..dissipation.friction_operator import KERNEL
 from ..dissipation.geometry import Geometry
@@ -49,14 +51,12 @@ class CheckReport:
         return all(row.passed is not False for row in self.rows)
 
     def __str__(self) -> str:
-        width = max(len(row.axiom) for row in self.rows)
-        verdict = {True: "ok", False: "FAILS", None: "-"}
-        lines = [f"{'axiom':<{width}}  {'residual':>9}  {'tolerance':>9}  "]
-        for row in self.rows:
-            tolerance = f"{row.tolerance:9.1e}" if row.passed is not None else " " * 9
-            lines.append(f"{row.axiom:<{width}}  {row.residual:9.1e}  {tolerance}  {verdict[row.passed]:<5} {row.note}")
+        rows = (
+            Row(row.axiom, row.residual, None if row.passed is None else row.tolerance, row.passed, row.note)
+            for row in self.rows
+        )
         total = "all axioms hold" if self.passed else "NOT metriplectic"
-        return "\n".join(line.rstrip() for line in [*lines, f"{total} (at {self.points} points)"])
+        return table(rows, ("axiom", "residual", "tolerance"), f"{total} (at {self.points} points)")
 
 
 class Subject(Geometry, Protocol):

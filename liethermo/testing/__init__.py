@@ -1,0 +1,14 @@
+"""The property suites of this package, for methods, dissipations and systems of one's own.
+
+Each ``check_*`` puts an object through what every registered one goes through. It returns a report, or raises
+:class:`PropertyError` with the table of what was measured. Algebras, groups and spaces have theirs in
+:mod:`manifolds.testing`.
+"""
+
+from manifolds.testing import PropertyError, Report
+
+from .dissipations import check_dissipation
+from .methods import check_method
+from .systems import check_system
+
+__all__ = ["PropertyError", "Report", "check_dissipation", "check_method", "check_system"]

@@ -1,0 +1,80 @@
+"""The suite of dissipations."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds.testing import Report, Suite
+
+from ..dissipation.base import Dissipation
+from ..functions.energy import Quadratic
+from ..integrators import MetriplecticGauss, MetriplecticMidpoint
+from ..systems import LiePoissonSystem, System
+from .runs import follow_laws, start_of, step_of
+
+
+def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra | None = None, seed: int = 0) -> Report:
+    """The laws of a dissipation: for discrete gradients in the place of gradients, at points, and along runs.
+
+    Parameters
+    ----------
+    dissipation : Dissipation or System
+        One that acts on the dual of a Lie algebra, or a system that has it.
+    algebra : LieAlgebra, optional
+        Where it is tried, so(3) by default; with an energy that is not quadratic, and a quadratic Casimir for entropy.
+
+    Raises
+    ------
+    PropertyError
+        If it does not keep what it states: its laws, the functions that it is told to preserve.
+    """
+    system = dissipation if isinstance(dissipation, System) else _system(dissipation, algebra or mf.so(3))
+    if system.dissipation is None:
+        raise ValueError("the system has no dissipation")
+    suite = Suite(f"{type(system.dissipation).__name__} in a {system.kind}")
+    random = np.random.default_rng(seed)
+    points = [x for x in system.samples(8, seed) if np.isfinite(np.asarray(system.vector_field(x))).all()]
+    acting, lost, made, size = system.dissipation, 0.0, 0.0, 0.0
+    for x in points:
+        dH, dS, *dL = random.standard_normal((2 + len(acting.preserve), system.dim))
+        force = np.asarray(
+            acting.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))
+        )
+        scale = float(np.linalg.norm(force))
+        lost = max(lost, float(abs(force @ dH) / max(scale * np.linalg.norm(dH), 1e-300)))
+        made = min(made, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
+        size = max(size, scale)
+    if acting.energy_law == "conserved" and system.space is None:
+        suite.small("any vector in the place of grad H is in the kernel", lost, 1.0, 1e-12)
+    if acting.entropy_law == "nondecreasing" and acting.energy_law == "conserved" and system.space is None:
+        suite.small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
+    suite.true("it acts", size > 0.0)
+    report = system.check(seed=seed)
+    for row in report.rows:
+        if row.passed is not None:
+            suite.small(row.axiom, row.residual, 1.0, row.tolerance, row.note)
+    x0 = start_of(system, seed)
+    h = step_of(system, x0)
+    for method in (MetriplecticMidpoint(), MetriplecticGauss(2)):
+        follow_laws(suite, system, method, x0, h, f"{method}: ")
+    return suite.report()
+
+
+def _system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
+    quadratic = g.casimirs(2)
+    if not quadratic:
+        raise ValueError(f"{g.name} has no quadratic Casimir: give a system that has the dissipation")
+    weights = np.linspace(1.0, 2.0, g.dim)
+
+    def energy(mu):
+        return 0.5 * jnp.sum(weights * mu * mu) + 0.1 * jnp.cos(mu[0] + 0.5 * mu[-1])
+
+    entropy = sum((np.asarray(_matrix(F)) for F in quadratic[1:]), np.asarray(_matrix(quadratic[0])))
+    return LiePoissonSystem(g, energy, Quadratic(entropy), dissipation)
+
+
+def _matrix(F) -> np.ndarray:
+    return jax.hessian(F)(jnp.zeros(F.dim))

@@ -1,0 +1,60 @@
+"""What the suites have in common: an object taken apart and put together again, and the laws along a run."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._tables import Row
+from manifolds.testing import Suite
+
+from ..engines.choice import COMPILED_DIM, is_small
+from ..integrators import OneStepMethod
+from ..results.solution import Solution
+from ..runs.integrate import integrate
+from ..systems import System
+from ..tracing.scalarize import UnsupportedPrimitive
+
+STEPS = 40
+
+
+def rebuilt(tree):
+    """The same tree from copies of its leaves, so that no object is the one it was."""
+    leaves, structure = jax.tree_util.tree_flatten(tree)
+    return jax.tree_util.tree_unflatten(structure, [jnp.array(a) if isinstance(a, jax.Array) else a for a in leaves])
+
+
+def start_of(system: System, seed: int) -> np.ndarray:
+    """A random state inside the domain of the system."""
+    for x in system.samples(20, seed):
+        if not system.outside(jnp.asarray(x)) and np.isfinite(np.asarray(system.vector_field(x))).all():
+            return np.asarray(x)
+    raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
+
+
+def step_of(system: System, x0) -> float:
+    """A step in which the state moves by a hundredth of its size."""
+    speed, size = (float(np.linalg.norm(np.asarray(v))) for v in (system.vector_field(x0), x0))
+    return 0.01 * max(size, 1e-3) / speed if speed > 0.0 else 0.01
+
+
+def follow_laws(suite: Suite, system: System, method: OneStepMethod, x0, h: float, label: str = "") -> Solution:
+    """Rows of the audit of a run, of the engines' agreement and of a system that was put together again."""
+    solution = integrate(system, x0, (0.0, STEPS * h), h, method, on_failure="return", engine="array")
+    suite.true(f"{label}run completes", solution.status.ok, solution.status.message if not solution.status.ok else "")
+    audit = solution.audit()
+    for row in audit.rows:
+        if row.passed is not None and row.law not in ("steps taken", "accuracy"):
+            suite.rows.append(Row(f"{label}{row.law}", row.value, row.tolerance, row.passed, row.note))
+    again = integrate(rebuilt(system), x0, (0.0, STEPS * h), h, rebuilt(method), on_failure="return", engine="array")
+    same = np.array_equal(solution.x, again.x) and solution.laws == again.laws
+    suite.true(f"{label}the same to the bit when taken apart and put together", same)
+    if is_small(system, COMPILED_DIM):
+        try:
+            compiled = integrate(system, x0, (0.0, STEPS * h), h, method, on_failure="return", engine="compiled")
+        except UnsupportedPrimitive as error:
+            suite.without(f"{label}engines agree", str(error)[:60])
+        else:
+            suite.equal(f"{label}engines agree", compiled.x[-1], solution.x[-1], 1e-11)
+    return solution

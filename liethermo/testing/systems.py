@@ -1,0 +1,57 @@
+"""The suite of systems."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from manifolds._tables import Row
+from manifolds.testing import Report, Suite
+
+from ..integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod
+from ..systems import System
+from ..tracing.interpret import at_points
+from .runs import follow_laws, rebuilt, start_of, step_of
+
+METHODS = (MetriplecticMidpoint(), MetriplecticGauss(2))
+
+
+def check_system(
+    system: System,
+    x0=None,
+    step: float | None = None,
+    methods: Sequence[OneStepMethod] = METHODS,
+    seed: int = 0,
+) -> Report:
+    """The axioms of a system at random points, and its laws along a run of each method.
+
+    Parameters
+    ----------
+    system : System
+    x0 : array, optional
+        The state that runs start from; a random one by default.
+    step : float, optional
+        By default the state moves by a hundredth of its size in a step.
+    methods : sequence of OneStepMethod
+
+    Raises
+    ------
+    PropertyError
+        If one of the properties does not hold.
+    """
+    suite = Suite(f"{system.kind}")
+    for row in system.check(seed=seed).rows:
+        suite.rows.append(Row(row.axiom, row.residual, row.tolerance, row.passed, row.note))
+    points = system.samples(3, seed)
+    field, again = (at_points(_field, s, points) for s in (system, rebuilt(system)))
+    suite.true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))
+    start = start_of(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
+    h = step_of(system, start) if step is None else step
+    for method in methods:
+        follow_laws(suite, system, method, start, h, f"{method}: ")
+    return suite.report()
+
+
+def _field(system: System, x):
+    return system.vector_field(x)

@@ -1,0 +1,12 @@
+"""The property suites of this package, for algebras, groups and spaces of one's own.
+
+Each ``check_*`` puts an object through what every registered one goes through. It returns a :class:`Report`, or raises
+:class:`PropertyError` with the table of what was measured.
+"""
+
+from .algebras import check_algebra
+from .groups import check_group
+from .report import PropertyError, Report, Suite
+from .spaces import check_space
+
+__all__ = ["PropertyError", "Report", "Suite", "check_algebra", "check_group", "check_space"]

@@ -1,0 +1,79 @@
+"""The suite of state spaces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..spaces.base import Space
+from .report import Report, Suite
+
+BATCH = 4
+
+
+def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1e-12) -> Report:
+    """Points, tangent vectors, metric and, where the space has geodesics, exponential, logarithm and transport.
+
+    Parameters
+    ----------
+    M : Space
+    length : float
+        Of the geodesics that are tried; less than half the injectivity radius is taken in any case.
+    allowed : float
+        Largest residual, relative to the size of the points, squared.
+
+    Raises
+    ------
+    PropertyError
+        If one of the properties does not hold.
+    """
+    suite, random = Suite(M.name), np.random.default_rng(seed)
+    x = np.asarray(M.random(seed, (BATCH,)))
+    c, d = random.standard_normal((2, BATCH, M.dim))
+    u, v = (np.asarray(M.from_coordinates(x, w)) for w in (c, d))
+    noise = random.standard_normal(x.shape)
+    size = max(1.0, float(np.abs(x).max())) ** 2 * max(1, M.dim)
+    suite.true("shape and kind of random points", x.shape == (BATCH, *M.shape) and x.dtype == M.dtype)
+    suite.true("random points are in the space", bool(np.all(M.belongs(x))))
+    suite.small("a point is its own projection", M.project(x) - x, size, allowed)
+    moved = x + 0.01 * noise
+    suite.true("projections are in the space", bool(np.all(M.belongs(M.project(moved)))))
+    if bool(np.all(M.belongs(moved, 1e-4))):
+        suite.without("a point off the space is seen", "every array is a point")
+    suite.small("to_vector, from_vector", M.from_vector(M.to_vector(x)) - x, size, allowed)
+    suite.small("tangent vectors are their own projections", M.project_tangent(x, u) - u, size, allowed)
+    suite.small("coordinates of vectors", np.asarray(M.coordinates(x, u)) - c, size, allowed)
+    frame = np.einsum("ba,ba...->b...", c, M.frame(x))
+    suite.small("the frame spans the coordinates", frame - u, size, allowed)
+    suite.small("the frame is orthonormal", np.asarray(M.inner(x, u, v)) - (c * d).sum(1), size, allowed)
+    suite.small("the metric is symmetric", np.asarray(M.inner(x, u, v)) - np.asarray(M.inner(x, v, u)), size, allowed)
+    suite.small("norms", np.asarray(M.norm(x, u)) ** 2 - np.asarray(M.inner(x, u, u)), size, allowed)
+    axes = tuple(range(-len(M.shape), 0))
+    paired = np.sum(np.asarray(M.flat(x, u)) * v, axis=axes).real
+    suite.small("flat(u) v = <u, v>", paired - np.asarray(M.inner(x, u, v)), size, allowed)
+    suite.small("sharp inverts flat", np.asarray(M.sharp(x, M.flat(x, u))) - u, size, allowed)
+    if not M.geodesics:
+        suite.without("geodesics", "the space has none of its own: its charts project")
+        return suite.report()
+    reach = min(length, 0.45 * M.injectivity_radius(x[0]))
+    across = (reach / np.linalg.norm(c, axis=1)).reshape(-1, *(1,) * len(M.shape)) * u
+    y = np.asarray(M.exp(x, across))
+    size = max(1.0, float(np.abs(x).max()), float(np.abs(y).max())) ** 2 * max(1, M.dim)
+    suite.true("exp is in the space", bool(np.all(M.belongs(y))))
+    suite.small("exp 0", M.exp(x, np.zeros_like(x)) - x, size, allowed)
+    suite.small("log inverts exp", np.asarray(M.log(x, y)) - across, size, 10 * allowed)
+    if M.metric == "left-invariant":
+        suite.without("distance and transport", "one-parameter subgroups are not the geodesics of this metric")
+        return suite.report()
+    suite.small("distance is the length of the geodesic", np.asarray(M.distance(x, y)) - reach, size, 10 * allowed)
+    suite.small(
+        "distance is symmetric", np.asarray(M.distance(y, x)) - np.asarray(M.distance(x, y)), size, 10 * allowed
+    )
+    carried, other = (np.asarray(M.transport(x, across, w)) for w in (u, v))
+    suite.small(
+        "transported vectors are tangent", np.asarray(M.project_tangent(y, carried)) - carried, size, 10 * allowed
+    )
+    kept = np.asarray(M.inner(y, carried, other)) - np.asarray(M.inner(x, u, v))
+    suite.small("transport keeps inner products", kept, size, 10 * allowed)
+    half = np.asarray(M.exp(x, 0.5 * across))
+    suite.small("midpoints", np.asarray(M.midpoint(x, y)) - half, size, 10 * allowed)
+    return suite.report()

@@ -1,0 +1,66 @@
+"""The public suites: what the library has goes through, and broken objects do not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo import testing
+from tests.cases import slow
+
+TRIED = {
+    "killing": lt.KillingDissipation(0.3),
+    "projected": lt.ProjectedMetric(rate=0.2),
+    "sum": lt.KillingDissipation(0.1) + lt.ProjectedMetric(rate=0.1),
+}
+
+
+@pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods()])
+@pytest.mark.sampled(1)
+def test_methods(method):
+    assert testing.check_method(method).passed
+
+
+@pytest.mark.parametrize("name", ["projected", *map(slow, ("killing", "sum"))])
+def test_dissipations(name):
+    assert testing.check_dissipation(TRIED[name]).passed
+
+
+@pytest.mark.parametrize("name", ["rigid_body", *map(slow, ("heavy_top", "damped_oscillator", "thermo_particles"))])
+def test_systems(name):
+    if not hasattr(lt.models, name):
+        pytest.skip("no such model")
+    assert testing.check_system(getattr(lt.models, name)()).passed
+
+
+class Leaking(lt.ProjectedMetric):
+    """Control: half of the projection is left out, so that the energy is lost."""
+
+    def force(self, system, x, dH, dS, dL):
+        return super().force(system, x, dH, dS, dL) + 0.1 * dS
+
+
+def test_a_dissipation_that_loses_energy():
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lt.Quadratic(np.ones(3)), Leaking(rate=0.2), validate=False
+    )
+    with pytest.raises(testing.PropertyError, match=r"any vector in the place of grad H is in the kernel .*FAILS"):
+        testing.check_dissipation(system)
+
+
+class Euler(lt.MetriplecticMidpoint):
+    """Control: the field at the start of the step, which is of first order and keeps nothing."""
+
+    def slopes(self, system, x, low, h, k):
+        return system.vector_field(x)[None]
+
+
+def test_a_method_that_claims_too_much():
+    system = lt.LiePoissonSystem(
+        mf.so(3), lambda m: 0.5 * jnp.sum(m * m * jnp.array([1.0, 0.5, 0.3])) + 0.1 * m[0] ** 4
+    )
+    with pytest.raises(testing.PropertyError) as failure:
+        testing.check_method(Euler(), {"body": (system, [0.8, 0.5, 0.9], 1.0)})
+    failing = {row.name for row in failure.value.report.rows if row.passed is False}
+    assert {"body: order 2", "body: energy drift"} <= failing
