@@ -111,7 +111,8 @@ class Chosen:
             try:
                 compiled = CompiledEngine(system, method)
             except UnsupportedPrimitive as error:
-                self._fall_back(error)
+                if not (auto and error.too_large):  # as little of a surprise as one that is too long to be worth it
+                    self._fall_back(error)
             else:
                 if not auto or long or compiled.operations <= SMALL_PROGRAM:
                     return compiled

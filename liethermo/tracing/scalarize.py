@@ -51,10 +51,12 @@ class UnsupportedPrimitive(LiethermoError):
         The line of the user's code that called for it, as far as JAX knows.
     reason : str
         What about it is not supported, where it is not the primitive as such.
+    too_large : bool
+        Whether the program is only too long to be unrolled.
     """
 
-    def __init__(self, primitive: str, where: str, reason: str = ""):
-        self.primitive, self.where, self.reason = primitive, where, reason
+    def __init__(self, primitive: str, where: str, reason: str = "", too_large: bool = False):
+        self.primitive, self.where, self.reason, self.too_large = primitive, where, reason, too_large
         refusal = f"the compiled engine cannot run the JAX primitive {primitive!r} {reason}".rstrip()
         super().__init__(f"{refusal} ({where})")
 
@@ -267,10 +269,10 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
         except UnsupportedPrimitive as inside:
             if inside.where != UNKNOWN:
                 raise
-            raise UnsupportedPrimitive(inside.primitive, _where(eqn), inside.reason) from None
+            raise UnsupportedPrimitive(inside.primitive, _where(eqn), inside.reason, inside.too_large) from None
         except LimitExceededError:
             reason = f"within the size limit: the program exceeds {b.limit} scalar instructions"
-            raise UnsupportedPrimitive(name, _where(eqn), reason) from None
+            raise UnsupportedPrimitive(name, _where(eqn), reason, too_large=True) from None
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
