@@ -12,8 +12,6 @@ from manifolds._arrays import real_array
 from ..errors import IndefiniteError, InputError
 from .geometry import Geometry
 
-# -- helpers ------------------------------------------------------------------------------------------------------
-
 
 def form_at(form, x):
     """A constant, or a function of the state evaluated at x."""

@@ -264,7 +264,7 @@ def _seen_on(system: System, C: Energy) -> Energy:
 
 
 def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
-    """``|Pi grad C|`` of each function relative to ``|Pi grad H|`` and ``|grad C|``: rounding for Casimirs."""
+    """``|Pi grad C|`` of each function, relative to what Pi makes of another covector of that size."""
     system, functions = model
     system = system.here(x)
     found = []

@@ -104,6 +104,10 @@ class AuditRow:
     passed: bool | None
     note: str = ""
 
+    def as_row(self, label: str = "") -> Row:
+        """The row of a table, its name after a label."""
+        return Row(f"{label}{self.law}", self.value, self.tolerance, self.passed, self.note)
+
 
 ACCURACY, CONSISTENCY = "accuracy", "consistency"
 """The rows that are not about laws."""
@@ -163,8 +167,7 @@ class Audit:
         return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __str__(self) -> str:
-        rows = (Row(row.law, row.value, row.tolerance, row.passed, row.note) for row in self.rows)
-        return table(rows, ("law", "measured", "allowed"), self.verdict)
+        return table([row.as_row() for row in self.rows], ("law", "measured", "allowed"), self.verdict)
 
 
 @dataclass(frozen=True)

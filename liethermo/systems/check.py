@@ -38,6 +38,10 @@ class CheckRow:
     passed: bool | None
     note: str = ""
 
+    def as_row(self) -> Row:
+        """The row of a table."""
+        return Row(self.axiom, self.residual, None if self.passed is None else self.tolerance, self.passed, self.note)
+
 
 @dataclass(frozen=True)
 class CheckReport:
@@ -51,11 +55,8 @@ class CheckReport:
         return all(row.passed is not False for row in self.rows)
 
     def __str__(self) -> str:
-        rows = (
-            Row(row.axiom, row.residual, None if row.passed is None else row.tolerance, row.passed, row.note)
-            for row in self.rows
-        )
         total = "all axioms hold" if self.passed else "NOT metriplectic"
+        rows = [row.as_row() for row in self.rows]
         return table(rows, ("axiom", "residual", "tolerance"), f"{total} (at {self.points} points)")
 
 

@@ -1,22 +1,16 @@
 """A system that is taken apart and put together again is the same system, to the last bit."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.testing.runs import rebuilt
 from liethermo.tracing.interpret import at_points
 from tests.cases import DISSIPATIONS, build, slow
 from tests.liethermo.closed_systems import ISOLATED
 from tests.liethermo.integrators.test_convergence import SYSTEMS
-
-
-def rebuilt(tree):
-    """The same tree from its leaves, copied, so that no object is the one it was."""
-    leaves, structure = jax.tree_util.tree_flatten(tree)
-    return jax.tree_util.tree_unflatten(structure, [jnp.array(a) if isinstance(a, jax.Array) else a for a in leaves])
 
 
 def each_system():

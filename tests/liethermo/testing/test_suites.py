@@ -27,10 +27,8 @@ def test_dissipations(name):
     assert testing.check_dissipation(TRIED[name]).passed
 
 
-@pytest.mark.parametrize("name", ["rigid_body", *map(slow, ("heavy_top", "damped_oscillator", "thermo_particles"))])
+@pytest.mark.parametrize("name", ["rigid_body", *map(slow, ("damped_oscillator", "thermo_particles"))])
 def test_systems(name):
-    if not hasattr(lt.models, name):
-        pytest.skip("no such model")
     assert testing.check_system(getattr(lt.models, name)()).passed
 
 
