@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from liethermo.engines.rules import RULES
+
 from .report import UnavailableError
 
 SOURCES = Path(__file__).parent / "c"
@@ -45,6 +47,12 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get("CC", "cc"))
 
 
+def rules() -> list[str]:
+    """The library's rules, as definitions for the compiler."""
+    names = ("fixed_point", "slow", "shrinking", "floor", "plateau", "steered")
+    return [f"-D{name.upper()}={getattr(RULES, name)!r}" for name in names]
+
+
 @functools.cache
 def program(source: str, *options: str) -> ctypes.CDLL:
     """The library built from a file in ``c/``.
@@ -58,7 +66,7 @@ def program(source: str, *options: str) -> ctypes.CDLL:
     if command is None:
         raise UnavailableError("no C compiler was found; install one, or name it with CC=...")
     target = _folder() / f"{Path(source).stem}{len(os.listdir(_folder()))}.so"
-    arguments = [command, *OPTIONS, *options, str(SOURCES / source), "-o", str(target), "-lm", "-lpthread"]
+    arguments = [command, *OPTIONS, *rules(), *options, str(SOURCES / source), "-o", str(target), "-lm", "-lpthread"]
     built = subprocess.run(arguments, capture_output=True, text=True, check=False)
     if built.returncode != 0:
         raise UnavailableError(f"{source} could not be compiled: {built.stderr.strip().splitlines()[-1]}")

@@ -68,7 +68,7 @@ static inline void solve(const Problem *p, Block *b, double h, Lanes k[N])
     const Lanes size = largest_of(b->x) / h;
     Lanes update = all(INFINITY), best = update;
     Mask active = b->running, stalled = none();
-    for (int made = 1; made <= FIXED_POINT_LIMIT && any(active); made++) {
+    for (int made = 1; made <= FIXED_POINT && any(active); made++) {
         Lanes new[N], change[N];
         slopes(p, b->x, b->low, h, k, new);
         EACH(i) {

@@ -48,7 +48,7 @@ static inline int solve(const Problem *p, const Run *run, double h, double k[N],
     double best = INFINITY;
     int stalled = 0;
     *update = INFINITY;
-    for (int made = 1; made <= FIXED_POINT_LIMIT; made++) {
+    for (int made = 1; made <= FIXED_POINT; made++) {
         double new[N], previous = *update, total = 0.0;
         slopes(p, &s, run->x, run->low, h, k, new);
         *update = 0.0;

@@ -4,6 +4,7 @@
 
    -DSCHEME says which. V = (x_1 - x_0)/h is known outright; s = (S_1 - S_0)/h, by Newton's method, is what is iterated. */
 
+#undef STEERED
 #define STEERED INFINITY /* none of them keeps the energy to rounding */
 #include <math.h>
 

@@ -22,39 +22,9 @@ from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-
-EPS = float(np.finfo(np.float64).eps)
+from .rules import EPS, RULES, Rules
 
 RUNNING, NOT_CONVERGED, NON_FINITE = 0, 1, 2
-
-FIXED_POINT_LIMIT = NEWTON_LIMIT = 60
-NEWTON_REUSE = 4
-"""Iterations with one factorisation before the Jacobian is taken afresh."""
-
-HALVINGS = 8
-"""Times that a Newton step is halved until the equations are solved better than before, in the second attempt. Whole
-steps come first: where halved ones get stuck in a valley of the misfit, whole ones leap out of it."""
-
-SLOW = 0.6
-"""Contraction rate above which fixed-point iteration is given up for Newton's."""
-
-SHRINKING = 0.8
-"""An update above this fraction of the smallest so far has not shrunk: rounding makes the iterates cycle, and the
-cycle itself may still converge, by parts in 1e9."""
-
-FLOOR = 1e-5 * EPS
-"""Update below which nothing is gained, relative to ``|x|/h + |k|``: even of one sign, errors of this size change the
-energy by 2e-15 in 1e6 steps. (Stopping at one eps lets it drift by 4e-14.)"""
-
-PLATEAU = 1e3 * EPS
-"""Largest update at which an iteration that has stopped shrinking counts as converged, relative to ``|x|/h + |k|``.
-
-Rounding in the vector field leaves a few eps; a conditioning of 100 is allowed for. Near a rest that lies at the origin
-this size vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the
-slopes are rounded."""
-
-VANISHED = 1e-280
-"""Size, of a state over a step, that is none: below it lie the numbers that have lost their digits."""
 
 DENSE_LIMIT = 12_000
 """Unknowns of a step up to which a full Jacobian matrix is formed (1.2 GB); larger ones have fixed-point iteration \
@@ -92,36 +62,39 @@ class Iteration(NamedTuple):
         infinite, zero, none = jnp.asarray(jnp.inf), jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
         return cls(k, infinite, infinite, none, zero, none)
 
-    def after(self, k) -> Iteration:
+    def after(self, k, rules: Rules) -> Iteration:
         update = jnp.max(jnp.abs(k - self.k))
         rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
-        stalled = jnp.where(update < SHRINKING * self.best, 0, self.stalled + 1)
+        stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
         return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
 
-    def settled(self, scale, misfit=jnp.inf, noise=0.0) -> jax.Array:
+    def settled(self, scale, rules: Rules, misfit=jnp.inf, noise=0.0) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
 
         Small beside the scale of the slopes and the state; or the misfit is, beside the ``noise`` that slopes have.
         """
-        small = (self.update <= PLATEAU * scale) | (misfit <= PLATEAU * noise)
-        return (self.update <= FLOOR * scale) | ((self.stalled >= 2) & small)
+        small = (self.update <= rules.plateau * scale) | (misfit <= rules.plateau * noise)
+        return (self.update <= rules.floor * scale) | ((self.stalled >= 2) & small)
+
+    def stands(self, scale, rules: Rules, noise=0.0) -> tuple[jax.Array, jax.Array]:
+        """How a fixed-point iteration stands: whether it has converged, and whether to go on."""
+        slow = (self.made >= 3) & (self.rate > rules.slow) & (self.best > rules.plateau * jnp.maximum(scale, noise))
+        finite = jnp.isfinite(self.update)
+        hopeless = slow | ((self.made > 0) & ~finite)
+        settled = self.settled(scale, rules, self.update, noise)
+        return settled & finite, ~settled & ~hopeless & (self.made < rules.fixed_point)
 
 
-def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0) -> Solved:
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0, rules: Rules = RULES) -> Solved:
     """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
 
-    def settled(s: Iteration):
-        return s.settled(scale(s.k), s.update, noise)
-
     def goes_on(s: Iteration):
-        slow = (s.made >= 3) & (s.rate > SLOW) & (s.best > PLATEAU * jnp.maximum(scale(s.k), noise))
-        hopeless = slow | ((s.made > 0) & ~jnp.isfinite(s.update))
-        return ~settled(s) & ~hopeless & (s.made < FIXED_POINT_LIMIT)
+        return s.stands(scale(s.k), rules, noise)[1]
 
-    s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k)), Iteration.begin(guess))
-    finite = jnp.isfinite(s.update)
+    s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k), rules), Iteration.begin(guess))
+    converged = s.stands(scale(s.k), rules, noise)[0]
     noise = jnp.zeros(()) + noise
-    return Solved(s.k, settled(s) & finite, finite, s.update, s.made, jnp.zeros_like(s.made), noise)
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), noise)
 
 
 def noise_of(system: System, x) -> jax.Array:
@@ -130,35 +103,40 @@ def noise_of(system: System, x) -> jax.Array:
 
 
 def solve_stages(
-    slopes: Callable, guess: jax.Array, scale: Callable, jacobian: Callable, noise: Callable = lambda: jnp.zeros(())
+    slopes: Callable,
+    guess: jax.Array,
+    scale: Callable,
+    jacobian: Callable,
+    noise: Callable = lambda: jnp.zeros(()),
+    rules: Rules = RULES,
 ) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``.
 
     ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``, and
     ``noise()`` the size at which the slopes are rounded, asked for where fixed-point iteration fails.
     """
-    first = fixed_point(slopes, guess, scale)
+    first = fixed_point(slopes, guess, scale, rules=rules)
     done = first.converged
     size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
     if guess.size > DENSE_LIMIT:
-        again = jax.lax.cond(done, lambda: first, lambda: fixed_point(slopes, first.k, scale, size))
+        again = jax.lax.cond(done, lambda: first, lambda: fixed_point(slopes, first.k, scale, size, rules))
         return again._replace(fixed_point=first.fixed_point + jnp.where(done, 0, again.fixed_point))
 
     def misfit(k):
         return slopes(k) - k
 
     def lost(s: Iteration, damped):
-        return (s.made >= jnp.where(damped, 2, 1) * NEWTON_LIMIT) | ~jnp.isfinite(jnp.sum(s.k))
+        return (s.made >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
 
     def unsolved(s: Iteration, found):
-        return ~done & ~s.settled(scale(s.k), jnp.max(jnp.abs(found)), size)
+        return ~done & ~s.settled(scale(s.k), rules, jnp.max(jnp.abs(found)), size)
 
     def improved(k, step, size, plateau, damped):
         """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
 
         def worse(carry):
             factor, found = carry
-            halve = damped & (factor > 0.5**HALVINGS) & (factor * jnp.max(jnp.abs(step)) > plateau)
+            halve = damped & (factor > 0.5**rules.halvings) & (factor * jnp.max(jnp.abs(step)) > plateau)
             return (factor > 1.0) | (~(jnp.linalg.norm(found) < size) & halve)
 
         def halved(carry):
@@ -178,13 +156,13 @@ def solve_stages(
         def reuse(carry):
             inner, found, _ = carry
             step = (inverse @ found.ravel()).reshape(guess.shape)
-            k, found, whole = improved(inner.k, step, jnp.linalg.norm(found), PLATEAU * scale(inner.k), damped)
-            inner = inner.after(k)
-            return inner, found, jnp.where(whole, inner.made - before, NEWTON_REUSE)
+            k, found, whole = improved(inner.k, step, jnp.linalg.norm(found), rules.plateau * scale(inner.k), damped)
+            inner = inner.after(k, rules)
+            return inner, found, jnp.where(whole, inner.made - before, rules.reuse)
 
         def goes_on(carry):
             inner, found, used = carry
-            fresh = (used == 0) | ((used < NEWTON_REUSE) & (inner.rate < 0.3))
+            fresh = (used == 0) | ((used < rules.reuse) & (inner.rate < rules.stale))
             return fresh & unsolved(inner, found) & ~lost(inner, damped)
 
         s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
@@ -199,7 +177,7 @@ def solve_stages(
     k = jnp.where(done, first.k, second.k)
     converged = ~unsolved(second, found) & jnp.isfinite(jnp.sum(k))
     residual = jnp.where(done, first.residual, second.update)
-    size = jnp.where(second.settled(scale(second.k)), 0.0, size)
+    size = jnp.where(second.settled(scale(second.k), rules), 0.0, size)
     return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made, size)
 
 
@@ -254,8 +232,7 @@ class State(eqx.Module):
     entropy_sensitivity: jax.Array
 
 
-@program
-def begin(system: System, method: OneStepMethod, x) -> State:
+def first_state(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)
     energy, entropy = values(system, x)
@@ -286,7 +263,10 @@ def begin(system: System, method: OneStepMethod, x) -> State:
     )
 
 
-def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
+begin = program(first_state)
+
+
+def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES) -> State:
     """One step; where it fails the state is left as it was, with a status."""
 
     def jacobian(k):
@@ -295,19 +275,24 @@ def take_step(system: System, method: OneStepMethod, state: State, h) -> State:
     def noise():
         return noise_of(system, state.x)
 
-    return conclude(system, method, state, h, solve_stages(*equations(system, method, state, h), jacobian, noise))
+    solved = solve_stages(*equations(system, method, state, h, rules), jacobian, noise, rules)
+    return conclude(system, method, state, h, solved)
 
 
-def equations(system: System, method: OneStepMethod, state: State, h) -> tuple[Callable, jax.Array, Callable]:
+def equations(
+    system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES
+) -> tuple[Callable, jax.Array, Callable]:
     """What a step has to solve, ``k = slopes(k)``: the slopes, a guess of k, and the size of what is rounded."""
 
     def slopes(k):
         return method.slopes(system, state.x, state.low, h, k)
 
-    def scale(k):
-        return jnp.max(jnp.abs(state.x)) / h + jnp.max(jnp.abs(k)) + VANISHED
+    return slopes, method.predict(state.k, state.before), lambda k: scale_of(state.x, h, k, rules)
 
-    return slopes, method.predict(state.k, state.before), scale
+
+def scale_of(x, h, k, rules: Rules = RULES):
+    """What updates of slopes are measured against."""
+    return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k)) + rules.vanished
 
 
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
@@ -348,24 +333,24 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 
-def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
+def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules = RULES):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
     Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
     """
     h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
-    return _advance(system, method, state, h, saves, every, capacity)
+    return _advance(system, method, state, h, saves, every, capacity, rules)
 
 
 @program
-def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int):
+def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules):
     def one_save(state: State, index):
         target = state.step + every
 
         def goes_on(s: State):
             return (s.status == RUNNING) & (s.step < target) & (index < saves)
 
-        state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h), state)
+        state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h, rules), state)
         reached = (state.status == RUNNING) & (index < saves)
         return state, (state.x, state.energy, state.entropy, reached)
 
@@ -377,22 +362,22 @@ class ArrayEngine:
 
     name = "array"
 
-    def __init__(self, system: System, method: OneStepMethod):
-        self.system, self.method = system, method
+    def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
+        self.system, self.method, self.rules = system, method, rules
 
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
 
     def advance(self, state: State, h, saves, every, capacity: int):
-        return advance(self.system, self.method, state, h, saves, every, capacity)
+        return advance(self.system, self.method, state, h, saves, every, capacity, self.rules)
 
     def step(self, state: State, h) -> State:
-        return _one_step(self.system, self.method, state, jnp.asarray(h))
+        return _one_step(self.system, self.method, state, jnp.asarray(h), self.rules)
 
 
 @program
-def _one_step(system, method, state, h):
-    return take_step(system, method, state, h)
+def _one_step(system, method, state, h, rules):
+    return take_step(system, method, state, h, rules)
 
 
 def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
@@ -482,10 +467,6 @@ def _unit(v):
     return v / jnp.where(length > 0.0, length, 1.0)
 
 
-STEERED = 4 * EPS
-"""Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself."""
-
-
 def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
     """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are.
 
@@ -508,7 +489,7 @@ def _steering(system: System, x, low, energy, first_energy):
     error = (energy - first_energy) + jnp.dot(gradient, low)
     size = system.energy.sensitivity(x)
     most = 0.25 * EPS * size
-    amount = jnp.where(jnp.abs(error) > STEERED * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
+    amount = jnp.where(jnp.abs(error) > RULES.steered * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
     direction = system.raised(x, gradient)
     square = jnp.dot(gradient, direction)
     return -direction * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))

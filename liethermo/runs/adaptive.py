@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..engines import array
+from ..engines.rules import RULES
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
@@ -172,7 +173,7 @@ def judged(growth: Growth, system: System, method, state, new, h: float) -> tupl
 def allowed_error(step: Adaptive, state, new) -> float:
     """The largest local error."""
     size = max(float(np.abs(state.x).max()), float(np.abs(new.x).max()))
-    return max(step.atol + step.rtol * size, array.VANISHED)
+    return max(step.atol + step.rtol * size, RULES.vanished)
 
 
 def first_step(state, length: float) -> float:

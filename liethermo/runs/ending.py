@@ -9,6 +9,7 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import Chosen
+from ..engines.rules import RULES
 from ..results.status import Stats, Status
 from .adaptive import Adaptive
 
@@ -62,7 +63,7 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, ca
     if code == array.NOT_CONVERGED:
         message = (
             f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
-            f"relative to the state (wanted: rounding, below {array.PLATEAU:.0e}). "
+            f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). "
             + _advice(engine, state, h, capacity)
         )
         return Status("not_converged", message, step, now, residual)

@@ -19,7 +19,7 @@ import numpy as np
 from ..engines import array
 from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..engines.compiled import stepper as compiled
-from ..engines.compiled.stepper import Form
+from ..engines.compiled.form import Form, numbers_of
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.audit import Audit, AuditRow, Rounding, Tolerances, accuracy_row
@@ -430,7 +430,7 @@ def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, 
     cores, stop = len(os.sched_getaffinity(0)), threading.Event()
     size = len(states)
     portion = min(BATCH, LANES * math.ceil(size / (LANES * 4 * cores)))
-    own = compiled.numbers_of(method)
+    own = numbers_of(method)
     first_member = np.append(family.flat(slice(0, 1), 1)[0], own)
     varies = np.append(family.varies, np.zeros(len(own), dtype=bool))
     stepper = compiled.stepper_of(family.form, first_member, method, LANES, varies)

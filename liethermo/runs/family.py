@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines.compiled.stepper import Form
+from ..engines.compiled.form import Form
 from ..errors import InputError
 from ..systems import System
 from ..tracing.remembered import fingerprint

@@ -100,11 +100,10 @@ def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Arra
 
     def solve(dynamic, guess):
         system, method, x, low, h = eqx.combine(dynamic, static)
-        size = jnp.max(jnp.abs(x))
         solved = array.solve_stages(
             lambda k: slopes(dynamic, k),
             guess,
-            lambda k: size / h + jnp.max(jnp.abs(k)) + array.VANISHED,
+            lambda k: array.scale_of(x, h, k),
             lambda k: method.jacobian(system, x, low, h, k),
             lambda: array.noise_of(system, x),
         )

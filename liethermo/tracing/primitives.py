@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
@@ -28,86 +29,43 @@ class Instruction(NamedTuple):
     args: tuple[Scalar, ...]
 
 
-ELEMENTARY = {
-    "abs": "abs({0})",
-    "sign": "np.sign({0})",
-    "sqrt": "np.sqrt({0})",
-    "cbrt": "np.cbrt({0})",
-    "exp": "np.exp({0})",
-    "exp2": "np.exp2({0})",
-    "expm1": "np.expm1({0})",
-    "log": "np.log({0})",
-    "log1p": "np.log1p({0})",
-    "sin": "np.sin({0})",
-    "cos": "np.cos({0})",
-    "tan": "np.tan({0})",
-    "asin": "np.arcsin({0})",
-    "acos": "np.arccos({0})",
-    "atan": "np.arctan({0})",
-    "atan2": "np.arctan2({0}, {1})",
-    "sinh": "np.sinh({0})",
-    "cosh": "np.cosh({0})",
-    "tanh": "np.tanh({0})",
-    "asinh": "np.arcsinh({0})",
-    "acosh": "np.arccosh({0})",
-    "atanh": "np.arctanh({0})",
-    "erf": "np.float64(math.erf({0}))",
-    "erfc": "np.float64(math.erfc({0}))",
-    "floor": "np.floor({0})",
-    "ceil": "np.ceil({0})",
-    "is_finite": "np.isfinite({0})",
-    "eq": "{0} == {1}",
-    "ne": "{0} != {1}",
-    "lt": "{0} < {1}",
-    "le": "{0} <= {1}",
-    "gt": "{0} > {1}",
-    "ge": "{0} >= {1}",
-    "and": "{0} & {1}",
-    "or": "{0} | {1}",
-    "xor": "{0} ^ {1}",
+def _truncated(a) -> np.ndarray:
+    """As XLA converts to integers: NaN to 0, and what is too large to the nearest one."""
+    a = np.asarray(a, dtype=np.float64)
+    inside = np.abs(a) < 2.0**63
+    outside = np.where(a != a, 0, np.where(a < 0.0, -(2**63), 2**63 - 1))
+    return np.where(inside, np.where(inside, a, 0.0).astype(np.int64), outside)
+
+
+ELEMENTARY: dict[str, Callable[..., Any]] = {
+    **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
+    **{name: getattr(np, name) for name in "sinh cosh tanh floor ceil".split()},
+    **{f"a{name}": getattr(np, f"arc{name}") for name in "sin cos tan tan2 sinh cosh tanh".split()},
+    "erf": scipy.special.erf,
+    "erfc": scipy.special.erfc,
+    "is_finite": np.isfinite,
+    **{name: getattr(operator, name) for name in "eq ne lt le gt ge xor".split()},
+    "and": operator.and_,
+    "or": operator.or_,
 }
 """Operations that are primitives of the same name, with nothing to simplify."""
 
-OPERATIONS = {
-    **ELEMENTARY,
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
-    "neg": "-{0}",
-    "pow": "{0} ** {1}",
-    "rem": "np.fmod({0}, {1})",
-    "trunc": "np.trunc({0})",
-    "rint": "np.rint({0})",
-    "max": "{0} if {0} > {1} or {0} != {0} else {1}",  # like XLA's, NaN if either is
-    "min": "{0} if {0} < {1} or {0} != {0} else {1}",
-    "not": "not {0}",
-    "select": "{1} if {0} else {2}",
-    "float": "np.float64({0})",
-    "int": "np.int64({0})",
-    # XLA converts NaN to 0 and what is too large to the nearest integer; the C conversion leaves both undefined.
-    "truncate": "np.int64({0}) if abs({0}) < 2.0**63 else np.int64(0 if {0} != {0} else "
-    "-9223372036854775808 if {0} < 0.0 else 9223372036854775807)",
-}
-"""What each operation means, as Python; numba compiles the same text with ``error_model="numpy"``."""
-
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    op: eval(f"lambda a=0, b=0, c=0: {text.format('a', 'b', 'c')}", {"np": np, "math": math})
-    for op, text in OPERATIONS.items()
-}
-
-INTERPRETED: dict[str, Callable[..., Any]] = FUNCTIONS | {
-    "erf": scipy.special.erf,
-    "erfc": scipy.special.erfc,
-    "max": np.maximum,
+OPERATIONS: dict[str, Callable[..., Any]] = ELEMENTARY | {
+    **{name: getattr(operator, name) for name in "add sub mul neg".split()},
+    "div": operator.truediv,
+    "pow": operator.pow,
+    "rem": np.fmod,
+    "trunc": np.trunc,
+    "rint": np.rint,
+    "max": np.maximum,  # like XLA's, NaN if either is
     "min": np.minimum,
     "not": np.logical_not,
     "select": np.where,
     "float": lambda a: np.asarray(a, dtype=np.float64),
     "int": lambda a: np.asarray(a, dtype=np.int64),
-    "truncate": np.vectorize(FUNCTIONS["truncate"], otypes=[np.int64]),
+    "truncate": _truncated,
 }
-"""The same on NumPy arrays."""
+"""What each operation means, on numbers and on NumPy arrays of them."""
 
 TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 """Operations on numbers that give a truth value."""
@@ -260,8 +218,8 @@ class Builder:
 def fold(op: str, *args: Scalar) -> Scalar:
     """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
     with np.errstate(all="ignore"):
-        value = FUNCTIONS[op](*(np.float64(a) if type(a) is float else a for a in args))
-    return value.item() if isinstance(value, np.generic) else value
+        value = OPERATIONS[op](*(np.float64(a) if type(a) is float else a for a in args))
+    return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 
 # -- arrays of scalars ----------------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from ..errors import InputError, LiethermoError
 from .primitives import (
-    INTERPRETED,
     OF_TESTS,
     OPERATIONS,
     PARAMETERS,
@@ -98,7 +97,7 @@ class Program:
             values.update(zip(names, np.moveaxis(x.reshape(*front, -1), -1, 0), strict=True))
         with np.errstate(all="ignore"):
             for target, op, args in self.instructions:
-                values[target] = INTERPRETED[op](*(values[a] if type(a) is str else a for a in args))
+                values[target] = OPERATIONS[op](*(values[a] if type(a) is str else a for a in args))
 
         def gathered(entries, shape):
             columns = [np.broadcast_to(values[a] if type(a) is str else a, front) for a in entries]
@@ -158,54 +157,6 @@ class Program:
         instructions, renamed = _live(early, handed)
         first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
         return first, Program((*self.inputs, tuple(handed)), tuple(rest), self.outputs, self.shapes)
-
-    def body(self, sources: Sequence[str], targets: Sequence[str], prefix: str = "") -> list[str]:
-        """The program as lines of Python, to be placed in a function that numba compiles.
-
-        All inputs are read before any output is written, so the two may overlap.
-
-        Parameters
-        ----------
-        sources : sequence of str
-            An expression for each entry of the inputs, all arrays one after another.
-        targets : sequence of str
-            What to assign each entry of the outputs to, likewise.
-        prefix : str
-            Put before the name of every variable.
-        """
-        names = [name for entries in self.inputs for name in entries]
-        results = [a for entries in self.outputs for a in entries]
-        used = {a for instruction in self.instructions for a in instruction.args} | set(results)
-
-        def text(a: Scalar) -> str:
-            return prefix + a if isinstance(a, str) else _number(a)
-
-        def line(i: Instruction) -> str:
-            args = [text(a) for a in i.args]
-            if i.op in (
-                "select",
-                "max",
-                "min",
-            ):  # a plain float could not divide by zero in Python
-                args = [f"np.float64({t})" if isinstance(a, float) else t for a, t in zip(i.args, args, strict=True)]
-            return f"{prefix}{i.target} = {OPERATIONS[i.op].format(*args)}"
-
-        loads = [f"{prefix}{name} = {source}" for name, source in zip(names, sources, strict=True) if name in used]
-        lines = [line(i) for i in self.instructions]
-        stores = [f"{target} = {text(a)}" for target, a in zip(targets, results, strict=True)]
-        return loads + lines + stores
-
-    def source(self, arrays: int | None = None, name: str = "program") -> str:
-        """Python source of ``def name(x, p, out)`` on flat arrays, for numba with ``error_model="numpy"``.
-
-        It uses ``np`` and ``math``. The first ``arrays`` input arrays, by default all, are read from x, one after
-        another, the others from p.
-        """
-        sources = []
-        for array_name, group in ("x", self.inputs[:arrays]), ("p", self.inputs[len(self.inputs[:arrays]) :]):
-            sources += [f"{array_name}[{i}]" for i in range(sum(map(len, group)))]
-        targets = [f"out[{i}]" for i in range(sum(map(len, self.outputs)))]
-        return "\n    ".join([f"def {name}(x, p, out):", *self.body(sources, targets), "return"]) + "\n"
 
 
 def scalarize(closed: ClosedJaxpr, known: Sequence | None = None, limit: int = LIMIT) -> Program:
@@ -405,13 +356,6 @@ def _live(
                 renamed[stack.pop()] = f"t{len(order)}"
                 order.append(Instruction(f"t{len(order)}", instruction.op, args))
     return tuple(order), renamed
-
-
-def _number(a: float) -> str:
-    """A number as Python source, safe inside any expression."""
-    if isinstance(a, float) and not math.isfinite(a):
-        return "np.nan" if a != a else "np.inf" if a > 0 else "(-np.inf)"
-    return repr(a) if not repr(a).startswith("-") else f"({a!r})"
 
 
 def _where(eqn) -> str:

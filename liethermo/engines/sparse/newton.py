@@ -8,6 +8,7 @@ Newton iteration runs on the host, where SciPy factorises; all else is the array
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -19,16 +20,11 @@ from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.programs import program
 from .. import array
+from ..rules import RULES
 from .linear import Compression, Inverse
 
-LIMIT = 80
-"""Newton iterations: cheap ones, most of which use factors that are there already."""
-
-HALVINGS = 12
-"""Times that a Newton step is halved before the iteration is given up."""
-
-STALE = 0.1
-"""Contraction rate above which the Jacobian matrix is taken afresh; it is kept from step to step otherwise."""
+PATIENT = replace(RULES, newton=80, halvings=12, stale=0.1)
+"""Newton iterations are cheap here: most use factors that are there already, kept from step to step."""
 
 
 class SparseEngine:
@@ -87,12 +83,12 @@ class SparseEngine:
         k, misfit, scale = _better_start(self.system, self.method, state, h)
         s, renew = array.Iteration.begin(k), float(h) != self._h
         noise = jnp.zeros(())
-        while not self._settled(s, scale, misfit, noise) and int(s.made) < LIMIT:
+        while not self._settled(s, scale, misfit, noise) and int(s.made) < PATIENT.newton:
             if renew or self._inverse is None:
                 self._inverse, self._h = self._inverted(state, h, s.k), float(h)
                 if self._inverse is None:
                     break
-            found = self._improved(state, h, s, misfit, scale, self._inverse, HALVINGS if renew else 1)
+            found = self._improved(state, h, s, misfit, scale, self._inverse, PATIENT.halvings if renew else 1)
             if found is None and renew:
                 s = s._replace(stalled=jnp.asarray(2))  # no step, however short, solves the equations better
                 noise = _noise(self.system, state.x)
@@ -100,8 +96,8 @@ class SparseEngine:
             renew = found is None
             if found is not None:
                 s, misfit, scale = found
-                renew = float(s.rate) > STALE and float(s.update) > array.PLATEAU * float(scale)
-            if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale)):
+                renew = float(s.rate) > PATIENT.stale and float(s.update) > PATIENT.plateau * float(scale)
+            if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale, PATIENT)):
                 noise = _noise(self.system, state.x)
         defined = bool(jnp.isfinite(misfit).all())
         return array.Solved(
@@ -111,12 +107,12 @@ class SparseEngine:
             residual=s.update,
             fixed_point=jnp.asarray(before),
             newton=s.made,
-            noise=jnp.where(s.settled(scale), 0.0, noise),
+            noise=jnp.where(s.settled(scale, PATIENT), 0.0, noise),
         )
 
     @staticmethod
     def _settled(s: array.Iteration, scale, misfit, noise) -> bool:
-        return bool(s.settled(scale, jnp.max(jnp.abs(misfit)), noise))
+        return bool(s.settled(scale, PATIENT, jnp.max(jnp.abs(misfit)), noise))
 
     def _improved(self, state, h, s: array.Iteration, misfit, scale, inverse: Inverse, attempts: int):
         """After a Newton step, halved until the equations are solved better than before; None if that fails.
@@ -131,9 +127,9 @@ class SparseEngine:
             k = s.k - step
             found, new_scale = _misfit(self.system, self.method, state, h, k)
             new_size = float(jnp.linalg.norm(found))
-            rounding = float(np.abs(step).max()) <= array.PLATEAU * float(scale)
+            rounding = float(np.abs(step).max()) <= PATIENT.plateau * float(scale)
             if new_size < size or (rounding and np.isfinite(new_size)):
-                return s.after(k), found, new_scale
+                return s.after(k, PATIENT), found, new_scale
             step = 0.5 * step
         return None
 

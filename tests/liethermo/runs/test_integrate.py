@@ -10,6 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
+from liethermo.engines.rules import RULES
 from liethermo.runs import run as loop
 
 BODY = lt.models.rigid_body()
@@ -118,7 +119,7 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
         lt.integrate(stiff, [0.3, 1.0, -0.2], (0.0, 500.0), 50.0)
     solution = caught.value.solution
     assert (solution.status.code, solution.status.step, solution.status.time) == ("not_converged", 0, 0.0)
-    assert solution.status.residual > array.PLATEAU
+    assert solution.status.residual > RULES.plateau
     assert np.array_equal(solution.x, [[0.3, 1.0, -0.2]])
     assert not solution.audit().passed
     assert isinstance(caught.value, ArithmeticError)

@@ -1,5 +1,6 @@
 """A study in an ordinary loop: closures made anew find what was compiled for those before, and nothing piles up."""
 
+import gc
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.tracing import programs, traced
 from liethermo.tracing.remembered import Latest
+from tests.machine_code import memory_maps
 
 COMMON = """
 import resource, sys, time
@@ -194,20 +196,23 @@ def test_a_family_built_by_a_new_function_each_time():
     assert len(compiled._steppers) == before
 
 
-def test_machine_code_that_cannot_be_unloaded_is_bounded(monkeypatch):
-    """Of programs that do differ; "auto" goes on with the array engine, and says so."""
-    from liethermo.engines.choice import CompiledEngineWarning
-    from liethermo.engines.compiled import module_cache
+@pytest.mark.slow
+def test_a_thousand_programs_that_differ(monkeypatch):
+    """Machine code is unloaded with the steppers that are dropped."""
     from liethermo.engines.compiled import stepper as compiled
 
-    monkeypatch.setattr(module_cache, "_names", {"another"})
-    monkeypatch.setattr(module_cache, "MOST_MODULES", 1)
-    monkeypatch.setattr(compiled, "_steppers", Latest(2))
-    system = lt.MetriplecticSystem(None, lambda x: jnp.sin(3.0 * x[0]), dim=1)
-    with pytest.raises(lt.LiethermoError, match="cannot be unloaded"):
-        lt.integrate(system, [0.3], (0.0, 0.2), 0.1, engine="compiled")
-    with pytest.warns(CompiledEngineWarning, match="cannot be unloaded"):
-        assert lt.integrate(system, [0.3], (0.0, 0.2), 0.1).provenance["engine"] == "array"
+    monkeypatch.setattr(compiled, "_steppers", Latest(4))
+
+    def run(i):
+        system = lt.MetriplecticSystem(None, lambda x: jnp.sin(x[0]) ** (i + 3), dim=1, validate=False)
+        return lt.integrate(system, [0.3], (0.0, 0.2), 0.1, engine="compiled").status.ok
+
+    assert all(map(run, range(20)))
+    gc.collect()
+    before = memory_maps()
+    assert all(map(run, range(20, 60)))
+    gc.collect()
+    assert memory_maps() <= before + 400
 
 
 class Spring(eqx.Module):

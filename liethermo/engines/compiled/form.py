@@ -1,0 +1,63 @@
+"""What systems and methods are to the compiled engine: a form, which is compiled, and parameters, its arguments."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ...integrators import OneStepMethod
+from ...systems import System
+
+
+@dataclass(frozen=True)
+class Form:
+    """What systems, or methods, have in common that differ in their parameters.
+
+    Attributes
+    ----------
+    key : hashable
+        The same for the same form.
+    shapes : tuple of shapes
+        Of the parameters, which are arrays.
+    rebuild : function from a list of arrays to one of them
+    """
+
+    key: Any
+    shapes: tuple[tuple[int, ...], ...]
+    rebuild: Callable[[list], Any] = field(compare=False)
+
+    @classmethod
+    def of(cls, system: System | OneStepMethod) -> Form:
+        """The form of a system or method, its parameters being the arrays among its leaves."""
+        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+        leaves, structure = jax.tree_util.tree_flatten(dynamic)
+        functions, outline = jax.tree_util.tree_flatten(static)
+        return cls(
+            (outline, tuple(functions)),
+            tuple(np.shape(leaf) for leaf in leaves),
+            lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
+        )
+
+    @property
+    def size(self) -> int:
+        """How many numbers the parameters are."""
+        return sum(map(math.prod, self.shapes))
+
+    def build(self, p) -> Any:
+        """The one with the parameters p, shape (size,), all arrays one after another."""
+        ends = list(itertools.accumulate(map(math.prod, self.shapes)))
+        arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
+        return self.rebuild(arrays)
+
+
+def numbers_of(tree: System | OneStepMethod) -> np.ndarray:
+    """The parameters of a system or a method, shape (p,)."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
+    return np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])

@@ -1,0 +1,209 @@
+"""The step loop of the compiled engine: the array engine's own steps, as scalar programs, on lanes that go together.
+
+A *block* of trajectories advances together, one SIMD lane each; a single one is a block of one lane. The programs are
+traced from the functions that the array engine runs (:mod:`..array`), so its rules are these; here are the loops around
+them. What a block knows stays in registers, as far as there are enough, and is written back when the loop is left.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from llvmlite import ir
+
+from ...tracing.scalarize import Program
+from .machine_code import NUMBER, WHOLE, MachineCode, Writer
+
+POINTER, NUMBERS, WHOLES = ir.IntType(8).as_pointer(), NUMBER.as_pointer(), WHOLE.as_pointer()
+
+
+class Piece(NamedTuple):
+    """A program, and the names of the arrays that it reads and writes."""
+
+    program: Program
+    arguments: tuple[str, ...]
+    results: tuple[str, ...]
+
+
+class Layout:
+    """Where arrays lie one after another: their first rows by name, and how many rows there are."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
+        self.sizes = {name: math.prod(shape) for name, shape in shapes.items()}
+        ends = list(itertools.accumulate(self.sizes.values(), initial=0))
+        self.rows, self.height = dict(zip(self.sizes, ends, strict=False)), ends[-1]
+
+
+def step_loop(
+    pieces: Mapping[str, Piece], layout: Layout, state: Sequence[str], varies: np.ndarray, lanes: int
+) -> MachineCode:
+    """The function ``advance`` of :class:`Steps` as machine code.
+
+    Parameters
+    ----------
+    pieces : mapping
+        ``prepare``, from the state to a guess; ``iterate``, one iteration; ``conclude``, the state after the step.
+    layout : Layout
+        Of a block, each row with a number for each lane.
+    state : sequence of str
+        The arrays that stay from step to step.
+    varies : array of bool, shape (p,)
+        Which parameters lie in the block, under the name "p"; the others are the same for all.
+    """
+    module = ir.Module("steps")
+    kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, POINTER]
+    function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
+    function.args[0].add_attribute("noalias")
+    _Steps(function, pieces, layout, state, varies, lanes).write_loops()
+    return MachineCode(module)
+
+
+class _Steps(Writer):
+    """Writes ``advance(p, blocks, done, count, saves, every, out, most, newton)``.
+
+    Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept in ``out``, with its energy
+    and entropy. No further than ``most`` steps, or to where a block needs Newton's method and ``newton`` is null: the
+    number of that block is returned, and another call goes on there; otherwise the number of blocks.
+    """
+
+    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int):
+        super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
+        self.pieces, self.layout, self.state, self.varies = pieces, layout, state, varies
+        names = "p blocks done count saves every out most newton".split()
+        self.argument = dict(zip(names, function.args, strict=True))
+        own = np.cumsum(varies) - 1
+        self.shared = [None if v else i for i, v in enumerate(varies)]
+        self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
+        slots = [name for name in layout.sizes if name != "p"]
+        self.slots = {
+            name: [self.builder.alloca(self.number, name=f"{name}_{i}") for i in range(layout.sizes[name])]
+            for name in slots
+        }
+        self.truth = {name: self.builder.alloca(self.test, name=name) for name in ("running", "active", "hard")}
+        self.block = self.builder.alloca(NUMBERS)
+
+    # -- the loops ----------------------------------------------------------------------------------------------------
+
+    def write_loops(self) -> None:
+        build, argument = self.builder, self.argument
+        for slot in itertools.chain.from_iterable(self.slots.values()):
+            build.store(self.constant(0.0), slot)
+        with self.counted(argument["count"]) as i:
+            size = build.mul(i, self.whole_number(self.layout.height * self.lanes))
+            build.store(build.gep(argument["blocks"], [size]), self.block)
+            done = build.gep(argument["done"], [i])
+            total = build.mul(argument["saves"], argument["every"])
+            limit = build.add(build.load(done), argument["most"])
+            end = build.select(build.icmp_signed("<", total, limit), total, limit)
+            self.load(self.state)
+
+            def goes_on():
+                build.store(build.fcmp_ordered("==", self.value("status"), self.constant(0.0)), self.truth["running"])
+                running = self.any(build.load(self.truth["running"]))
+                return build.and_(running, build.icmp_signed("<", build.load(done), end))
+
+            with self.repeated(goes_on):
+                self.step(i)
+                build.store(build.add(build.load(done), self.whole_number(1)), done)
+                with build.if_then(
+                    build.icmp_signed("==", build.srem(build.load(done), argument["every"]), self.whole_number(0))
+                ):
+                    self.keep(i, build.sdiv(build.load(done), argument["every"]))
+            self.save(self.state)
+        build.ret(argument["count"])
+
+    def step(self, i: ir.Value) -> None:
+        """One step of every lane that is running; where one fails its state stays and a status says why."""
+        build, truth = self.builder, self.truth
+        self.run("prepare")
+        build.store(build.load(truth["running"]), truth["active"])
+
+        with self.repeated(lambda: self.any(build.load(truth["active"]))):
+            active = build.load(truth["active"])
+            self.run("iterate", active)
+            going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
+            build.store(build.and_(active, going), truth["active"])
+        solved = build.fcmp_ordered("==", self.value("converged"), self.constant(1.0))
+        hard = build.and_(build.load(truth["running"]), build.not_(solved))
+        with build.if_then(self.any(hard), likely=False):
+            self.newton(i, hard)
+        self.run("conclude", build.load(truth["running"]))
+
+    def newton(self, i: ir.Value, hard: ir.Value) -> None:
+        """Newton's method for the lanes that need it; the loop is left where there is none."""
+        build, argument = self.builder, self.argument
+        self.save(self.state)
+        with build.if_then(build.icmp_unsigned("==", argument["newton"], ir.Constant(POINTER, None))):
+            build.ret(i)
+        solve = ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE])
+        function = build.bitcast(argument["newton"], solve.as_pointer())
+        block = build.load(self.block)
+        self.save(SOLVED)
+        for lane in range(self.lanes):
+            needed = hard if self.lanes == 1 else build.extract_element(hard, ir.Constant(ir.IntType(32), lane))
+            with build.if_then(needed):
+                build.call(function, [argument["p"], block, self.whole_number(lane)])
+        self.load(SOLVED)
+
+    # -- rows and slots -----------------------------------------------------------------------------------------------
+
+    def run(self, name: str, where: ir.Value | None = None) -> None:
+        """Run a piece; its results take the place of what there was, in the lanes where a test holds."""
+        piece, build = self.pieces[name], self.builder
+
+        def read(i: int, j: int) -> ir.Value:
+            array = piece.arguments[i]
+            return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
+
+        for array, values in zip(piece.results, super().write(piece.program, read), strict=True):
+            for slot, value in zip(self.slots[array], values, strict=True):
+                build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
+
+    def parameter(self, i: int) -> ir.Value:
+        own, build = self.own[i], self.builder
+        if own is not None:
+            return build.load(self.place(self.layout.rows["p"] + own), align=8)
+        found = build.load(build.gep(self.argument["p"], [self.whole_number(i)]))
+        found.set_metadata("invariant.load", build.module.add_metadata([]))
+        return found if self.lanes == 1 else self.splat(found)
+
+    def splat(self, number: ir.Value) -> ir.Value:
+        build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
+        one = build.insert_element(ir.Constant(self.number, ir.Undefined), number, zero)
+        order = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+        return build.shuffle_vector(one, ir.Constant(self.number, ir.Undefined), order)
+
+    def value(self, name: str) -> ir.Value:
+        return self.builder.load(self.slots[name][0])
+
+    def place(self, row: int) -> ir.Value:
+        start = self.builder.gep(self.builder.load(self.block), [self.whole_number(row * self.lanes)])
+        return self.builder.bitcast(start, self.number.as_pointer())
+
+    def load(self, names: Sequence[str]) -> None:
+        for name in names:
+            for i, slot in enumerate(self.slots[name]):
+                self.builder.store(self.builder.load(self.place(self.layout.rows[name] + i), align=8), slot)
+
+    def save(self, names: Sequence[str]) -> None:
+        for name in names:
+            for i, slot in enumerate(self.slots[name]):
+                self.builder.store(self.builder.load(slot), self.place(self.layout.rows[name] + i), align=8)
+
+    def keep(self, i: ir.Value, number: ir.Value) -> None:
+        """The states, energies and entropies as the so-manieth of block i in ``out``."""
+        build, argument = self.builder, self.argument
+        kept = [slot for name in ("x", "energy", "entropy") for slot in self.slots[name]]
+        row = build.add(build.mul(i, argument["saves"]), build.sub(number, self.whole_number(1)))
+        start = build.gep(argument["out"], [build.mul(row, self.whole_number(len(kept) * self.lanes))])
+        for j, slot in enumerate(kept):
+            place = build.bitcast(build.gep(start, [self.whole_number(j * self.lanes)]), self.number.as_pointer())
+            build.store(build.load(slot), place, align=8)
+
+
+SOLVED = ("guess", "update", "converged", "defined", "newtons", "noise")
+"""What Newton's method leaves in a block."""

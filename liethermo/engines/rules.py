@@ -1,0 +1,62 @@
+"""When an iteration on the stage equations goes on, has converged, or is given up: one object, for every engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The solver's rules.
+
+    Updates of the slopes k are measured against ``|x|/h + |k|``, their scale.
+
+    Attributes
+    ----------
+    fixed_point, newton : int
+        The most iterations of each kind.
+    reuse : int
+        Newton iterations with one factorisation before the Jacobian is taken afresh.
+    halvings : int
+        Times that a Newton step is halved until the equations are solved better than before, in the second attempt.
+        Whole steps come first: where halved ones get stuck in a valley of the misfit, whole ones leap out of it.
+    slow : float
+        Contraction rate above which fixed-point iteration is given up for Newton's.
+    stale : float
+        Contraction rate above which Newton's method takes the Jacobian afresh.
+    shrinking : float
+        An update above this fraction of the smallest so far has not shrunk: rounding makes the iterates cycle, and the
+        cycle itself may still converge, by parts in 1e9.
+    floor : float
+        Update below which nothing is gained: even of one sign, errors of this size change the energy by 2e-15 in 1e6
+        steps. (Stopping at one eps lets it drift by 4e-14.)
+    plateau : float
+        Largest update at which an iteration that has stopped shrinking counts as converged. Rounding in the vector
+        field leaves a few eps; a conditioning of 100 is allowed for. Near a rest that lies at the origin the scale
+        vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the slopes
+        are rounded.
+    vanished : float
+        Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
+    steered : float
+        Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself.
+    """
+
+    fixed_point: int = 60
+    newton: int = 60
+    reuse: int = 4
+    halvings: int = 8
+    slow: float = 0.6
+    stale: float = 0.3
+    shrinking: float = 0.8
+    floor: float = 1e-5 * EPS
+    plateau: float = 1e3 * EPS
+    vanished: float = 1e-280
+    steered: float = 4 * EPS
+
+
+RULES = Rules()
+"""Those of every run."""

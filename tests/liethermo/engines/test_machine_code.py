@@ -1,0 +1,119 @@
+"""Programs as machine code mean what they mean to NumPy, in every lane; code is unloaded, and found again on disk."""
+
+import gc
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from llvmlite import ir
+
+from liethermo.engines.compiled import machine_code
+from liethermo.engines.compiled.machine_code import NUMBER, MachineCode, Writer
+from liethermo.tracing.primitives import OF_TESTS, OPERATIONS, TESTS, Instruction
+from liethermo.tracing.scalarize import Program, UnsupportedPrimitive
+from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
+from tests.machine_code import compiled, memory_maps
+
+PAIRS = {*"add sub mul div pow rem max min atan2".split(), *TESTS - {"is_finite"}}
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
+GRID = np.array(list(itertools.product(SPECIAL, SPECIAL)))
+
+
+def of_one_operation(op: str) -> Program:
+    """A program of two numbers."""
+    first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
+    if op in OF_TESTS:
+        chosen = [Instruction("t", op, ("p",) if op == "not" else ("p", "q"))]
+    elif op == "select":
+        chosen = [Instruction("t", op, ("p", "a", "b"))]
+    elif op in ("float", "int"):
+        chosen = [Instruction("t", op, ("p",))]
+    else:
+        chosen = [Instruction("t", op, ("a", "b") if op in PAIRS else ("a",))]
+    return Program((("a",), ("b",)), (*first, *chosen), (("t",),), ((1,),))
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+@pytest.mark.parametrize("op", list(OPERATIONS))
+def test_every_operation_at_every_kind_of_number(op, lanes):
+    program = of_one_operation(op)
+    function = compiled(program, lanes)
+    for a, b in GRID.reshape(-1, lanes, 2).swapaxes(1, 2):
+        (found,), (right,) = function(a, b), program.evaluate(a, b, batch=True)
+        np.testing.assert_allclose(np.ravel(found), np.ravel(right).astype(float), rtol=4e-15, equal_nan=True)
+        numbers = ~np.isnan(np.ravel(right).astype(float))
+        if right.dtype.kind == "f" and op not in ("max", "min", "sign"):  # whose zeros may have either sign
+            assert np.array_equal(np.signbit(np.ravel(found))[numbers], np.signbit(np.ravel(right))[numbers])
+
+
+def test_arithmetic_of_integers_and_constants():
+    program = program_of(lambda a: (3 * np.argmax(np.zeros(3)) + a.argmax() * 2 - 1, a.argmin() == 1), np.ones(3))
+    for lanes in (1, 2):
+        function = compiled(program, lanes)
+        a = np.array([[0.3, -1.0, 2.0], [5.0, np.nan, 1.0]])[:lanes]
+        for found, right in zip(function(a), program.evaluate(a, batch=True), strict=True):
+            assert np.array_equal(np.ravel(found), np.ravel(right))
+
+
+@settings(max_examples=12)
+@given(st.lists(steps, min_size=1, max_size=7), shapes, shapes, st.integers(0, 99), st.sampled_from([1, 3]))
+def test_random_programs_agree(chosen, shape_x, shape_y, seed, lanes):
+    def run(x, y):
+        values = [x, y]
+        for name, i, j, k in chosen:
+            values.append(STEPS[name](values[-1 - i % len(values)], values[-1 - j % len(values)], k))
+        return values[2:]
+
+    random = np.random.default_rng(seed)
+    x, y = (random.uniform(-1.5, 1.5, (lanes, *shape)) for shape in (shape_x, shape_y))
+    program = program_of(run, x[0], y[0])
+    for seen, found in zip(compiled(program, lanes)(x, y), program.evaluate(x, y, batch=True), strict=True):
+        np.testing.assert_allclose(seen.reshape(found.shape), found, rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+def test_an_operation_without_an_instruction_is_refused():
+    writer = Writer(
+        ir.IRBuilder(ir.Function(ir.Module(), ir.FunctionType(NUMBER, [NUMBER]), "f").append_basic_block()), 1
+    )
+    with pytest.raises(UnsupportedPrimitive, match="gamma"):
+        writer.operation("gamma", [writer.constant(1.0)])
+
+
+def test_code_is_unloaded():
+    """A function that is compiled anew again and again takes no more memory maps than one."""
+    program = lambda i: program_of(lambda a: a * (i + 0.5), np.ones(2))  # noqa: E731
+    for i in range(3):
+        compiled(program(i))
+    gc.collect()
+    before = memory_maps()
+    for i in range(60):
+        assert compiled(program(i))(np.ones(2))[0][0] == i + 0.5
+    gc.collect()
+    assert memory_maps() <= before + 30
+
+
+def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
+    made = []
+    monkeypatch.setattr(machine_code, "_compile", lambda *a, make=machine_code._compile: made.append(1) or make(*a))
+    program = program_of(lambda a: a * 3.25, np.ones(2))
+    for _ in range(2):
+        assert compiled(program)(np.ones(2))[0][0] == 3.25
+    assert len(made) == 1
+    (file,) = (tmp_path / "cache").glob("*.o")
+    whole = file.read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"", whole[:-1] + bytes([whole[-1] ^ 1])):
+        file.write_bytes(damaged)
+        assert compiled(program)(np.ones(2))[0][0] == 3.25
+    assert len(made) == 4
+    assert file.read_bytes() == whole
+
+
+def test_a_module_that_llvm_refuses_is_an_error():
+    module = ir.Module()
+    function = ir.Function(module, ir.FunctionType(NUMBER, []), "f")
+    ir.IRBuilder(function.append_basic_block())  # without an end
+    with pytest.raises(RuntimeError):
+        MachineCode(module)
