@@ -275,8 +275,19 @@ def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rul
     def noise():
         return noise_of(system, state.x)
 
-    solved = solve_stages(*equations(system, method, state, h, rules), jacobian, noise, rules)
+    if method.explicit:
+        solved = explicit(system, method, state.x, state.low, h, state.k, rules)
+    else:
+        solved = solve_stages(*equations(system, method, state, h, rules), jacobian, noise, rules)
     return conclude(system, method, state, h, solved)
+
+
+def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules = RULES) -> Solved:
+    """The slopes of an explicit method, which there is nothing to solve for."""
+    k = method.slopes(system, x, low, h, k)
+    missed, none = method.missed(system, x, low, h, k), jnp.zeros((), dtype=jnp.int64)
+    converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
+    return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
 
 
 def equations(

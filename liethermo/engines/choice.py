@@ -98,7 +98,11 @@ class Chosen:
 
     def _choose(self) -> Engine:
         system, method, auto = self.system, self.method, self.asked == "auto"
-        if self.asked == "sparse" or (auto and system.dim >= SPARSE_DIM):
+        if self.asked == "sparse" and method.explicit:
+            raise InputError(
+                f"{method} has no equations to solve, so the sparse engine is not for it: leave out engine"
+            )
+        if self.asked == "sparse" or (auto and system.dim >= SPARSE_DIM and not method.explicit):
             if system.sparsity() is not None:
                 return SparseEngine(system, method)
             if not auto:

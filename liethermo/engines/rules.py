@@ -39,6 +39,8 @@ class Rules:
         field leaves a few eps; a conditioning of 100 is allowed for. Near a rest that lies at the origin the scale
         vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the slopes
         are rounded.
+    corrected : float
+        What an explicit step may miss of the levels that it ends on.
     vanished : float
         Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
     steered : float
@@ -54,6 +56,7 @@ class Rules:
     shrinking: float = 0.8
     floor: float = 1e-5 * EPS
     plateau: float = 1e3 * EPS
+    corrected: float = 64 * EPS
     vanished: float = 1e-280
     steered: float = 4 * EPS
 

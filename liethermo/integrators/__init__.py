@@ -7,6 +7,7 @@ from .herglotz import DiscreteHerglotz
 from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
+from .runge_kutta import MetriplecticRungeKutta
 from .variational.discrete import DiscreteSystem, FiniteDifference
 from .variational.gauss import VariationalGauss
 from .variational.lie import LieVariational
@@ -30,6 +31,7 @@ __all__ = [
     "LieVariational",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
+    "MetriplecticRungeKutta",
     "OneStepMethod",
     "Reference",
     "VariationalGauss",

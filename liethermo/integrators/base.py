@@ -51,9 +51,19 @@ class OneStepMethod(eqx.Module):
     @abstractmethod
     def preserves(self) -> frozenset[str]: ...
 
+    @property
+    def explicit(self) -> bool:
+        """Whether the slopes do not depend on k, so that there is nothing to iterate: see :meth:`missed`."""
+        return False
+
     @abstractmethod
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
+
+    def missed(self, system: System, x, low, h, k) -> jax.Array:
+        """Of an explicit method, what the slopes miss of what they are to do, of the size of a slope."""
+        del system, x, low, h
+        return jnp.zeros_like(jnp.max(k))
 
     def change(self, system: System, x, low, h, k, d) -> jax.Array:
         """The derivative of ``slopes - k`` by k in the direction d, shape (stages, n), for Newton's method."""

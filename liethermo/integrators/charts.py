@@ -49,8 +49,18 @@ class InCharts(OneStepMethod):
         return self.method.order
 
     @property
+    def explicit(self) -> bool:
+        return self.method.explicit
+
+    @property
     def preserves(self) -> frozenset[str]:
         return self.method.preserves & {"energy", "entropy_law"}
+
+    def keeps(self, system: System, name: str) -> bool:
+        return self.method.keeps(system, name) if self.explicit else super().keeps(system, name)
+
+    def missed(self, system: System, x, low, h, k) -> jax.Array:
+        return self.method.missed(system, x, low, h, k)
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         step = self._step(system, x, low, h, k)
@@ -87,7 +97,7 @@ class InCharts(OneStepMethod):
         self.method.check(system)
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
-        return collocation_error(system, x, low, h, k)
+        return self.method.error(system, x, low, h, k) if self.explicit else collocation_error(system, x, low, h, k)
 
     def explain(self, system: System, x, k, h) -> str:
         x, k = jnp.asarray(x), jnp.asarray(k)
@@ -137,7 +147,7 @@ class InCharts(OneStepMethod):
         return _Step(local, self.method.pulled(local), start, there(low), own, jax.vmap(back_there))
 
     def predict(self, k, before) -> jax.Array:
-        return 2.0 * k - before  # whatever the method's own: the chart has changed
+        return k if self.explicit else 2.0 * k - before  # whatever the method's own: the chart has changed
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"

@@ -79,7 +79,11 @@ def _path(system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[i
 def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
     def one_step(carry, _):
         x, low, k, before = carry
-        new = _stages(system, method, x, low, h, method.predict(k, before))
+        if method.explicit:
+            solved = array.explicit(system, method, x, low, h, k)
+            new = jnp.where(solved.converged, solved.k, jnp.nan)
+        else:
+            new = _stages(system, method, x, low, h, method.predict(k, before))
         after, after_low, *_ = array.finish(system, method, x, low, h, new, system.energy.value(x))
         return (after, after_low, new, k), None
 

@@ -39,7 +39,12 @@ class Layout:
 
 
 def step_loop(
-    pieces: Mapping[str, Piece], layout: Layout, state: Sequence[str], varies: np.ndarray, lanes: int
+    pieces: Mapping[str, Piece],
+    layout: Layout,
+    state: Sequence[str],
+    varies: np.ndarray,
+    lanes: int,
+    explicit: bool = False,
 ) -> MachineCode:
     """The function ``advance`` of :class:`Steps` as machine code.
 
@@ -53,12 +58,14 @@ def step_loop(
         The arrays that stay from step to step.
     varies : array of bool, shape (p,)
         Which parameters lie in the block, under the name "p"; the others are the same for all.
+    explicit : bool
+        Of a method that has nothing to solve: what its one iteration does not do, Newton's method cannot.
     """
     module = ir.Module("steps")
     kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, POINTER]
     function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
     function.args[0].add_attribute("noalias")
-    _Steps(function, pieces, layout, state, varies, lanes).write_loops()
+    _Steps(function, pieces, layout, state, varies, lanes, explicit).write_loops()
     return MachineCode(module)
 
 
@@ -70,13 +77,12 @@ class _Steps(Writer):
     number of that block is returned, and another call goes on there; otherwise the number of blocks.
     """
 
-    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int):
+    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool):
         super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
-        self.pieces, self.layout, self.state, self.varies = pieces, layout, state, varies
+        self.pieces, self.layout, self.state, self.explicit = pieces, layout, state, explicit
         names = "p blocks done count saves every out most newton".split()
         self.argument = dict(zip(names, function.args, strict=True))
         own = np.cumsum(varies) - 1
-        self.shared = [None if v else i for i, v in enumerate(varies)]
         self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
         slots = [name for name in layout.sizes if name != "p"]
         self.slots = {
@@ -127,10 +133,11 @@ class _Steps(Writer):
             self.run("iterate", active)
             going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
             build.store(build.and_(active, going), truth["active"])
-        solved = build.fcmp_ordered("==", self.value("converged"), self.constant(1.0))
-        hard = build.and_(build.load(truth["running"]), build.not_(solved))
-        with build.if_then(self.any(hard), likely=False):
-            self.newton(i, hard)
+        if not self.explicit:
+            solved = build.fcmp_ordered("==", self.value("converged"), self.constant(1.0))
+            hard = build.and_(build.load(truth["running"]), build.not_(solved))
+            with build.if_then(self.any(hard), likely=False):
+                self.newton(i, hard)
         self.run("conclude", build.load(truth["running"]))
 
     def newton(self, i: ir.Value, hard: ir.Value) -> None:

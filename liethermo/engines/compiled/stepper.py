@@ -131,6 +131,10 @@ class Stepper:
 
         def iterate(p, x, low, h, *iteration):
             system, method = both(p)
+            if method.explicit:
+                solved = array.explicit(system, method, x, low, h, iteration[0], rules)
+                s = Iteration(solved.k, solved.residual, *iteration[2:5], iteration[5] + 1.0)
+                return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
             s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
             converged, going = s.stands(array.scale_of(x, h, s.k, rules), rules)
             return *s, jnp.where(converged, 1.0, 0.0), jnp.where(going, 1.0, 0.0)
@@ -140,7 +144,7 @@ class Stepper:
             solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
             return array.conclude(*both(p), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
 
-        self._both = both
+        self._both, self._explicit = both, method.explicit
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
         self._shapes |= dict.fromkeys(("k", "before", "guess", "old", "new", "direction", "changes"), (stages, n))
 
@@ -233,7 +237,7 @@ class Stepper:
         """The function ``advance``, compiled or found compiled."""
         with self._lock:
             if self._advance is None:
-                code = step_loop(self._pieces, self._layout, (*FIELDS, "h"), self._varies, self.lanes)
+                code = step_loop(self._pieces, self._layout, (*FIELDS, "h"), self._varies, self.lanes, self._explicit)
                 self._advance = code, ADVANCE(code.address("advance"))  # the code is unloaded with this object
             return self._advance[1]
 

@@ -1,0 +1,120 @@
+"""Explicit Runge-Kutta tableaus with nonnegative weights on the Lobatto nodes, and estimates of their errors."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+
+class ExplicitTableau(NamedTuple):
+    """Stages ``X_i = x + h sum_j A_ij k_j`` and step ``x' = x + h sum_i b_i k_i``.
+
+    Attributes
+    ----------
+    A, b : ndarray, shapes (s, s) and (s,)
+    d : ndarray, shape (s,)
+        ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
+    q : int
+    scale : float
+        The local error of a step of length l is ``scale |E| (|E| / l)^((p - q) / (q + 1))``, p the order: right for a
+        linear equation as h -> 0.
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    q: int
+    scale: float
+
+
+ORDERS = (4, 6, 8)
+
+
+@functools.cache
+def lobatto(order: int) -> ExplicitTableau:
+    """The tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
+    A, b = {4: _kutta, 6: _butcher, 8: _cooper_verner}[order]()
+    d, q = _estimate(A, b, order)
+    tall = [np.ones(len(b))]
+    for _ in range(order):
+        tall.append(A @ tall[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
+    missed = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ tall[order])
+    seen = abs(d @ tall[q])
+    assert seen > 0.0
+    return ExplicitTableau(A, b, d, q, missed / seen ** ((order + 1) / (q + 1)))
+
+
+def _estimate(A: np.ndarray, b: np.ndarray, order: int) -> tuple[np.ndarray, int]:
+    """Weights d that every rooted tree of at most q nodes is orthogonal to, q as large as there are any but zero."""
+    vectors, found = trees(A, order), None
+    for q in range(order - 1, 0, -1):
+        conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
+        _, sizes, rows = np.linalg.svd(conditions)
+        free = rows[np.sum(sizes > 1e-10 * sizes[0]) :]
+        tall = np.linalg.matrix_power(A, q) @ np.ones(len(b))
+        seen = free @ tall  # of all such weights those that see most of a linear equation
+        if np.linalg.norm(seen) > 1e-8 * np.linalg.norm(tall):
+            found = seen @ free / np.linalg.norm(seen), q
+            break
+    assert found is not None
+    return found
+
+
+def trees(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
+    """For each number of nodes, up to ``order``, the vectors at the stages of the rooted trees with so many.
+
+    That of a tree is the product of ``A v`` over its branches, v their vectors; a method has the order p if ``b . v``
+    is one over the density of the tree for all with at most p nodes [Hairer, Nørsett & Wanner 1993, II.2].
+    """
+    found: dict[int, list[np.ndarray]] = {1: [np.ones(len(A))]}
+    for n in range(2, order + 1):
+        found[n] = [v for v, _ in _forests(A, found, n - 1, n - 1)]
+    return found
+
+
+def _forests(A, found, nodes: int, largest: int):
+    """Products of branches with so many nodes together, none of more than ``largest``."""
+    if nodes == 0:
+        yield np.ones(len(A)), largest
+        return
+    for size in range(min(nodes, largest), 0, -1):
+        for v in found[size]:
+            for rest, _ in _forests(A, found, nodes - size, size):
+                yield (A @ v) * rest, size
+
+
+def _kutta() -> tuple[np.ndarray, np.ndarray]:
+    A = np.zeros((4, 4))
+    A[1, 0], A[2, 1], A[3, 2] = 0.5, 0.5, 1.0
+    return A, np.array([1, 2, 2, 1]) / 6
+
+
+def _butcher() -> tuple[np.ndarray, np.ndarray]:
+    s, A = np.sqrt(5.0), np.zeros((7, 7))
+    A[1, 0] = (5 - s) / 10
+    A[2, :2] = -s / 10, (5 + 2 * s) / 10
+    A[3, :3] = (-15 + 7 * s) / 20, (-1 + s) / 4, (15 - 7 * s) / 10
+    A[4, :4] = (5 - s) / 60, 0, 1 / 6, (15 + 7 * s) / 60
+    A[5, :5] = (5 + s) / 60, 0, (9 - 5 * s) / 12, 1 / 6, (-5 + 3 * s) / 10
+    A[6, :6] = 1 / 6, 0, (-55 + 25 * s) / 12, (-25 - 7 * s) / 12, 5 - 2 * s, (5 + s) / 2
+    return A, np.array([1, 0, 0, 0, 5, 5, 1]) / 12
+
+
+def _cooper_verner() -> tuple[np.ndarray, np.ndarray]:
+    s, A, b = np.sqrt(21.0), np.zeros((11, 11)), np.zeros(11)
+    A[1, 0] = 1 / 2
+    A[2, :2] = 1 / 4, 1 / 4
+    A[3, :3] = 1 / 7, (-7 - 3 * s) / 98, (21 + 5 * s) / 49
+    A[4, :4] = (11 + s) / 84, 0, (18 + 4 * s) / 63, (21 - s) / 252
+    A[5, :5] = (5 + s) / 48, 0, (9 + s) / 36, (-231 + 14 * s) / 360, (63 - 7 * s) / 80
+    A[6, :6] = (10 - s) / 42, 0, (-432 + 92 * s) / 315, (633 - 145 * s) / 90, (-504 + 115 * s) / 70, (63 - 13 * s) / 35
+    A[7, :7] = 1 / 14, 0, 0, 0, (14 - 3 * s) / 126, (13 - 3 * s) / 63, 1 / 9
+    A[8, :8] = 1 / 32, 0, 0, 0, (91 - 21 * s) / 576, 11 / 72, (-385 - 75 * s) / 1152, (63 + 13 * s) / 128
+    A[9, :4] = 1 / 14, 0, 0, 0
+    A[9, 4:9] = 1 / 9, (-733 - 147 * s) / 2205, (515 + 111 * s) / 504, (-51 - 11 * s) / 56, (132 + 28 * s) / 245
+    A[10, 4:7] = (-42 + 7 * s) / 18, (-18 + 28 * s) / 45, (-273 - 53 * s) / 72
+    A[10, 7:10] = (301 + 53 * s) / 72, (28 - 28 * s) / 45, (49 - 7 * s) / 18
+    b[[0, 7, 8, 9, 10]] = 1 / 20, 49 / 180, 16 / 45, 49 / 180, 1 / 20
+    return A, b

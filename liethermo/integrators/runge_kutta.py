@@ -1,0 +1,268 @@
+"""Explicit methods with both laws exact: Runge-Kutta steps, brought back onto the levels that they have to end on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..dissipation.base import portions
+from ..errors import InputError
+from ..functions.checks import check_scalar, recognised
+from ..functions.energy import Energy, as_energy
+from ..functions.gradients import Gonzalez
+from ..functions.on_spaces import on_points
+from ..systems import ChartSystem, System
+from .base import OneStepMethod, register
+from .charts import in_charts
+from .lobatto import ORDERS, ExplicitTableau, lobatto
+
+CORRECTIONS = 3
+"""Newton corrections of a step: what a relative error e leaves of the laws is e^6."""
+
+SLOPE, ERROR, FIRST, LAST, MISSED = range(5)
+"""What stands in the vectors that a step hands on: its mean slope, the estimate of its local error, the slopes at its
+ends and, in each component, what is missed of the levels after the corrections. Error and what is missed are over h."""
+
+
+class MetriplecticRungeKutta(OneStepMethod):
+    """``X_i = x + h sum_{j<i} A_ij f(X_j)``, ``y = x + h sum_i b_i f(X_i)``, and x' the point near y where
+
+        H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X_i),    sigma = grad S . K grad S >= 0,
+
+    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. The weights b of Lobatto's
+    quadrature are nonnegative, so that the entropy never falls; the quadrature is of the order p of the method, 4, 6 or
+    8, so that x' - y is O(h^{p+1}).
+
+    The point x' is found by Newton's method along the gradients of H and the C, and that of S as far as it is
+    independent of these. What a function changes by is taken from a discrete gradient along the step, whose rounding
+    vanishes with the step. So a state that relaxes is not held off its equilibrium by rounding.
+
+    Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
+    by its own quadrature.
+
+    A step costs 4, 7 or 11 evaluations of the field; and with three corrections, four values of what each function
+    changes by. There is nothing to iterate, so it is many times as fast as an implicit step; but stiff systems ask for
+    short steps. A step that is too long for its corrections fails with a status.
+
+    On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
+    same laws. See :class:`InCharts`.
+
+    Parameters
+    ----------
+    order : int
+        4, 6 or 8.
+    preserve : sequence of functions or energies
+        Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
+    retraction : str or manifolds.Retraction, optional
+        On a manifold, with its base point where the step starts: ``"exp"`` by default.
+    held : tuple of str
+        Names of the functions of the system to hold. A run fills it in with what the system conserves.
+    """
+
+    number: int = eqx.field(static=True)
+    functions: tuple[Energy, ...]
+    retraction: str | mf.Retraction | None = eqx.field(static=True)
+    held: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        order: int = 4,
+        preserve: Sequence = (),
+        retraction: str | mf.Retraction | None = None,
+        held: tuple[str, ...] = (),
+    ):
+        if isinstance(order, bool) or order not in ORDERS:
+            raise InputError(f"the order is 4, 6 or 8, not {order!r}")
+        functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
+        self.number = order
+        self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
+        self.retraction, self.held = retraction, held
+
+    @property
+    def order(self) -> int:
+        return self.number
+
+    @property
+    def stages(self) -> int:
+        return MISSED + 1
+
+    @property
+    def explicit(self) -> bool:
+        return True
+
+    @property
+    def preserves(self) -> frozenset[str]:
+        return frozenset({"energy", "entropy_law", "casimirs"})
+
+    @property
+    def tableau(self) -> ExplicitTableau:
+        return lobatto(self.number)
+
+    def keeps(self, system: System, name: str) -> bool:
+        return name in system.first_integrals()
+
+    def on(self, system: System) -> OneStepMethod:
+        seen = self._with(lambda C: _seen_on(system, C), tuple(sorted(system.first_integrals())))
+        method = in_charts(seen, system, self.retraction, "exp")
+        if system.space is not None and not isinstance(method.retraction, mf.Chart):
+            raise InputError(
+                f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
+            )
+        return method
+
+    def pulled(self, local: ChartSystem) -> OneStepMethod:
+        return self._with(local.pulled, self.held)
+
+    def _with(self, change: Callable, held: tuple[str, ...]) -> MetriplecticRungeKutta:
+        """The method with its preserved functions changed, holding these of the system."""
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
+
+    def check(self, system: System) -> None:
+        """Raise InputError unless the system has a law to hold and conserves what is to be preserved."""
+        if not self._laws(system):
+            raise InputError(f"{self} holds the laws of a system, and this one claims none: take lt.Reference")
+        for C, kept in zip(self.functions, system.conserves(self.functions), strict=True):
+            if not kept:
+                name = getattr(getattr(C, "function", None), "__name__", str(C))
+                raise InputError(
+                    f"the system does not conserve the preserved function {name}: holding it would change the dynamics"
+                )
+
+    # -- the step -----------------------------------------------------------------------------------------------------
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        """The vectors that the step hands on; none of those before it is needed."""
+        del k
+        laws, t = self._laws(system), self.tableau
+        s = len(t.b)
+
+        def stage(slopes, row):
+            i, weights = row
+            found, rates = self._rates(system, laws, x + (low + h * (weights @ slopes)))
+            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
+
+        start = jnp.zeros((s, x.shape[0])) + 0.0 * x
+        slopes, rates = jax.lax.scan(stage, start, (np.arange(s), t.A))
+        d, missed = self._corrected(system, laws, x, low, h * (t.b @ slopes), h * (t.b @ rates))
+        return jnp.stack([d / h, t.d @ slopes, slopes[0], slopes[-1], jnp.broadcast_to(missed / h, x.shape)])
+
+    def _rates(self, system: System, laws: list[_Law], x) -> tuple[jax.Array, jax.Array]:
+        """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants."""
+        system = system.here(x)
+        dH = system.energy.gradient(x)
+        dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
+        dL = tuple(L.gradient(x) for L in system.preserved)
+        if system.dissipation is None:
+            return system.field(x, dH, dS, dL), jnp.zeros(len(laws))
+        names, force = tuple(system.preserved_by_name()), jnp.zeros_like(x)
+        gradients = dict(zip(names, dL, strict=True))
+        for part, own in portions(system.dissipation, names):
+            force = force + part.force(system, x, dH, dS, tuple(gradients[name] for name in own))
+        # apart from the motion, along which H and S do not change: near rest that is rounding noise
+        rates = [law.sign * jnp.maximum(law.sign * jnp.dot(law.function.gradient(x), force), 0.0) for law in laws]
+        return system.field(x, dH, dS, dL), jnp.stack(rates)
+
+    def _corrected(self, system: System, laws: list[_Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
+        """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
+        change = Gonzalez()
+
+        def misses(d) -> jax.Array:
+            return changes - jnp.stack([jnp.dot(change(law.function, x, d, low), d) for law in laws])
+
+        def directions(d):
+            return [system.raised(x + (low + d), law.function.gradient(x + (low + d))) for law in laws]
+
+        found = directions(d)
+        for i in range(CORRECTIONS):
+            d = d + _towards(found, misses(d))
+            found = directions(d) if i == 0 else found  # the second time they are as good as they get
+        squares = jnp.stack([jnp.dot(v, v) for v in found])
+        left = misses(d) / jnp.sqrt(jnp.where(squares > 0.0, squares, 1.0))
+        return d, jnp.max(jnp.abs(jnp.where(squares > 0.0, left, 0.0)))
+
+    def _laws(self, system: System) -> list[_Law]:
+        """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
+        functions = system.functions()
+        laws = [_Law(system.energy, LAWS[system.energy_law])] if system.energy_law in LAWS else []
+        laws += [_Law(functions[name], 0.0) for name in self.held]
+        laws += [_Law(C, 0.0) for C in self.functions]
+        if system.entropy_law in LAWS:
+            assert system.entropy is not None
+            laws.append(_Law(system.entropy, LAWS[system.entropy_law]))
+        return sorted(laws, key=lambda law: law.sign != 0.0)
+
+    def missed(self, system: System, x, low, h, k) -> jax.Array:
+        del system, x, low, h
+        return jnp.max(jnp.abs(k[MISSED]))
+
+    def increment(self, h, k) -> jax.Array:
+        return h * k[SLOPE]
+
+    def predict(self, k, before) -> jax.Array:
+        del before
+        return k
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        """From weights that lower orders leave undetermined: see :class:`.lobatto.ExplicitTableau`."""
+        del system, x, low
+        t = self.tableau
+        found, length = h * jnp.max(jnp.abs(k[ERROR])), h * jnp.max(jnp.abs(k[SLOPE]))
+        share = found / jnp.where(length > 0.0, length, 1.0)
+        return t.scale * found * share ** ((self.number - t.q) / (t.q + 1))
+
+    def explain(self, system: System, x, k, h) -> str:
+        del system, x, k, h
+        return ""
+
+    def __str__(self) -> str:
+        kept = f", preserve={len(self.functions)} functions" if self.functions else ""
+        return f"MetriplecticRungeKutta(order={self.number}{kept})"
+
+
+DEPENDENT = 1e-24
+"""Square of what is left of a direction, relative to its own, below which it depends on those before it."""
+
+
+def _towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
+    """The vector in the span of some whose inner products with them are these, shape (n,).
+
+    By Gram and Schmidt; one that depends on those before it, as at an equilibrium, is left out.
+    """
+    found, units = jnp.zeros_like(directions[0]), []
+    for v, product in zip(directions, products, strict=True):
+        own = v
+        for unit, square in units:
+            own = own - (jnp.dot(v, unit) / square) * unit
+        square = jnp.dot(own, own)
+        use = square > DEPENDENT * jnp.dot(v, v)
+        square = jnp.where(use, square, 1.0)
+        own = jnp.where(use, own, 0.0)
+        found = found + ((product - jnp.dot(v, found)) / square) * own
+        units.append((own, square))
+    return found
+
+
+class _Law(NamedTuple):
+    """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
+
+    function: Energy
+    sign: float
+
+
+LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
+
+
+def _seen_on(system: System, C: Energy) -> Energy:
+    """A preserved function as one of the state vectors of a system."""
+    C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
+    return recognised(C, system.dim) if system.space is None else C
+
+
+register(*map(MetriplecticRungeKutta, ORDERS))
