@@ -1,5 +1,7 @@
 """Shared settings: property tests are deterministic, so that a failure here is a failure everywhere."""
 
+import gc
+import resource
 from collections import defaultdict
 from pathlib import Path
 
@@ -39,11 +41,18 @@ def _own_cache(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _bounded_compilation_cache(request):
-    """Every compiled program holds memory maps, of which a process has 65,530: drop them where many are held."""
+    """Every compiled program holds memory, and maps, of which a process has 65,530: drop them where many are held."""
     yield
     request.session.liethermo_count = count = getattr(request.session, "liethermo_count", 0) + 1
-    if count % 10 == 0 and _memory_maps() > 30_000:
+    if count % 10 == 0 and (_memory_maps() > 30_000 or _megabytes() > 3_000):
         jax.clear_caches()
+        gc.collect()
+
+
+def _megabytes() -> int:
+    """That are resident; none where the system does not tell."""
+    pages = Path("/proc/self/statm")
+    return int(pages.read_text().split()[1]) * resource.getpagesize() // 2**20 if pages.exists() else 0
 
 
 def _memory_maps() -> int:

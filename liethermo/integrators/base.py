@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..functions.gradients import EPS, compensated
 from ..functions.rounding import with_rounding
 from ..systems import System
-from .tableaus import MOST_STAGES, at_start, beyond, gauss
+from .tableaus import MOST_STAGES, at_start, beyond, gauss, integrated
 
 _registry: list[OneStepMethod] = []
 
@@ -85,6 +85,10 @@ class OneStepMethod(eqx.Module):
     def along(self, system: System, x, v) -> jax.Array:
         """The state that a displacement v leads to from x: where the step is on its way, outside of the laws."""
         return x + v
+
+    def weights(self, theta) -> np.ndarray:
+        """Those w for which ``h sum_i w_i k_i`` displaces the state by a share theta of a step, shape (..., stages)."""
+        return integrated(self.stages, theta)
 
     def on(self, system: System) -> OneStepMethod:
         """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold."""

@@ -59,6 +59,9 @@ class InCharts(OneStepMethod):
     def keeps(self, system: System, name: str) -> bool:
         return self.method.keeps(system, name) if self.explicit else super().keeps(system, name)
 
+    def weights(self, theta):
+        return self.method.weights(theta)
+
     def missed(self, system: System, x, low, h, k) -> jax.Array:
         return self.method.missed(system, x, low, h, k)
 

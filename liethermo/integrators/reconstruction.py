@@ -70,6 +70,8 @@ class WithAttitude(OneStepMethod):
         return self.method.keeps(system.body, name)
 
     def check(self, system) -> None:
+        if self.method.explicit:
+            raise InputError(f"{self.method} does not reconstruct attitudes: take lt.MetriplecticGauss")
         self.method.check(system.body)
 
     def slopes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]

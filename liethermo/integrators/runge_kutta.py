@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,19 +16,21 @@ from ..dissipation.base import portions
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
-from ..functions.gradients import Gonzalez
+from ..functions.gradients import EPS, Gonzalez
 from ..functions.on_spaces import on_points
 from ..systems import ChartSystem, System
 from .base import OneStepMethod, register
-from .charts import in_charts
+from .charts import InCharts, in_charts
 from .lobatto import ORDERS, ExplicitTableau, lobatto
 
-CORRECTIONS = 3
-"""Newton corrections of a step: what a relative error e leaves of the laws is e^6."""
-
-SLOPE, ERROR, FIRST, LAST, MISSED = range(5)
+SLOPE, ERROR, FIRST, LAST, MISSED, LEVELS = range(6)
 """What stands in the vectors that a step hands on: its mean slope, the estimate of its local error, the slopes at its
-ends and, in each component, what is missed of the levels after the corrections. Error and what is missed are over h."""
+ends; in each component, what is missed of the levels after the corrections; and the levels that the run has begun on.
+Error and what is missed are over h."""
+
+NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
+"""What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
+back, and the most that one takes back: far below what its rounding is."""
 
 
 class MetriplecticRungeKutta(OneStepMethod):
@@ -47,7 +49,7 @@ class MetriplecticRungeKutta(OneStepMethod):
     Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
     by its own quadrature.
 
-    A step costs 4, 7 or 11 evaluations of the field; and with three corrections, four values of what each function
+    A step costs 4, 7 or 11 evaluations of the field; and with four corrections, five values of what each function
     changes by. There is nothing to iterate, so it is many times as fast as an implicit step; but stiff systems ask for
     short steps. A step that is too long for its corrections fails with a status.
 
@@ -66,10 +68,14 @@ class MetriplecticRungeKutta(OneStepMethod):
         Names of the functions of the system to hold. A run fills it in with what the system conserves.
     """
 
+    corrections: ClassVar[int] = 4
+    """Newton corrections of a step: a relative error of a twentieth is one of rounding after them."""
+
     number: int = eqx.field(static=True)
     functions: tuple[Energy, ...]
     retraction: str | mf.Retraction | None = eqx.field(static=True)
     held: tuple[str, ...] = eqx.field(static=True)
+    charted: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,13 +83,14 @@ class MetriplecticRungeKutta(OneStepMethod):
         preserve: Sequence = (),
         retraction: str | mf.Retraction | None = None,
         held: tuple[str, ...] = (),
+        charted: bool = False,
     ):
-        if isinstance(order, bool) or order not in ORDERS:
+        if type(order) is not int or order not in ORDERS:
             raise InputError(f"the order is 4, 6 or 8, not {order!r}")
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.number = order
         self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
-        self.retraction, self.held = retraction, held
+        self.retraction, self.held, self.charted = retraction, held, charted
 
     @property
     def order(self) -> int:
@@ -91,7 +98,7 @@ class MetriplecticRungeKutta(OneStepMethod):
 
     @property
     def stages(self) -> int:
-        return MISSED + 1
+        return LEVELS + 1
 
     @property
     def explicit(self) -> bool:
@@ -109,20 +116,21 @@ class MetriplecticRungeKutta(OneStepMethod):
         return name in system.first_integrals()
 
     def on(self, system: System) -> OneStepMethod:
-        seen = self._with(lambda C: _seen_on(system, C), tuple(sorted(system.first_integrals())))
+        held, charted = tuple(sorted(system.first_integrals())), system.space is not None
+        seen = self._with(lambda C: _seen_on(system, C), held, charted)
         method = in_charts(seen, system, self.retraction, "exp")
-        if system.space is not None and not isinstance(method.retraction, mf.Chart):
+        if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
             raise InputError(
                 f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
             )
         return method
 
     def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled, self.held)
+        return self._with(local.pulled, self.held, self.charted)
 
-    def _with(self, change: Callable, held: tuple[str, ...]) -> MetriplecticRungeKutta:
+    def _with(self, change: Callable, held: tuple[str, ...], charted: bool) -> MetriplecticRungeKutta:
         """The method with its preserved functions changed, holding these of the system."""
-        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, charted)
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a law to hold and conserves what is to be preserved."""
@@ -135,11 +143,15 @@ class MetriplecticRungeKutta(OneStepMethod):
                     f"the system does not conserve the preserved function {name}: holding it would change the dynamics"
                 )
 
+    def start(self, system: System, x) -> jax.Array:
+        levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: x.shape[0]]
+        levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
+        return jnp.zeros((self.stages, x.shape[0])).at[SLOPE].set(system.vector_field(x)).at[LEVELS].set(levels)
+
     # -- the step -----------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        """The vectors that the step hands on; none of those before it is needed."""
-        del k
+        """The vectors that the step hands on; of those before it the levels alone are needed."""
         laws, t = self._laws(system), self.tableau
         s = len(t.b)
 
@@ -150,8 +162,28 @@ class MetriplecticRungeKutta(OneStepMethod):
 
         start = jnp.zeros((s, x.shape[0])) + 0.0 * x
         slopes, rates = jax.lax.scan(stage, start, (np.arange(s), t.A))
-        d, missed = self._corrected(system, laws, x, low, h * (t.b @ slopes), h * (t.b @ rates))
-        return jnp.stack([d / h, t.d @ slopes, slopes[0], slopes[-1], jnp.broadcast_to(missed / h, x.shape)])
+        changes = h * (t.b @ rates)
+        if not self.charted:
+            changes = changes + self._steering(laws, x, low, k[LEVELS])
+        d, missed = self._corrected(system, laws, x, low, h * (t.b @ slopes), changes)
+        return jnp.stack([d / h, t.d @ slopes, slopes[0], slopes[-1], jnp.broadcast_to(missed / h, x.shape), k[LEVELS]])
+
+    def _steering(self, laws: list[_Law], x, low, levels) -> jax.Array:
+        """What functions that are conserved are to change by, back to the levels that the run has begun on.
+
+        Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
+        """
+
+        def back(law: _Law, level) -> jax.Array:
+            gradient = law.function.gradient(x)
+            size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
+            off = (level - law.function.value(x)) - jnp.dot(gradient, low)
+            return jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -STEERED * size, STEERED * size), 0.0)
+
+        found = [
+            back(law, levels[i]) if law.sign == 0.0 and i < x.shape[0] else jnp.zeros(()) for i, law in enumerate(laws)
+        ]
+        return jax.lax.stop_gradient(jnp.stack(found))
 
     def _rates(self, system: System, laws: list[_Law], x) -> tuple[jax.Array, jax.Array]:
         """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants."""
@@ -180,12 +212,12 @@ class MetriplecticRungeKutta(OneStepMethod):
             return [system.raised(x + (low + d), law.function.gradient(x + (low + d))) for law in laws]
 
         found = directions(d)
-        for i in range(CORRECTIONS):
+        for i in range(self.corrections):
+            found = directions(d) if 0 < i < 3 else found  # the last time they are as good as they get
             d = d + _towards(found, misses(d))
-            found = directions(d) if i == 0 else found  # the second time they are as good as they get
         squares = jnp.stack([jnp.dot(v, v) for v in found])
-        left = misses(d) / jnp.sqrt(jnp.where(squares > 0.0, squares, 1.0))
-        return d, jnp.max(jnp.abs(jnp.where(squares > 0.0, left, 0.0)))
+        left = misses(d) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
+        return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
 
     def _laws(self, system: System) -> list[_Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
@@ -205,6 +237,15 @@ class MetriplecticRungeKutta(OneStepMethod):
     def increment(self, h, k) -> jax.Array:
         return h * k[SLOPE]
 
+    def weights(self, theta) -> np.ndarray:
+        """Of the cubic through both ends with the slopes there, which is O(h^4) between."""
+        theta = np.asarray(theta, dtype=np.float64)
+        found = np.zeros((*theta.shape, self.stages))
+        found[..., SLOPE] = theta**2 * (3.0 - 2.0 * theta)
+        found[..., FIRST] = theta * (1.0 - theta) ** 2
+        found[..., LAST] = theta**2 * (theta - 1.0)
+        return found
+
     def predict(self, k, before) -> jax.Array:
         del before
         return k
@@ -218,8 +259,13 @@ class MetriplecticRungeKutta(OneStepMethod):
         return t.scale * found * share ** ((self.number - t.q) / (t.q + 1))
 
     def explain(self, system: System, x, k, h) -> str:
-        del system, x, k, h
-        return ""
+        del k
+        if not bool(jnp.isfinite(system.vector_field(jnp.asarray(x))).all()):
+            return ""
+        return (
+            f"the stages of a step of {h:g} run away, or leave the domain of the functions: it is too long for an "
+            "explicit method; lt.MetriplecticGauss takes longer ones of a stiff system"
+        )
 
     def __str__(self) -> str:
         kept = f", preserve={len(self.functions)} functions" if self.functions else ""
@@ -235,7 +281,8 @@ def _towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
 
     By Gram and Schmidt; one that depends on those before it, as at an equilibrium, is left out.
     """
-    found, units = jnp.zeros_like(directions[0]), []
+    found = jnp.zeros_like(directions[0])
+    units: list[tuple[jax.Array, jax.Array]] = []
     for v, product in zip(directions, products, strict=True):
         own = v
         for unit, square in units:

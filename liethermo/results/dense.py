@@ -1,4 +1,4 @@
-"""Dense output: the collocation polynomials of a run."""
+"""Dense output: the states of a run between the ends of its steps."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from ..integrators.tableaus import integrated
 
 
 @dataclass(frozen=True)
 class Dense:
-    """The collocation polynomials of a run: ``x(t)`` anywhere, to O(h^(s+1)) for s stages.
+    """``x(t)`` anywhere: to O(h^(s+1)) by the polynomial of collocation with s stages, to O(h^4) by explicit methods.
 
-    That is less than the order 2s of the states at the ends of steps, where alone the laws are exact.
+    That is less than the order of the states at the ends of steps, where alone the laws are exact.
 
     Attributes
     ----------
@@ -24,6 +23,8 @@ class Dense:
         States at the starts.
     k : ndarray, shape (steps, s, n)
         Slopes at the stages.
+    weights : function
+        From shares of a step to weights of the slopes: :meth:`liethermo.integrators.OneStepMethod.weights`.
     along : function or None
         On a manifold, from states and displacements, shapes (m, n), to states.
     """
@@ -32,6 +33,7 @@ class Dense:
     h: np.ndarray
     x: np.ndarray
     k: np.ndarray
+    weights: Callable[..., np.ndarray]
     along: Callable | None = None
 
     def __call__(self, t) -> np.ndarray:
@@ -41,7 +43,7 @@ class Dense:
         if not np.all((t >= first - slack) & (t <= last + slack)):
             raise InputError(f"the solution is known from t = {first:g} to {last:g}, not at {t}")
         i = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
-        weights = integrated(self.k.shape[1], (t - self.start[i]) / self.h[i])
+        weights = self.weights((t - self.start[i]) / self.h[i])
         x, v = self.x[i], self.h[i][..., None] * np.einsum("...s,...sn->...n", weights, self.k[i])
         if self.along is None:
             return x + v

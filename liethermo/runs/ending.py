@@ -60,6 +60,13 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, ca
     if code == array.RUNNING:
         return Status("completed", f"reached t = {now:g} in {step} steps", step, now, residual)
     where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
+    if code == array.NOT_CONVERGED and engine.method.explicit:
+        message = (
+            f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
+            f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e}). "
+            + _advice(engine, state, h, capacity)
+        )
+        return Status("not_converged", message, step, now, residual)
     if code == array.NOT_CONVERGED:
         message = (
             f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
@@ -82,7 +89,10 @@ def _advice(engine: Chosen, state, h: float, capacity: int) -> str:
         one = h / part, 1, 1, capacity
         new, _ = engine.advance(state, *one)
         if int(new.status) == array.RUNNING:
-            return f"Try a smaller step, for example {h / part:g}"
+            stiff = (
+                "; if that is far below what the motion needs, it is stiff, and lt.MetriplecticGauss takes long steps"
+            )
+            return f"Try a smaller step, for example {h / part:g}{stiff if engine.method.explicit else ''}"
     return (
         f"Steps down to {h / SHORTER[-1]:g} were tried and do not help: the functions may not be smooth there, or "
         "lose more digits than the iteration expects, as differences of large terms do"

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..engines import array
 from ..errors import FunctionError, InputError
-from ..integrators.tableaus import integrated
 from ..systems import System
 from ..tracing.interpret import evaluator
 
@@ -89,7 +88,7 @@ def located(event: Event, advance: Callable, system, method, state, new, h: floa
         found = event(np.asarray(end.x)) if int(end.status) == array.RUNNING else math.nan
         if math.isfinite(found):
             return found
-        return event(np.asarray(method.along(system, x, h * integrated(len(k), theta) @ k)))
+        return event(np.asarray(method.along(system, x, h * method.weights(theta) @ k)))
 
     theta = float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
     return theta * h, advance(state, theta * h)

@@ -135,7 +135,9 @@ class Run:
         self.event_time = outcome.event_time
         if pieces:
             begins, lengths, x, k = (np.array(column) for column in zip(*pieces, strict=True))
-            self.dense = Dense(begins, lengths, x, k, None if self.system.space is None else self._along)
+            self.dense = Dense(
+                begins, lengths, x, k, self.method.weights, None if self.system.space is None else self._along
+            )
         state, now = outcome.state, self.times[-1]
         self.stats = dataclasses.replace(stats_of(state), rejected=outcome.rejected)
         steps = int(state.step)

@@ -133,7 +133,8 @@ class Stepper:
             system, method = both(p)
             if method.explicit:
                 solved = array.explicit(system, method, x, low, h, iteration[0], rules)
-                s = Iteration(solved.k, solved.residual, *iteration[2:5], iteration[5] + 1.0)
+                _, _, best, stalled, rate, made = iteration
+                s = Iteration(solved.k, solved.residual, best, stalled, rate, made + 1.0)
                 return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
             s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
             converged, going = s.stands(array.scale_of(x, h, s.k, rules), rules)
