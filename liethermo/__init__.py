@@ -57,7 +57,7 @@ from .runs.ensemble import Ensemble, ensemble
 from .runs.events import Relaxed
 from .runs.flow import flow
 from .runs.integrate import integrate
-from .runs.suggest import suggest_step
+from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .systems import (
     AttitudeSystem,
     ChartSystem,
@@ -122,6 +122,7 @@ __all__ = [
     "LieVariational",
     "LiethermoError",
     "MeanValue",
+    "MethodSuggestion",
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticRungeKutta",
@@ -153,6 +154,7 @@ __all__ = [
     "plot",
     "read_graph",
     "registered_methods",
+    "suggest_method",
     "suggest_step",
     "testing",
 ]

@@ -56,6 +56,11 @@ class OneStepMethod(eqx.Module):
         """Whether the slopes do not depend on k, so that there is nothing to iterate: see :meth:`missed`."""
         return False
 
+    @property
+    def evaluations(self) -> int:
+        """Of the vector field, in one iteration."""
+        return self.stages
+
     @abstractmethod
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""

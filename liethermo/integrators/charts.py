@@ -53,6 +53,10 @@ class InCharts(OneStepMethod):
         return self.method.explicit
 
     @property
+    def evaluations(self) -> int:
+        return self.method.evaluations
+
+    @property
     def preserves(self) -> frozenset[str]:
         return self.method.preserves & {"energy", "entropy_law"}
 

@@ -105,6 +105,10 @@ class MetriplecticRungeKutta(OneStepMethod):
         return True
 
     @property
+    def evaluations(self) -> int:
+        return len(self.tableau.b)
+
+    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law", "casimirs"})
 

@@ -425,9 +425,14 @@ def _first_errors(model: tuple[Form, OneStepMethod, int], step):
     return error_at(system, method, step[p:])
 
 
+def _cores() -> int:
+    """That this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, record: _Record) -> None:
     """Blocks of lanes, dealt out to a thread for each core; the loop does not hold the interpreter's lock."""
-    cores, stop = len(os.sched_getaffinity(0)), threading.Event()
+    cores, stop = _cores(), threading.Event()
     size = len(states)
     portion = min(BATCH, LANES * math.ceil(size / (LANES * 4 * cores)))
     own = numbers_of(method)

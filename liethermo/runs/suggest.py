@@ -1,16 +1,17 @@
-"""A step for an accuracy that is asked for."""
+"""A step, and a method, for an accuracy that is asked for."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from ..engines import array
-from ..errors import InputError
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..engines.choice import Chosen
+from ..errors import InputError, LiethermoError
+from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, OneStepMethod
 from ..systems import DrivenSystem, System, driven
 from .adaptive import GROWTH, Adaptive
 from .stepwise import run
@@ -37,30 +38,121 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     InputError
         Where nothing moves at x0, so that any step will do.
     """
+    return _tried(system, x0, rtol, DEFAULT_METHOD if method is None else method, t0).step
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A method tried on a system.
+
+    Attributes
+    ----------
+    method : OneStepMethod
+    step : float
+        Of the size that the tolerance asks for.
+    evaluations : float
+        Of the vector field, in a unit of time.
+    """
+
+    method: OneStepMethod
+    step: float
+    evaluations: float
+
+
+@dataclass(frozen=True)
+class MethodSuggestion:
+    """The method that takes least work, and what others would take; prints as a table.
+
+    Attributes
+    ----------
+    method : OneStepMethod
+    step : float
+    reason : str
+    trials : tuple of Trial
+        Least work first.
+    """
+
+    method: OneStepMethod
+    step: float
+    reason: str
+    trials: tuple[Trial, ...]
+
+    def __str__(self) -> str:
+        lines = [f"{'method':<36}{'step':>9}  evaluations of the field in a unit of time"]
+        lines += [f"{trial.method!s:<36}{trial.step:>9.2g}  {trial.evaluations:.3g}" for trial in self.trials]
+        return "\n".join([*lines, self.reason])
+
+
+CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
+
+
+def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
+    """The method, of those that hold both laws, that reaches an accuracy with least work near x0.
+
+    Each is run for some thirty adaptive steps; stages times iterations over the step is what it costs. So stiffness,
+    which keeps explicit steps short, shows by itself.
+
+    Parameters
+    ----------
+    system, x0, rtol, t0
+        As for :func:`suggest_step`.
+
+    Raises
+    ------
+    InputError
+        Where nothing moves at x0, or no method reaches the accuracy.
+    """
+    trials, refusals = [], []
+    for method in CANDIDATES:
+        try:
+            trials.append(_tried(system, x0, rtol, method, t0))
+        except LiethermoError as error:
+            refusals.append(f"{method}: {error}")
+    if not trials:
+        raise InputError("; ".join(refusals))
+    trials.sort(key=lambda trial: trial.evaluations)
+    best, explicit = trials[0], [trial for trial in trials if trial.method.explicit]
+    if best.method.explicit:
+        reason = f"{best.method} with steps of {best.step:g}: the system is not stiff at this accuracy"
+    elif explicit:
+        ratio = explicit[0].evaluations / best.evaluations
+        reason = (
+            f"{best.method} with steps of {best.step:g}: it is stiff, explicit steps cost {ratio:.1f} times as much"
+        )
+    else:
+        reason = f"{best.method} with steps of {best.step:g}: no explicit method takes steps from this state"
+    return MethodSuggestion(best.method, best.step, reason, tuple(trials))
+
+
+def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
     system = driven(system)
-    method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
+    used = method.pulled(system).on(system)
+    used.check(system)
     x = np.asarray(system.begin(x0, t0) if isinstance(system, DrivenSystem) else system.state(x0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
     taken: list[float] = []
+    iterations = [0]
 
     def keep(t, reached, h, before, after):
         taken.append(h)
+        iterations.append(int(after.fixed_point) + int(after.newton))
         if len(taken) == 30:
             raise _EnoughError
 
     span = (0.0, 1e6 * max(size, 1e-300) / speed)
     with contextlib.suppress(_EnoughError):
-        engine = array.ArrayEngine(system, method)
-        state, advance = engine.begin(x), engine.step
-        run(system, method, advance, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+        engine = Chosen(system, used, "auto", 1)
+        state = engine.begin(x)
+        run(system, used, engine.step, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
         raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < 0.9 * GROWTH * a), len(taken) - 1)
     h = min(taken[settled:])
     digits = 1 - math.floor(math.log10(h))
-    return math.floor(h * 10.0**digits) / 10.0**digits
+    work = used.evaluations * (iterations[-1] - iterations[settled]) / sum(taken[settled:])
+    return Trial(method, math.floor(h * 10.0**digits) / 10.0**digits, work)
 
 
 class _EnoughError(Exception):

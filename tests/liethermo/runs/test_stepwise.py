@@ -387,3 +387,23 @@ def test_bad_tolerances(options, message):
         lt.Adaptive(**options)
     with pytest.raises(lt.InputError, match="entropy production"):
         lt.Relaxed(0.0)
+
+
+# -- the method -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rate", "explicit"), [(1.0, True), pytest.param(300.0, False, marks=pytest.mark.slow)])
+def test_a_method_is_suggested_by_what_it_costs(rate, explicit):
+    system, x0 = lt.models.rigid_body(rate=rate), np.array([0.1, 1.0, 0.1])
+    found = lt.suggest_method(system, x0, 1e-6)
+    assert found.method.explicit == explicit
+    assert ("stiff, explicit steps cost" in found.reason) != explicit
+    assert [trial.evaluations for trial in found.trials] == sorted(trial.evaluations for trial in found.trials)
+    assert found.trials[0].method is found.method
+    assert len(str(found).splitlines()) == len(found.trials) + 2
+    span = 20 * found.step
+    run = lt.integrate(system, x0, (0.0, span), found.step, found.method)
+    exact = lt.integrate(system, x0, (0.0, span), span, lt.Reference(rtol=1e-12, scheme="Radau")).x[-1]
+    assert np.abs(run.x[-1] - exact).max() < 1e-4
+    with pytest.raises(lt.errors.InputError, match="nothing moves"):
+        lt.suggest_method(system, [1.0, 0.0, 0.0])
