@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,7 +203,7 @@ def _inverses(axis_size, batched, matrices):
     return inverse(matrices), True
 
 
-class State(eqx.Module):
+class State(NamedTuple):
     """Everything a run carries from step to step."""
 
     x: jax.Array
@@ -340,7 +339,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         energy_sensitivity=jnp.fmax(state.energy_sensitivity, sizes[0]),
         entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, sizes[1]),
     )
-    failed = eqx.tree_at(lambda s: (s.status, s.residual), state, (failure, residual))
+    failed = state._replace(status=failure, residual=residual)
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -84,7 +82,7 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, ca
 
 def _advice(engine: Chosen, state, h: float, capacity: int) -> str:
     """What helps where a step of size h could not be solved: shorter ones are tried."""
-    state = dataclasses.replace(state, status=jnp.zeros_like(jnp.asarray(state.status)))
+    state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
     for part in SHORTER:
         one = h / part, 1, 1, capacity
         new, _ = engine.advance(state, *one)

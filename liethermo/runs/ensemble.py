@@ -392,7 +392,7 @@ class _Witness:
             parameters, axes = self.family.batched(slice(None))
             state = _begin_all(form, parameters, axes, self.method, jnp.asarray(self.x))
             state, _ = _advance_all(form, parameters, axes, self.method, state, jnp.asarray(self.h), 1, jnp.asarray(1))
-            after = {name: np.asarray(value) for name, value in vars(state).items()}
+            after = {name: np.asarray(value) for name, value in state._asdict().items()}
         moved = np.abs(self._seen(after["x"] + after["low"]) - self._seen(self.x)).max(axis=1)
         found = Evidence(terms=self._terms(own))
         told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
@@ -484,7 +484,7 @@ def _run_array(family: Family, method, states: np.ndarray, times: Timetable, rec
                 saved.append(np.concatenate([kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])], axis=-1))
         except KeyboardInterrupt:
             interrupted = True
-        first, last = ({name: np.asarray(value) for name, value in vars(s).items()} for s in (before, state))
+        first, last = ({name: np.asarray(value) for name, value in s._asdict().items()} for s in (before, state))
         record.put(chosen, first, last, saved)
         if interrupted:
             return

@@ -67,9 +67,9 @@ class Run:
         saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
         capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
         state, interrupted = None, False
-        self.values = [self._energies(self.states[0])]
         try:
             state = self.engine.begin(self.states[0][0])
+            self.values = [np.array([[float(state.energy), float(state.entropy)]])]
             if self.engine.name == "sparse":
                 capacity = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
             self.capacity = capacity
@@ -82,6 +82,7 @@ class Run:
         except KeyboardInterrupt:
             interrupted = True
         if state is None:
+            self.values = [self._energies(self.states[0])]
             self.status = Status("interrupted", "stopped by the user before the first step", 0, self.table.start)
             return
         step = int(state.step)

@@ -46,12 +46,13 @@ def step_loop(
     lanes: int,
     explicit: bool = False,
 ) -> MachineCode:
-    """The function ``advance`` of :class:`Steps` as machine code.
+    """The functions ``advance`` and ``begin`` of :class:`_Steps` as machine code.
 
     Parameters
     ----------
     pieces : mapping
-        ``prepare``, from the state to a guess; ``iterate``, one iteration; ``conclude``, the state after the step.
+        ``begin``, the state of a run about to start; ``prepare``, from the state to a guess; ``iterate``, one
+        iteration; ``conclude``, the state after the step.
     layout : Layout
         Of a block, each row with a number for each lane.
     state : sequence of str
@@ -66,6 +67,8 @@ def step_loop(
     function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
     function.args[0].add_attribute("noalias")
     _Steps(function, pieces, layout, state, varies, lanes, explicit).write_loops()
+    begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "begin")
+    _Steps(begin, pieces, layout, state, varies, lanes, explicit).write_begin()
     return MachineCode(module)
 
 
@@ -80,8 +83,8 @@ class _Steps(Writer):
     def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool):
         super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
         self.pieces, self.layout, self.state, self.explicit = pieces, layout, state, explicit
-        names = "p blocks done count saves every out most newton".split()
-        self.argument = dict(zip(names, function.args, strict=True))
+        names = "p blocks done count saves every out most newton" if len(function.args) > 3 else "p blocks count"
+        self.argument = dict(zip(names.split(), function.args, strict=True))
         own = np.cumsum(varies) - 1
         self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
         slots = [name for name in layout.sizes if name != "p"]
@@ -99,8 +102,7 @@ class _Steps(Writer):
         for slot in itertools.chain.from_iterable(self.slots.values()):
             build.store(self.constant(0.0), slot)
         with self.counted(argument["count"]) as i:
-            size = build.mul(i, self.whole_number(self.layout.height * self.lanes))
-            build.store(build.gep(argument["blocks"], [size]), self.block)
+            self.enter(i)
             done = build.gep(argument["done"], [i])
             total = build.mul(argument["saves"], argument["every"])
             limit = build.add(build.load(done), argument["most"])
@@ -121,6 +123,20 @@ class _Steps(Writer):
                     self.keep(i, build.sdiv(build.load(done), argument["every"]))
             self.save(self.state)
         build.ret(argument["count"])
+
+    def write_begin(self) -> None:
+        """``begin(p, blocks, count)``: from the x of each trajectory the state of a run about to start there."""
+        with self.counted(self.argument["count"]) as i:
+            self.enter(i)
+            self.load(("x",))
+            self.run("begin")
+            self.save([name for name in self.state if name in self.pieces["begin"].results])
+        self.builder.ret_void()
+
+    def enter(self, i: ir.Value) -> None:
+        """Work on block i from here on."""
+        size = self.builder.mul(i, self.whole_number(self.layout.height * self.lanes))
+        self.builder.store(self.builder.gep(self.argument["blocks"], [size]), self.block)
 
     def step(self, i: ir.Value) -> None:
         """One step of every lane that is running; where one fails its state stays and a status says why."""

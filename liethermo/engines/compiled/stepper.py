@@ -12,7 +12,6 @@ import ctypes
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import jax
@@ -31,7 +30,7 @@ from .loop import Layout, Piece, step_loop
 from .machine_code import MachineCode
 from .newton import solver
 
-FIELDS = tuple(field.name for field in fields(State))
+FIELDS = State._fields
 ITERATION = ("guess", "update", "best", "stalled", "rate", "made")
 
 
@@ -72,7 +71,7 @@ class CompiledEngine:
         return self._state(blocks), out
 
     def _state(self, blocks: np.ndarray) -> State:
-        return State(**{name: value[0] for name, value in self._stepper.fields(blocks).items()})
+        return State(*(value[0] for value in self._stepper.fields(blocks).values()))
 
 
 class Stepper:
@@ -104,7 +103,7 @@ class Stepper:
         self.lanes, self._rules, self._varies = lanes, rules, varies
         self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
         self._lock = threading.Lock()
-        self._advance: tuple[MachineCode, Callable] | None = None
+        self._functions: tuple[Callable, Callable] | None = None
         self._newton: MachineCode | None = None
         system, size = form.build(parameters), form.size
         n, stages = system.dim, method.stages
@@ -158,7 +157,7 @@ class Stepper:
             ),
         }
         self._pieces = pieces
-        self._start = self._piece(begin, "p x", FIELDS).program
+        self._start = self._piece(begin, "p x", FIELDS)
         own_size = int(varies.sum())
         rows = (*FIELDS, "h", *ITERATION, *after, "defined", "newtons", "noise")
         self._layout = Layout({name: self._shapes.get(name, ()) for name in rows} | {"p": (own_size,)})
@@ -182,11 +181,26 @@ class Stepper:
 
         ``parameters`` has shape (p,), or (trajectories, p) where some vary.
         """
-        own = np.broadcast_to(parameters, (len(x), len(self._varies)))
-        return self.blocks(dict(zip(FIELDS, self._start.evaluate(own, x, batch=True), strict=True)), own)
+        blocks = self.blocks({"x": x}, parameters)
+        first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
+        status = self._part(blocks, "status").copy()
+        self._code()[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
+        self._part(blocks, "status")[...] = status  # empty lanes stay empty
+        return blocks
+
+    def _part(self, blocks: np.ndarray, name: str) -> np.ndarray:
+        """A field of blocks, shape (blocks, entries, lanes)."""
+        first, size = self._layout.rows[name], self._layout.sizes[name]
+        return blocks.reshape(len(blocks), self._height, self.lanes)[:, first : first + size]
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields of :class:`.array.State`, trajectories first."""
+        if len(fields["x"]) == self.lanes == 1 and not self._varies.any():  # nothing to rearrange
+            whole = np.zeros((1, self._height))
+            for name, values in fields.items():
+                first = self._layout.rows[name]
+                whole[0, first : first + self._layout.sizes[name]] = np.ravel(values[0])
+            return whole
         number, lanes, rows = len(fields["x"]), self.lanes, self._layout.rows
         count = -(-number // lanes)
         blocks = np.zeros((count, self._height, lanes))
@@ -197,8 +211,8 @@ class Stepper:
                 values = np.concatenate([values, np.repeat(values[-1:], count * lanes - number, axis=0)])
             blocks[:, first : first + values.shape[1]] = values.reshape(count, lanes, -1).swapaxes(1, 2)
 
-        for name in FIELDS:
-            fill(rows[name], fields[name])
+        for name, values in fields.items():
+            fill(rows[name], values)
         if self._varies.any():
             fill(rows["p"], parameters[:, self._varies])
         blocks[-1, rows["status"], lanes - (count * lanes - number) :] = EMPTY
@@ -228,19 +242,21 @@ class Stepper:
         arguments = [parameters.ctypes.data, blocks.ctypes.data, done.ctypes.data, count, saves, every]
         arguments += [out.ctypes.data, saves * every]
         solve = 0 if self._newton is None else self._solver()
-        while self._loop()(*arguments, solve) < count:
+        while self._code()[1](*arguments, solve) < count:
             solve = self._solver()
         return out.reshape(count, saves, n + 2, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, n + 2)
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
-    def _loop(self) -> Callable:
-        """The function ``advance``, compiled or found compiled."""
+    def _code(self) -> tuple[Callable, Callable]:
+        """The functions ``begin`` and ``advance``, compiled or found compiled."""
         with self._lock:
-            if self._advance is None:
-                code = step_loop(self._pieces, self._layout, (*FIELDS, "h"), self._varies, self.lanes, self._explicit)
-                self._advance = code, ADVANCE(code.address("advance"))  # the code is unloaded with this object
-            return self._advance[1]
+            if self._functions is None:
+                pieces = self._pieces | {"begin": self._start}
+                code = step_loop(pieces, self._layout, (*FIELDS, "h"), self._varies, self.lanes, self._explicit)
+                self._loaded = code  # unloaded with this object
+                self._functions = BEGIN(code.address("begin")), ADVANCE(code.address("advance"))
+            return self._functions
 
     def _solver(self) -> int:
         """The address of Newton's method, which is compiled when a step first needs it."""
@@ -349,6 +365,8 @@ def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> 
 
 ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
                            ctypes.c_int64, ctypes.c_void_p)  # fmt: skip
+
+BEGIN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 
 EMPTY = 9.0
 """Status of a lane without a trajectory."""
