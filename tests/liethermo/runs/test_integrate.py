@@ -158,7 +158,7 @@ def test_one_iteration_is_not_enough_and_says_so(method):
     """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     engine = array.ArrayEngine(system, method.on(system), Rules(fixed_point=1, newton=1))
-    state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.1, 10, 1, 16)
+    state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1, 16)
     assert int(state.status) == (array.RUNNING if method.explicit else array.NOT_CONVERGED)
     assert int(state.step) == (10 if method.explicit else 0)
 
