@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import check_matrix, checked_rate, semidefinite
 

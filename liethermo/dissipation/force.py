@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
-
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import needed_algebra, zero_state
 

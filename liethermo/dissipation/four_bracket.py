@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import check_matrix, form_at, semidefinite, zero_state
 from .inner_product import InnerProductDissipation, KillingDissipation

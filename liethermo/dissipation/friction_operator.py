@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import check_matrix, checked_rate, form_at, semidefinite
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +9,6 @@ import numpy as np
 import manifolds as mf
 
 from ..errors import IndefiniteError, InputError
-
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import checked_rate, needed_algebra, semidefinite
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,9 +10,6 @@ import jax.numpy as jnp
 
 from ..functions.checks import recognised
 from ..functions.energy import Energy, as_energy
-
-if TYPE_CHECKING:
-    pass
 from .base import Dissipation
 from .checks import checked_rate, form_at, semidefinite
 

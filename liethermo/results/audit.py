@@ -300,12 +300,16 @@ def _rounding(series: np.ndarray, sensitivity: float | None, terms: float | None
     return Rounding(abs(float(series[0])), largest, _or(terms, 0.0))
 
 
+INEXACT = "not kept exactly by this method"
+"""Beside a law that a method does not claim to keep."""
+
+
 def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:
     return AuditRow(law, float(value), tolerance, bool(value <= tolerance), note)
 
 
 def _note(laws: Laws, law: str) -> str:
-    return "not kept exactly by this method" if law in laws.inexact else ""
+    return INEXACT if law in laws.inexact else ""
 
 
 def _or(value: float | None, otherwise: float) -> float:

@@ -1,0 +1,66 @@
+"""Each addition goes through the suite of its kind in one call, and runs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from tests.additions.algebra import OSCILLATOR
+from tests.additions.dissipation import Steep
+from tests.additions.group import AFFINE
+from tests.additions.integrator import Simpson
+from tests.additions.space import Ring
+from tests.additions.system import LotkaVolterra
+
+PREY = LotkaVolterra([[0.0, -1.0, 0.5], [1.0, 0.0, -0.8], [-0.5, 0.8, 0.0]], [1.0, 1.2, 0.9])
+
+
+def test_the_algebra():
+    assert mf.testing.check_algebra(OSCILLATOR).passed
+    quadratic = OSCILLATOR.casimirs(2)
+    system = lt.LiePoissonSystem(OSCILLATOR, lt.Quadratic([1.0, 2.0, 3.0, 1.0]), quadratic[0], Steep(0.1))
+    assert lt.integrate(system, [0.5, 0.2, 1.0, 0.7], (0.0, 5.0), 0.05).audit().passed
+
+
+def test_the_group():
+    assert mf.testing.check_group(AFFINE).passed
+    body = lt.LiePoissonSystem(AFFINE.algebra, lt.Quadratic([1.0, 2.0]), group=AFFINE)
+    run = lt.integrate(body, [0.3, 0.8], (0.0, 2.0), 0.05, attitude=np.eye(2))
+    assert run.audit().passed
+    assert float(np.max(AFFINE.defect(run.attitude))) < 1e-13
+
+
+def test_the_space():
+    assert mf.testing.check_space(Ring()).passed
+    system = lt.MetriplecticSystem(
+        None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, lt.ProjectedMetric(normalized=True), space=Ring()
+    )
+    run = lt.integrate(system, system.space.random(0), (0.0, 2.0), 0.1, lt.MetriplecticRungeKutta(4))
+    assert run.audit().passed
+    assert system.space.belongs(run.x).all()
+
+
+def test_the_dissipation():
+    assert lt.testing.check_dissipation(Steep(0.2), mf.so(3)).passed
+
+
+def test_the_integrator():
+    assert lt.testing.check_method(Simpson()).passed
+
+
+def test_the_system():
+    x0 = [1.5, 0.7, 1.0]
+    assert lt.testing.check_system(PREY, x0).passed
+    run = lt.integrate(PREY, x0, (0.0, 20.0), 0.1, lt.MetriplecticRungeKutta(6))
+    assert run.audit().passed
+    with pytest.raises(lt.InputError, match="no members"):
+        lt.integrate(PREY, [1.0, -1.0, 1.0], (0.0, 1.0), 0.1)
+
+
+def test_what_an_addition_costs():
+    """Lines of each file, with its imports and its docstring."""
+    lines = {path.stem: len(path.read_text().splitlines()) for path in Path(__file__).parent.glob("[a-s]*.py")}
+    assert set(lines) == {"algebra", "dissipation", "group", "integrator", "space", "system"}
+    assert max(lines.values()) <= 30, lines
