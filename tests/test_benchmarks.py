@@ -19,7 +19,7 @@ from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
 from benchmarks.report import Target
 from benchmarks.timing import race
-from liethermo.engines import array
+from liethermo.engines.codes import Code
 from liethermo.engines.rules import RULES
 
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
@@ -82,7 +82,7 @@ def test_c_is_handed_the_library_s_rules():
         assert f"define {name}" not in header
     statuses = re.search(r"enum \{ (.*) \};", header)
     assert statuses is not None
-    assert [getattr(array, name) for name in statuses[1].split(", ")] == [0, 1, 2]
+    assert statuses[1].split(", ") == ["RUNNING", *(code.name for code in (Code(1), Code(2)))]
 
 
 @pytest.mark.sampled(1)

@@ -21,9 +21,8 @@ from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
+from .codes import Code
 from .rules import EPS, RULES, Rules
-
-RUNNING, NOT_CONVERGED, NON_FINITE = 0, 1, 2
 
 DENSE_LIMIT = 12_000
 """Unknowns of a step up to which a full Jacobian matrix is formed (1.2 GB); larger ones have fixed-point iteration \
@@ -310,7 +309,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     x, low = state.x, state.low
     new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
-    failure = jnp.where(solved.converged | ~solved.defined, NON_FINITE, NOT_CONVERGED)
+    failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
     size = jnp.maximum(jnp.max(jnp.abs(x)), h * solved.noise)
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
@@ -358,10 +357,10 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
         target = state.step + every
 
         def goes_on(s: State):
-            return (s.status == RUNNING) & (s.step < target) & (index < saves)
+            return (s.status == Code.COMPLETED) & (s.step < target) & (index < saves)
 
         state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h, rules), state)
-        reached = (state.status == RUNNING) & (index < saves)
+        reached = (state.status == Code.COMPLETED) & (index < saves)
         return state, (state.x, state.energy, state.entropy, reached)
 
     return jax.lax.scan(one_save, state, jnp.arange(capacity))

@@ -9,6 +9,7 @@ import numpy as np
 
 from manifolds._tables import Row, table
 
+from ..engines.codes import Code
 from ..errors import InputError
 
 if TYPE_CHECKING:
@@ -245,9 +246,11 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
         rows.append(_verdict("attitude in group", stats.attitude_residual, tolerances.attitude))
     rows += _of_the_steps(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
-    failed = not status.ok and status.code != "interrupted"
+    failed = not status.ok and status.code != Code.INTERRUPTED.text
     rows.append(
-        AuditRow("steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else status.code)
+        AuditRow(
+            "steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else str(status.code)
+        )
     )
     return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows))
 

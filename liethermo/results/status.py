@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..engines.codes import TEXTS, Code
+from ..errors import InputError
+
 
 @dataclass(frozen=True)
 class Status:
@@ -11,8 +14,9 @@ class Status:
 
     Attributes
     ----------
-    code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted",
-        "reference_failed"}
+    code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
+"reference_failed"}
+        Or its :class:`liethermo.engines.codes.Code`.
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
@@ -23,15 +27,20 @@ class Status:
         ``h |k - slopes(k)| / |x|`` of the last step tried.
     """
 
-    code: str
+    code: str | Code
     message: str
     step: int
     time: float
     residual: float = 0.0
 
+    def __post_init__(self):
+        object.__setattr__(self, "code", self.code.text if isinstance(self.code, Code) else self.code)
+        if self.code not in TEXTS:
+            raise InputError(f"no status {self.code!r}; there are {', '.join(TEXTS)}")
+
     @property
     def ok(self) -> bool:
-        return self.code in ("completed", "event")
+        return self.code in (Code.COMPLETED.text, Code.EVENT.text)
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"

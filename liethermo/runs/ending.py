@@ -7,6 +7,7 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import Chosen
+from ..engines.codes import Code
 from ..engines.rules import RULES
 from ..results.status import Stats, Status
 from .adaptive import Adaptive
@@ -36,48 +37,48 @@ def given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
     if outcome.limit == "steps":
         text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
         text += "Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer"
-        return Status("step_limit", text, steps, now, residual)
+        return Status(Code.STEP_LIMIT, text, steps, now, residual)
     if outcome.limit:
         text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "
-        return Status("step_limit", text + "save_every or save_at keeps fewer states", steps, now, residual)
+        return Status(Code.STEP_LIMIT, text + "save_every or save_at keeps fewer states", steps, now, residual)
     text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and "
-    if int(outcome.state.status) == array.RUNNING:
+    if int(outcome.state.status) == Code.COMPLETED:
         text += "the error is still too large: the tolerance may be below what rounding allows, or the functions not "
         text += f"smooth there. Try a larger tolerance than {step}"
     else:
         text += "its equations are still not solved, so no step size helps: check that the functions are smooth and "
         text += "finite near that state"
-    return Status("step_underflow", text, steps, now, residual)
+    return Status(Code.STEP_UNDERFLOW, text, steps, now, residual)
 
 
 def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, capacity: int = 1) -> Status:
     """How fixed steps of size h ended, or a step that could not be taken."""
     code, step, residual = int(state.status), int(state.step), float(state.residual)
     if interrupted:
-        return Status("interrupted", f"stopped by the user after step {step}, t = {now:g}", step, now)
-    if code == array.RUNNING:
-        return Status("completed", f"reached t = {now:g} in {step} steps", step, now, residual)
+        return Status(Code.INTERRUPTED, f"stopped by the user after step {step}, t = {now:g}", step, now)
+    if code == Code.COMPLETED:
+        return Status(Code.COMPLETED, f"reached t = {now:g} in {step} steps", step, now, residual)
     where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
-    if code == array.NOT_CONVERGED and engine.method.explicit:
+    if code == Code.NOT_CONVERGED and engine.method.explicit:
         message = (
             f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
             f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e}). "
             + _advice(engine, state, h, capacity)
         )
-        return Status("not_converged", message, step, now, residual)
-    if code == array.NOT_CONVERGED:
+        return Status(Code.NOT_CONVERGED, message, step, now, residual)
+    if code == Code.NOT_CONVERGED:
         message = (
             f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
             f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). "
             + _advice(engine, state, h, capacity)
         )
-        return Status("not_converged", message, step, now, residual)
+        return Status(Code.NOT_CONVERGED, message, step, now, residual)
     message = (
         f"NaN or infinity in {where}: the energy, the entropy or the vector field is not finite there "
         f"({_culprit(engine, state, h)}). Check the domain of your functions along the trajectory, or try "
         "a smaller step"
     )
-    return Status("non_finite", message, step, now, residual)
+    return Status(Code.NON_FINITE, message, step, now, residual)
 
 
 def _advice(engine: Chosen, state, h: float, capacity: int) -> str:
@@ -86,7 +87,7 @@ def _advice(engine: Chosen, state, h: float, capacity: int) -> str:
     for part in SHORTER:
         one = h / part, 1, 1, capacity
         new, _ = engine.advance(state, *one)
-        if int(new.status) == array.RUNNING:
+        if int(new.status) == Code.COMPLETED:
             stiff = (
                 "; if that is far below what the motion needs, it is stiff, and lt.MetriplecticGauss takes long steps"
             )

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
+from ..engines.codes import TEXTS, Code
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import Form, numbers_of
 from ..errors import InputError
@@ -52,7 +53,7 @@ BATCH = 4096
 ARRAY_BATCH = 65_536
 """Trajectories that the array engine takes at once: bounded memory."""
 
-STATUSES = ("completed", "not_converged", "non_finite", "interrupted")
+STATUSES = TEXTS
 
 
 @dataclass(frozen=True)
@@ -297,7 +298,7 @@ class _Record:
         names = "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale"
         names += " relaxation_time residual energy_sensitivity entropy_sensitivity first_energy entropy_change distance"
         self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in names.split()}
-        self.status = np.full(size, STATUSES.index("interrupted"), dtype=np.int8)
+        self.status = np.full(size, Code.INTERRUPTED, dtype=np.int8)
         self.steps, self.iterations = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self.x = self.path = None
         self.work = np.full(size, np.nan)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..engines import array
+from ..engines.codes import Code
 from ..errors import FunctionError, InputError
 from ..systems import System
 from ..tracing.interpret import evaluator
@@ -85,7 +85,7 @@ def located(event: Event, advance: Callable, system, method, state, new, h: floa
         if theta in (0.0, 1.0):
             return after if theta else before
         end = advance(state, theta * h)
-        found = event(np.asarray(end.x)) if int(end.status) == array.RUNNING else math.nan
+        found = event(np.asarray(end.x)) if int(end.status) == Code.COMPLETED else math.nan
         if math.isfinite(found):
             return found
         return event(np.asarray(method.along(system, x, h * method.weights(theta) @ k)))

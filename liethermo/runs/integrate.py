@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from typing import Literal
 
+from ..engines.codes import Code
 from ..errors import ConvergenceError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.solution import Solution
@@ -16,6 +17,8 @@ from .preparation import NO_GROUP, as_run, check_choice, prepared
 from .progress import Progress
 from .run import Run
 from .timetable import Timetable
+
+UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
 
 
 def integrate(
@@ -124,8 +127,8 @@ def integrate(
     solution = run.solution()
     if save_to is not None:
         solution.save(save_to)
-    if on_failure == "raise" and solution.status.code in ("not_converged", "step_underflow", "step_limit"):
+    if on_failure == "raise" and solution.status.code in UNSOLVED:
         raise ConvergenceError(solution.status.message, solution)
-    if on_failure == "raise" and solution.status.code in ("non_finite", "reference_failed"):
+    if on_failure == "raise" and not solution.status.ok and solution.status.code != Code.INTERRUPTED.text:
         raise NonFiniteError(solution.status.message, solution)
     return solution

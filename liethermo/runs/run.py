@@ -17,6 +17,7 @@ from ..engines import array
 from ..engines.choice import (
     Chosen,
 )
+from ..engines.codes import Code
 from ..integrators import OneStepMethod, Reference
 from ..results.dense import Dense
 from ..results.evidence import MEASURED, Witness, spread
@@ -76,14 +77,14 @@ class Run:
             for h, saves, every in self.table.calls(saves=capacity):
                 state = self._advance(state, h, saves, every, capacity)
                 bar.update(self.times[-1])
-                if int(state.status) != array.RUNNING:
+                if int(state.status) != Code.COMPLETED:
                     break
                 self._checkpoint(state)
         except KeyboardInterrupt:
             interrupted = True
         if state is None:
             self.values = [self._energies(self.states[0])]
-            self.status = Status("interrupted", "stopped by the user before the first step", 0, self.table.start)
+            self.status = Status(Code.INTERRUPTED, "stopped by the user before the first step", 0, self.table.start)
             return
         step = int(state.step)
         now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
@@ -115,7 +116,7 @@ class Run:
             state = self.engine.begin(self.states[0][0])
         except KeyboardInterrupt:
             self.values = [self._energies(self.states[0])]
-            self.status = Status("interrupted", "stopped by the user before the first step", 0, start)
+            self.status = Status(Code.INTERRUPTED, "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
         numbers = self.system.dim * ((1 if save_at is None else 0) / every + (self.method.stages + 1 if dense else 0))
@@ -146,7 +147,7 @@ class Run:
             self.status = given_up(outcome, step, end, now)
         elif event is not None and outcome.event_time is not None:
             text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
-            self.status = Status("event", text, steps, now, float(state.residual))
+            self.status = Status(Code.EVENT, text, steps, now, float(state.residual))
         else:
             h = step if isinstance(step, float) else float("nan")
             self.status = status_of(self.engine, state, now, h, outcome.interrupted)
@@ -185,7 +186,7 @@ class Run:
         try:
             x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
         except KeyboardInterrupt:
-            self.status = Status("interrupted", "stopped by the user before SciPy returned anything", 0, times[0])
+            self.status = Status(Code.INTERRUPTED, "stopped by the user before SciPy returned anything", 0, times[0])
             return
         self.times, self.states = list(times[: len(x)]), [x]
         self.values = [self._energies(x)]
@@ -194,9 +195,9 @@ class Run:
         bar.update(now)
         if message:
             text = f"SciPy's {self.method.scheme} stopped after t = {now:g}: {message}"
-            self.status = Status("reference_failed", text, len(x) - 1, now)
+            self.status = Status(Code.REFERENCE_FAILED, text, len(x) - 1, now)
         else:
-            self.status = Status("completed", f"reached t = {now:g}", len(x) - 1, now)
+            self.status = Status(Code.COMPLETED, f"reached t = {now:g}", len(x) - 1, now)
 
     def _energies(self, x: np.ndarray) -> np.ndarray:
         return np.stack(at_points(array.values, self.system, x), axis=1)
@@ -219,7 +220,7 @@ class Run:
                 name: at_points(_value, function, x)
                 for name, function in {**{name: f for name, (f, _) in invariants.items()}, **system.ledger}.items()
             },
-            status=self.status or Status("interrupted", "still running", len(x) - 1, self.times[-1]),
+            status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=wall),
             laws=laws,
             provenance=self._provenance(),

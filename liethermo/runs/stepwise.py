@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engines import array
+from ..engines.codes import Code
 from ..errors import InputError
 from ..systems import System
 from .adaptive import UNDERFLOW, Adaptive, Control, Growth, allowed_error, first_step, judged
@@ -90,7 +90,7 @@ def run(
             tried += 1
             if adaptive is not None:
                 error, longest = math.inf, math.inf
-                if int(new.status) == array.RUNNING:
+                if int(new.status) == Code.COMPLETED:
                     found, longest = judged(growth, system, method, state, new, h)
                     error = found / allowed_error(adaptive, state, new)
                 if not error <= 1.0 or h > 1.1 * longest:
@@ -100,12 +100,12 @@ def run(
                     control.h = min(control.h, longest)
                     if control.h < shortest:
                         outcome.underflow = control.h
-                        outcome.state = new if int(new.status) != array.RUNNING else state
+                        outcome.state = new if int(new.status) != Code.COMPLETED else state
                         return outcome
                     continue
                 control.accept(error, h)
                 control.h = min(control.h, growth.longest(control.h))
-            if int(new.status) != array.RUNNING:
+            if int(new.status) != Code.COMPLETED:
                 outcome.state = new
                 return outcome
             after = event(np.asarray(new.x)) if event else 0.0

@@ -20,6 +20,7 @@ from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.programs import program
 from .. import array
+from ..codes import Code
 from ..rules import RULES
 from .linear import Compression, Inverse
 
@@ -60,9 +61,9 @@ class SparseEngine:
         for _ in range(int(saves)):
             for _ in range(int(every)):
                 state = self.step(state, h)
-                if int(state.status) != array.RUNNING:
+                if int(state.status) != Code.COMPLETED:
                     break
-            if int(state.status) != array.RUNNING:
+            if int(state.status) != Code.COMPLETED:
                 break
             kept.append(state)
         x = np.array([np.asarray(s.x) for s in kept]).reshape(len(kept), self.system.dim)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from liethermo.engines.codes import Code
 
 X0 = [0.001, 1.0, 0.001]
 
@@ -209,3 +210,11 @@ def test_double_precision_is_on():
     import jax.numpy as jnp
 
     assert jnp.zeros(()).dtype == np.float64
+
+
+def test_statuses_have_one_vocabulary():
+    for code in Code:
+        assert lt.Status(code, "a sentence", 1, 0.0) == lt.Status(code.text, "a sentence", 1, 0.0)
+    assert [code.text for code in Code if lt.Status(code, "", 0, 0.0).ok] == ["completed", "event"]
+    with pytest.raises(lt.InputError, match=r"no status 'finished'; there are completed, not_converged"):
+        lt.Status("finished", "a sentence", 1, 0.0)

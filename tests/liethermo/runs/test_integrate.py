@@ -11,6 +11,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
+from liethermo.engines.codes import Code
 from liethermo.engines.rules import RULES, Rules
 from liethermo.runs import run as loop
 
@@ -159,7 +160,7 @@ def test_one_iteration_is_not_enough_and_says_so(method):
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     engine = array.ArrayEngine(system, method.on(system), Rules(fixed_point=1, newton=1))
     state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1, 16)
-    assert int(state.status) == (array.RUNNING if method.explicit else array.NOT_CONVERGED)
+    assert int(state.status) == (Code.COMPLETED if method.explicit else Code.NOT_CONVERGED)
     assert int(state.step) == (10 if method.explicit else 0)
 
 
