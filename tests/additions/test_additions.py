@@ -42,10 +42,12 @@ def test_the_space():
     assert system.space.belongs(run.x).all()
 
 
+@pytest.mark.slow
 def test_the_dissipation():
     assert lt.testing.check_dissipation(Steep(0.2), mf.so(3)).passed
 
 
+@pytest.mark.slow
 def test_the_integrator():
     assert lt.testing.check_method(Simpson()).passed
 

@@ -80,6 +80,7 @@ def test_order_conditions(order, stages):
 # -- orders -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize(("system", "x0"), nonlinear_systems())
 def test_observed_order(system, x0, order):
@@ -110,6 +111,7 @@ def assert_laws(many):
     assert (many.least_entropy_increment >= -4 * EPS * np.maximum(many.entropy_scale, many.entropy_sensitivity)).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_laws_of_random_systems(order):
     assert_laws(random_run(mf.so(3), 24, 500, order))
@@ -123,6 +125,7 @@ def test_laws_of_a_thousand_systems(g, order):
     assert_laws(random_run(g, 143, 1000, order))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_drift_over_a_hundred_thousand_steps(order):
     assert_no_drift(order, 100_000)
@@ -146,6 +149,7 @@ def assert_no_drift(order, steps):
             assert np.abs(run.entropy / run.entropy[0] - 1.0).max() <= 2e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_a_state_that_relaxes_goes_on_at_its_rate(order):
     """No rounding holds it off the equilibrium: the deviation decays by 1e-45, at the rate of the linear motion."""
@@ -160,6 +164,7 @@ def test_a_state_that_relaxes_goes_on_at_its_rate(order):
     assert run.audit().passed
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("rate", [0.0, 1e-6, 1.0])
 def test_saddles_and_weak_friction(order, rate):
@@ -184,6 +189,7 @@ def kepler():
     )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("excess", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
 def test_dependent_gradients(order, excess):
@@ -224,6 +230,7 @@ def test_a_driven_body():
 # -- stiffness, adaptive steps, derivatives, engines ------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_stiffness_ends_with_advice(order):
     stiff = lt.models.rigid_body(rate=200.0)
@@ -236,6 +243,7 @@ def test_stiffness_ends_with_advice(order):
     assert adaptive.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_adaptive_steps_events_and_output_between(order):
     exact = lt.integrate(BODY, X0, (0.0, 10.0), 10.0, lt.Reference(rtol=1e-13)).x[-1]
@@ -253,6 +261,7 @@ def test_adaptive_steps_events_and_output_between(order):
     assert event.x[-1][1] == pytest.approx(0.5, abs=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_engines_take_the_same_steps(order):
     quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4  # noqa: E731
@@ -267,6 +276,7 @@ def test_engines_take_the_same_steps(order):
     assert np.abs(many - alone).max() <= 1e-15 * np.abs(many).max()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_derivatives(order):
     """Against differences of fourth order, by the state and by a parameter."""
@@ -312,6 +322,7 @@ class Uncorrected(RK):
         return 0.0 * super().missed(system, x, low, h, k)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_without_corrections_the_energy_drifts_at_the_order_of_the_method(order):
     steps, x0 = np.array({4: [20, 30, 45], 6: [14, 20, 28], 8: [10, 14, 20]}[order]), 6.0 * X0
