@@ -296,8 +296,8 @@ REFUSALS = {
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
         [
-            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", "Reference" '
-            "(did you mean Reference?)"
+            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", '
+            '"MetriplecticRungeKutta", "Reference" (did you mean Reference?)'
         ],
     ),
     "option of a method": (
