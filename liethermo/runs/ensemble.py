@@ -44,8 +44,8 @@ from .family import Family, common_size
 from .preparation import NO_GROUP, as_run, check_choice, laws_of
 from .timetable import CHUNK_STEPS, Timetable
 
-LANES = 16
-"""Trajectories in a block of the compiled engine: two AVX-512 vectors, enough to hide the latency of arithmetic."""
+LANES = 8
+"""Trajectories in a block of the compiled engine: one AVX-512 vector or two of AVX2."""
 
 BATCH = 4096
 """Trajectories that a thread of the compiled engine takes at once: enough to hide the cost of Python."""
@@ -426,6 +426,11 @@ def _first_errors(model: tuple[Form, OneStepMethod, int], step):
     return error_at(system, method, step[p:])
 
 
+KEPT_BEFORE = ("x", "energy", "entropy")
+KEPT_AFTER = tuple(name for name in array.State._fields if name not in ("low", "k", "before"))
+"""Fields of the states of a batch that its record is made from."""
+
+
 def _cores() -> int:
     """That this process may use, where the system tells."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -435,7 +440,7 @@ def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, 
     """Blocks of lanes, dealt out to a thread for each core; the loop does not hold the interpreter's lock."""
     cores, stop = _cores(), threading.Event()
     size = len(states)
-    portion = min(BATCH, LANES * math.ceil(size / (LANES * 4 * cores)))
+    portion = min(BATCH, LANES * math.ceil(size / (LANES * 2 * cores)))
     own = numbers_of(method)
     first_member = np.append(family.flat(slice(0, 1), 1)[0], own)
     varies = np.append(family.varies, np.zeros(len(own), dtype=bool))
@@ -446,15 +451,17 @@ def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, 
         if stop.is_set():
             return
         number = chosen.stop - first
-        parameters = np.hstack([family.flat(chosen, number), np.broadcast_to(own, (number, len(own)))])
+        parameters = first_member
+        if varies.any():
+            parameters = np.hstack([family.flat(chosen, number), np.broadcast_to(own, (number, len(own)))])
         blocks = stepper.begin(parameters, states[chosen])
-        before = {name: value[:number].copy() for name, value in stepper.fields(blocks).items()}
+        before = {name: value[:number].copy() for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
         saved = []
         for h, saves, every in times.calls(CHUNK_STEPS * 16 // portion):
             if stop.is_set():
                 break
             saved.append(stepper.run(first_member, blocks, h, saves, every)[:number])
-        after = {name: value[:number] for name, value in stepper.fields(blocks).items()}
+        after = {name: value[:number] for name, value in stepper.fields(blocks, KEPT_AFTER).items()}
         record.put(chosen, before, after, saved)
 
     with ThreadPoolExecutor(cores) as pool:

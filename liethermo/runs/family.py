@@ -31,10 +31,13 @@ class Family:
         Builds a member from its parameters, a list of arrays.
     values : list of ndarray
         The parameters of all members, members first; one member where all have the same.
+    alike : System, optional
+        The one system that all members are: what has been found for it once need not be found again.
     """
 
     form: Form
     values: list[np.ndarray]
+    alike: System | None = None
 
     @classmethod
     def of(cls, system, parameters) -> Family:
@@ -64,7 +67,7 @@ class Family:
             if values[name].ndim == 0 or values[name].shape[1:] != leaves[name].shape:
                 wanted = ", ".join(["trajectories", *map(str, leaves[name].shape)])
                 raise InputError(f"the values of {name} have shape ({wanted}), not {values[name].shape}")
-        return cls(Form.of(system), list(values.values()))
+        return cls(Form.of(system), list(values.values()), None if parameters else system)
 
     @classmethod
     def _of_function(cls, build: Callable, parameters) -> Family:
@@ -128,7 +131,7 @@ class Family:
         return [jnp.asarray(value[i if len(value) > 1 else 0]) for value in self.values]
 
     def member(self, i: int) -> System:
-        return self.form.rebuild(self.arrays(i))
+        return self.form.rebuild(self.arrays(i)) if self.alike is None else self.alike
 
     def extremes(self) -> list[int]:
         """The members with the smallest and the largest parameters: what is out of range shows there."""

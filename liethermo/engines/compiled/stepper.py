@@ -9,9 +9,8 @@ finds it.
 from __future__ import annotations
 
 import ctypes
-import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -159,8 +158,11 @@ class Stepper:
         self._pieces = pieces
         self._start = self._piece(begin, "p x", FIELDS)
         own_size = int(varies.sum())
-        rows = (*FIELDS, "h", *ITERATION, *after, "defined", "newtons", "noise")
-        self._layout = Layout({name: self._shapes.get(name, ()) for name in rows} | {"p": (own_size,)})
+        working = (*ITERATION, *after, "defined", "newtons", "noise")
+        shapes = {name: self._shapes.get(name, ()) for name in (*FIELDS, "h")} | {"p": (own_size,)}
+        shapes |= {name: self._shapes.get(name, ()) for name in working}
+        # Newton's method is handed these in the block; without it they stay in registers
+        self._layout = Layout(shapes, working if method.explicit else ())
         self._height = self._layout.height
 
     @property
@@ -218,14 +220,13 @@ class Stepper:
         blocks[-1, rows["status"], lanes - (count * lanes - number) :] = EMPTY
         return blocks.reshape(count, -1)
 
-    def fields(self, blocks: np.ndarray) -> dict[str, np.ndarray]:
-        """The fields of :class:`.array.State`, trajectories first, those of empty lanes among them."""
-        count, rows = len(blocks), self._layout.rows
-        values = blocks.reshape(count, self._height, self.lanes).swapaxes(1, 2).reshape(count * self.lanes, -1)
-        return {
-            name: values[:, rows[name] : rows[name] + math.prod(shape)].reshape(-1, *shape)
-            for name, shape in ((name, self._shapes.get(name, ())) for name in FIELDS)
-        }
+    def fields(self, blocks: np.ndarray, names: Sequence[str] = FIELDS) -> dict[str, np.ndarray]:
+        """Fields of :class:`.array.State`, trajectories first, those of empty lanes among them."""
+        found = {}
+        for name in names:
+            values = self._part(blocks, name).swapaxes(1, 2)
+            found[name] = values.reshape(len(blocks) * self.lanes, *self._shapes.get(name, ()))
+        return found
 
     def run(self, parameters, blocks: np.ndarray, h: float, saves: int, every: int) -> np.ndarray:
         """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
