@@ -99,7 +99,7 @@ class _Steps(Writer):
             name: [self.builder.alloca(self.number, name=f"{name}_{i}") for i in range(layout.sizes[name])]
             for name in slots
         }
-        self.truth = {name: self.builder.alloca(self.test, name=name) for name in ("running", "active", "hard")}
+        self.truth = {name: self.builder.alloca(self.test, name=name) for name in ("running", "active")}
         self.block = self.builder.alloca(NUMBERS)
 
     # -- the loops ----------------------------------------------------------------------------------------------------

@@ -113,19 +113,10 @@ class Stepper:
         def begin(p, x):
             return array.first_state(*both(p), x)
 
-        def prepare(p, x, k, before):
-            zero = jnp.zeros(())
-            return (
-                both(p)[1].predict(k, before),
-                zero + jnp.inf,
-                zero + jnp.inf,
-                zero,
-                zero,
-                zero,
-                zero,
-                zero + 1.0,
-                zero,
-            )
+        def prepare(p, k, before):
+            zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
+            iteration = both(p)[1].predict(k, before), infinite, infinite, zero, zero, zero
+            return *iteration, zero, zero + 1.0, zero  # of Newton's method: iterations, defined, noise
 
         def iterate(p, x, low, h, *iteration):
             system, method = both(p)
@@ -149,7 +140,7 @@ class Stepper:
 
         after = ("converged", "going")
         pieces = {
-            "prepare": self._piece(prepare, "p x k before", (*ITERATION, "newtons", "defined", "noise")),
+            "prepare": self._piece(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
             "iterate": self._piece(iterate, f"p x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
             "conclude": self._piece(
                 conclude, f"p h guess update converged defined made newtons noise {' '.join(FIELDS)}", FIELDS
