@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-EPS = float(np.finfo(np.float64).eps)
+from ..functions.gradients import EPS
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,27 @@ def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None)
     return found
 
 
+def towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
+    """The vector in the span of some whose inner products with them are these, shape (n,).
+
+    As ``frame(directions).with_products(products)``, in one pass and without roots: for an iteration that corrects what
+    rounding leaves. One that depends on those before it, as at an equilibrium, is left out.
+    """
+    found = jnp.zeros_like(directions[0])
+    units: list[tuple[jax.Array, jax.Array]] = []
+    for v, product in zip(directions, products, strict=True):
+        own = v
+        for unit, square in units:
+            own = own - (jnp.dot(v, unit) / square) * unit
+        square = jnp.dot(own, own)
+        use = square > DEPENDENT * jnp.dot(v, v)
+        square = jnp.where(use, square, 1.0)
+        own = jnp.where(use, own, 0.0)
+        found = found + ((product - jnp.dot(v, found)) / square) * own
+        units.append((own, square))
+    return found
+
+
 def _inverse_root(square, usable):
     """``1 / |v|`` from ``|v|^2``, or 0 where that cannot be used; safe to differentiate."""
     return jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)

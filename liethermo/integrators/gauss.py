@@ -14,16 +14,15 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation, portions
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy, is_traced
+from ..functions.energy import Energy, is_traced
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
-from ..functions.on_spaces import on_points
 from ..systems import ChartSystem, System
 from ..tracing.interpret import at_points
 from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register
 from .charts import in_charts
 from .composed_entropy import composed_gradients
+from .preserved import check_preserved, preserved_functions, seen_on
 from .tableaus import finer, gauss
 
 
@@ -88,15 +87,14 @@ class MetriplecticGauss(GaussMethod):
         moving: tuple[int, ...] | None = None,
     ):
         self.number = checked_stages(stages)
-        functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-        self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
+        self.functions = preserved_functions(preserve)
         self.retraction = retraction
         self.held = held
         self.moving = moving
 
     def on(self, system: System) -> OneStepMethod:
         held = tuple(sorted(system.first_integrals() & system.casimirs().keys()))
-        method = self._with(lambda C: _seen_on(system, C), held)
+        method = self._with(lambda C: seen_on(system, C), held)
         if self.functions and not is_traced((system, method)):
             moved = at_points(_share_moved, (system, method.functions), system.samples(4)).max(axis=0)
             method = method._with(lambda C: C, held, tuple(int(i) for i in np.flatnonzero(moved > STILL)))
@@ -115,12 +113,7 @@ class MetriplecticGauss(GaussMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system conserves what is to be preserved, and room is left for it to move."""
-        for C, kept in zip(self.functions, system.conserves(self.functions), strict=True):
-            if not kept:
-                raise InputError(
-                    f"the system does not conserve the preserved function {_name(C)}: holding it would change the "
-                    "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"
-                )
+        check_preserved(system, self.functions)
         if not self.functions:
             return
         functions = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
@@ -257,12 +250,6 @@ def _projector(system: System, u, gradients: list[Gradients]) -> Callable:
     return frame([d for d, _ in pairs], like=[p for _, p in pairs]).off
 
 
-def _seen_on(system: System, C: Energy) -> Energy:
-    """A preserved function as one of the state vectors of a system."""
-    C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
-    return recognised(C, system.dim) if system.space is None else C
-
-
 def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
     """``|Pi grad C|`` of each function, relative to what Pi makes of another covector of that size."""
     system, functions = model
@@ -278,10 +265,6 @@ def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
 
 def _gradients(functions: tuple[Energy, ...], x):
     return jnp.stack([f.gradient(x) for f in functions])
-
-
-def _name(function: Energy) -> str:
-    return getattr(getattr(function, "function", None), "__name__", str(function))
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

@@ -36,7 +36,7 @@ ORDERS = (4, 6, 8)
 def lobatto(order: int) -> ExplicitTableau:
     """The tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
     A, b = {4: _kutta, 6: _butcher, 8: _cooper_verner}[order]()
-    d, q = _estimate(A, b, order)
+    d, q = _estimate(A, order)
     tall = [np.ones(len(b))]
     for _ in range(order):
         tall.append(A @ tall[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
@@ -46,14 +46,14 @@ def lobatto(order: int) -> ExplicitTableau:
     return ExplicitTableau(A, b, d, q, missed / seen ** ((order + 1) / (q + 1)))
 
 
-def _estimate(A: np.ndarray, b: np.ndarray, order: int) -> tuple[np.ndarray, int]:
+def _estimate(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
     """Weights d that every rooted tree of at most q nodes is orthogonal to, q as large as there are any but zero."""
-    vectors, found = trees(A, order), None
+    vectors, found = trees(A, order - 1), None
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
         _, sizes, rows = np.linalg.svd(conditions)
         free = rows[np.sum(sizes > 1e-10 * sizes[0]) :]
-        tall = np.linalg.matrix_power(A, q) @ np.ones(len(b))
+        tall = np.linalg.matrix_power(A, q) @ np.ones(len(A))
         seen = free @ tall  # of all such weights those that see most of a linear equation
         if np.linalg.norm(seen) > 1e-8 * np.linalg.norm(tall):
             found = seen @ free / np.linalg.norm(seen), q
@@ -70,19 +70,19 @@ def trees(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
     """
     found: dict[int, list[np.ndarray]] = {1: [np.ones(len(A))]}
     for n in range(2, order + 1):
-        found[n] = [v for v, _ in _forests(A, found, n - 1, n - 1)]
+        found[n] = list(_forests(A, found, n - 1, n - 1))
     return found
 
 
 def _forests(A, found, nodes: int, largest: int):
     """Products of branches with so many nodes together, none of more than ``largest``."""
     if nodes == 0:
-        yield np.ones(len(A)), largest
+        yield np.ones(len(A))
         return
     for size in range(min(nodes, largest), 0, -1):
         for v in found[size]:
-            for rest, _ in _forests(A, found, nodes - size, size):
-                yield (A @ v) * rest, size
+            for rest in _forests(A, found, nodes - size, size):
+                yield (A @ v) * rest
 
 
 def _kutta() -> tuple[np.ndarray, np.ndarray]:

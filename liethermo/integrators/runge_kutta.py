@@ -14,14 +14,14 @@ import manifolds as mf
 
 from ..dissipation.base import portions
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy
+from ..functions.frames import towards
 from ..functions.gradients import EPS, Gonzalez
-from ..functions.on_spaces import on_points
 from ..systems import ChartSystem, System
 from .base import OneStepMethod, register
 from .charts import InCharts, in_charts
 from .lobatto import ORDERS, ExplicitTableau, lobatto
+from .preserved import check_preserved, preserved_functions, seen_on
 
 SLOPE, ERROR, FIRST, LAST, MISSED, LEVELS = range(6)
 """What stands in the vectors that a step hands on: its mean slope, the estimate of its local error, the slopes at its
@@ -75,7 +75,6 @@ class MetriplecticRungeKutta(OneStepMethod):
     functions: tuple[Energy, ...]
     retraction: str | mf.Retraction | None = eqx.field(static=True)
     held: tuple[str, ...] = eqx.field(static=True)
-    charted: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -83,14 +82,11 @@ class MetriplecticRungeKutta(OneStepMethod):
         preserve: Sequence = (),
         retraction: str | mf.Retraction | None = None,
         held: tuple[str, ...] = (),
-        charted: bool = False,
     ):
         if type(order) is not int or order not in ORDERS:
             raise InputError(f"the order is 4, 6 or 8, not {order!r}")
-        functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-        self.number = order
-        self.functions = tuple(as_energy(C, "a preserved function") for C in functions)
-        self.retraction, self.held, self.charted = retraction, held, charted
+        self.number, self.functions = order, preserved_functions(preserve)
+        self.retraction, self.held = retraction, held
 
     @property
     def order(self) -> int:
@@ -120,8 +116,7 @@ class MetriplecticRungeKutta(OneStepMethod):
         return name in system.first_integrals()
 
     def on(self, system: System) -> OneStepMethod:
-        held, charted = tuple(sorted(system.first_integrals())), system.space is not None
-        seen = self._with(lambda C: _seen_on(system, C), held, charted)
+        seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
         method = in_charts(seen, system, self.retraction, "exp")
         if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
             raise InputError(
@@ -130,22 +125,17 @@ class MetriplecticRungeKutta(OneStepMethod):
         return method
 
     def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled, self.held, self.charted)
+        return self._with(local.pulled, self.held)
 
-    def _with(self, change: Callable, held: tuple[str, ...], charted: bool) -> MetriplecticRungeKutta:
+    def _with(self, change: Callable, held: tuple[str, ...]) -> MetriplecticRungeKutta:
         """The method with its preserved functions changed, holding these of the system."""
-        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, charted)
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a law to hold and conserves what is to be preserved."""
         if not self._laws(system):
             raise InputError(f"{self} holds the laws of a system, and this one claims none: take lt.Reference")
-        for C, kept in zip(self.functions, system.conserves(self.functions), strict=True):
-            if not kept:
-                name = getattr(getattr(C, "function", None), "__name__", str(C))
-                raise InputError(
-                    f"the system does not conserve the preserved function {name}: holding it would change the dynamics"
-                )
+        check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
         levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: x.shape[0]]
@@ -164,10 +154,11 @@ class MetriplecticRungeKutta(OneStepMethod):
             found, rates = self._rates(system, laws, x + (low + h * (weights @ slopes)))
             return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
 
-        start = jnp.zeros((s, x.shape[0])) + 0.0 * x
-        slopes, rates = jax.lax.scan(stage, start, (np.arange(s), t.A))
+        slopes, rates = jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
         changes = h * (t.b @ rates)
-        if not self.charted:
+        if not isinstance(
+            system, ChartSystem
+        ):  # whose coordinates, and with them the levels' row, are new at every step
             changes = changes + self._steering(laws, x, low, k[LEVELS])
         d, missed = self._corrected(system, laws, x, low, h * (t.b @ slopes), changes)
         return jnp.stack([d / h, t.d @ slopes, slopes[0], slopes[-1], jnp.broadcast_to(missed / h, x.shape), k[LEVELS]])
@@ -218,7 +209,7 @@ class MetriplecticRungeKutta(OneStepMethod):
         found = directions(d)
         for i in range(self.corrections):
             found = directions(d) if 0 < i < 3 else found  # the last time they are as good as they get
-            d = d + _towards(found, misses(d))
+            d = d + towards(found, misses(d))
         squares = jnp.stack([jnp.dot(v, v) for v in found])
         left = misses(d) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
         return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
@@ -276,30 +267,6 @@ class MetriplecticRungeKutta(OneStepMethod):
         return f"MetriplecticRungeKutta(order={self.number}{kept})"
 
 
-DEPENDENT = 1e-24
-"""Square of what is left of a direction, relative to its own, below which it depends on those before it."""
-
-
-def _towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
-    """The vector in the span of some whose inner products with them are these, shape (n,).
-
-    By Gram and Schmidt; one that depends on those before it, as at an equilibrium, is left out.
-    """
-    found = jnp.zeros_like(directions[0])
-    units: list[tuple[jax.Array, jax.Array]] = []
-    for v, product in zip(directions, products, strict=True):
-        own = v
-        for unit, square in units:
-            own = own - (jnp.dot(v, unit) / square) * unit
-        square = jnp.dot(own, own)
-        use = square > DEPENDENT * jnp.dot(v, v)
-        square = jnp.where(use, square, 1.0)
-        own = jnp.where(use, own, 0.0)
-        found = found + ((product - jnp.dot(v, found)) / square) * own
-        units.append((own, square))
-    return found
-
-
 class _Law(NamedTuple):
     """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
 
@@ -308,12 +275,6 @@ class _Law(NamedTuple):
 
 
 LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
-
-
-def _seen_on(system: System, C: Energy) -> Energy:
-    """A preserved function as one of the state vectors of a system."""
-    C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
-    return recognised(C, system.dim) if system.space is None else C
 
 
 register(*map(MetriplecticRungeKutta, ORDERS))

@@ -72,10 +72,16 @@ class MethodSuggestion:
         Least work first.
     """
 
-    method: OneStepMethod
-    step: float
     reason: str
     trials: tuple[Trial, ...]
+
+    @property
+    def method(self) -> OneStepMethod:
+        return self.trials[0].method
+
+    @property
+    def step(self) -> float:
+        return self.trials[0].step
 
     def __str__(self) -> str:
         lines = [f"{'method':<36}{'step':>9}  evaluations of the field in a unit of time"]
@@ -121,7 +127,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
         )
     else:
         reason = f"{best.method} with steps of {best.step:g}: no explicit method takes steps from this state"
-    return MethodSuggestion(best.method, best.step, reason, tuple(trials))
+    return MethodSuggestion(reason, tuple(trials))
 
 
 def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:

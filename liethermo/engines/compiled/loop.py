@@ -189,7 +189,7 @@ class _Steps(Writer):
             array = piece.arguments[i]
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
-        for array, values in zip(piece.results, super().write(piece.program, read), strict=True):
+        for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
             for slot, value in zip(self.slots[array], values, strict=True):
                 build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
 

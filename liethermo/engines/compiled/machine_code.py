@@ -10,7 +10,6 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import llvmlite.binding as llvm
@@ -25,11 +24,8 @@ NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
 INTRINSICS = {name: name for name in "sqrt exp exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
 """Operations that LLVM has functions for."""
 
-LIBRARY = {
-    **{name: name for name in "cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh".split()},
-    **{"erf": "erf", "erfc": "erfc"},
-}
-"""Operations that are functions of the C library."""
+LIBRARY = frozenset("cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc".split())
+"""Operations that are functions of the C library, by the same names."""
 
 COMPARED = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
@@ -104,7 +100,7 @@ class Writer:
         if real and op in INTRINSICS:
             return self._intrinsic(f"llvm.{INTRINSICS[op]}", args, self.number)
         if real and op in LIBRARY:
-            return self._of_each_lane(LIBRARY[op], args)
+            return self._of_each_lane(op, args)
         if real and op == "truncate":  # NaN to 0, and what is too large to the nearest integer
             return self._intrinsic("llvm.fptosi.sat", args, self.whole)
         if real and op == "is_finite":
@@ -125,7 +121,7 @@ class Writer:
     def whole_number(n: int) -> ir.Constant:
         return ir.Constant(WHOLE, n)
 
-    @contextmanager
+    @contextlib.contextmanager
     def repeated(self, goes_on: Callable[[], ir.Value]) -> Iterator[None]:
         """While a test holds."""
         build = self.builder
@@ -138,7 +134,7 @@ class Writer:
         build.branch(head)
         build.position_at_end(after)
 
-    @contextmanager
+    @contextlib.contextmanager
     def counted(self, count: ir.Value) -> Iterator[ir.Value]:
         """For each number from zero to before ``count``."""
         build = self.builder

@@ -6,19 +6,113 @@ scalar programs; here are the loops around them and the factorisation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from .loop import NUMBERS, Layout, Piece
+from .. import array
+from ..array import Iteration
+from ..rules import Rules
+from .loop import NUMBERS, SOLVED, Layout, Piece
 from .machine_code import NUMBER, WHOLE, MachineCode, Writer
 
 GIVEN = ("x", "low", "h", "k", "before")
 """What is taken from a block, beside the trajectory's own parameters."""
 
-FOUND = ("guess", "update", "converged", "defined", "newtons", "noise")
-"""What is left in it."""
+
+def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> dict[str, Piece]:
+    """The programs of Newton's method: see :func:`solver`.
+
+    Parameters
+    ----------
+    both : function from parameters to a system and a method
+    piece : function from a function, the names of its arguments and of its results
+    """
+
+    def fresh(k):
+        one = jnp.ones(())
+        return k, one * jnp.inf, one * jnp.inf, 0 * one, 0 * one, 0 * one, one * rules.reuse, one, one, 0 * one
+
+    def begin(p, k, before):
+        return fresh(both(p)[1].predict(k, before))
+
+    def rest(k):
+        return fresh(jnp.zeros_like(k))
+
+    def misfit(p, x, low, h, k):
+        system, method = both(p)
+        new = method.slopes(system, x, low, h, k)
+        return new, jnp.max(jnp.abs(new - k)), jnp.linalg.norm(new - k)
+
+    def along(p, x, low, h, k, direction):
+        system, method = both(p)
+        return method.change(system, x, low, h, k, direction)
+
+    def direct(k, new, used, renew):
+        return new - k, jnp.where(renew > 0.0, 0.0, used)
+
+    def moved(k, step, found):
+        return k - step, k, found, jnp.ones(()), jnp.max(jnp.abs(step))
+
+    def worse(x, h, k, damped, found, sought, factor, length):
+        scale = array.scale_of(x, h, k, rules)
+        halve = (damped > 0.0) & (factor > 0.5**rules.halvings) & (length > rules.plateau * scale)
+        return jnp.where(halve & ~(found < sought), 1.0, 0.0)
+
+    def halved(k, step, factor, length):
+        return k + 0.5 * factor * step, 0.5 * factor, 0.5 * length
+
+    def judge(x, h, k, old, update, best, stalled, rate, made, used, factor, found, missed, noise, regular):
+        s = Iteration(old, update, best, stalled, rate, made).after(k, rules)
+        scale = array.scale_of(x, h, k, rules)
+        defined = jnp.isfinite(found + scale) & (regular > 0.0)
+        plain, used = s.settled(scale, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
+        converged = defined & (plain | s.settled(scale, rules, missed, noise))
+        goes_on = defined & ~converged & (s.made < rules.newton)
+        uncertain = defined & ~converged & (s.stalled >= 2) & (noise == 0.0)
+        renew = (used >= rules.reuse) | (s.rate >= rules.stale)
+        return (
+            *s[1:],
+            used,
+            *(jnp.where(t, 1.0, 0.0) for t in (goes_on, renew, converged, defined, uncertain)),
+            jnp.where(plain, 0.0, noise),
+        )
+
+    def sound(p, x):
+        return array.noise_of(both(p)[0], x)
+
+    def settle(missed, noise, goes_on):
+        settled = missed <= rules.plateau * noise
+        return jnp.where(settled, 1.0, 0.0), jnp.where(settled, 0.0, goes_on)
+
+    def count(made, newtons, update, defined):
+        return newtons + made, jnp.where(defined > 0.0, update, jnp.nan)
+
+    iteration = "guess update best stalled rate made"
+    start = (*iteration.split(), "used", "renew", "goes_on", "noise")
+    judged = (*iteration.split()[1:], "used", "goes_on", "renew", "converged", "defined", "uncertain", "noise")
+    # of a derivative, what is the same in every direction is computed once a Jacobian
+    whole = piece(along, "p x low h guess direction", ("changes",))
+    first, rest_of_it = whole.program.split([5])
+    return {
+        "begin": piece(begin, "p k before", start),
+        "rest": piece(rest, "k", start),
+        "misfit": piece(misfit, "p x low h guess", ("new", "missed", "found")),
+        "linearise": Piece(first, whole.arguments, ("linear",)),
+        "along": Piece(rest_of_it, (*whole.arguments, "linear"), ("changes",)),
+        "direct": piece(direct, "guess new used renew", ("direction", "used")),
+        "moved": piece(moved, "guess direction found", ("guess", "old", "sought", "factor", "length")),
+        "worse": piece(worse, "x h guess damped found sought factor length", ("worse",)),
+        "halved": piece(halved, "guess direction factor length", ("guess", "factor", "length")),
+        "judge": piece(
+            judge, "x h guess old update best stalled rate made used factor found missed noise regular", judged
+        ),
+        "sound": piece(sound, "p x", ("noise",)),
+        "settle": piece(settle, "missed noise goes_on", ("converged", "goes_on")),
+        "count": piece(count, "made newtons update defined", ("newtons", "update")),
+    }
 
 
 def solver(
@@ -64,14 +158,14 @@ class _Piece(Writer):
             return build.gep(base, [self.whole_number(int(place))])
 
         def read(i: int, j: int) -> ir.Value:
-            array = piece.arguments[i]
-            if array != "p":
-                return build.load(at(self.s, rows[array] + j))
+            name = piece.arguments[i]
+            if name != "p":
+                return build.load(at(self.s, rows[name] + j))
             return build.load(at(self.s, rows["p"] + self.own[j]) if self.varies[j] else at(self.p, j))
 
-        for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
+        for name, values in zip(piece.results, self.write(piece.program, read), strict=True):
             for j, value in enumerate(values):
-                build.store(value, at(self.s, rows[array] + j))
+                build.store(value, at(self.s, rows[name] + j))
         build.ret_void()
 
 
@@ -91,9 +185,9 @@ class _Solve(Writer):
             build.store(self.constant(0.0), build.gep(self.s, [i]))
         self._exchange(("p", *GIVEN), out=False)
         with self.counted(self.whole_number(2)) as attempt, build.if_then(self._is("converged", "!=", 1.0)):
-            build.store(build.sitofp(attempt, NUMBER), self._at("damped"))
+            build.store(build.sitofp(attempt, NUMBER), self._array("damped"))
             self._attempt()
-        self._exchange(FOUND, out=True)
+        self._exchange(SOLVED, out=True)
         build.ret_void()
 
     def _attempt(self) -> None:
@@ -102,9 +196,9 @@ class _Solve(Writer):
         # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may
         # wander.
         self._call("begin", "misfit")
-        predicted = build.load(self._at("found"))
+        predicted = build.load(self._array("found"))
         self._call("rest", "misfit")
-        with build.if_then(build.fcmp_ordered("<=", predicted, build.load(self._at("found")))):
+        with build.if_then(build.fcmp_ordered("<=", predicted, build.load(self._array("found")))):
             self._call("begin", "misfit")
         with self.repeated(lambda: self._is("goes_on", "==", 1.0)):
             with build.if_then(self._is("renew", "==", 1.0)):
@@ -139,7 +233,7 @@ class _Solve(Writer):
             build.store(self.constant(0.0), build.gep(direction, [j]))
             with self.counted(m) as i:
                 build.store(build.load(build.gep(changes, [i])), entry(i, j))
-        build.store(self.constant(1.0), self._at("regular"))
+        build.store(self.constant(1.0), self._array("regular"))
         with build.goto_entry_block():
             pivot = build.alloca(WHOLE)
         with self.counted(m) as j:
@@ -156,8 +250,8 @@ class _Solve(Writer):
                 build.fcmp_ordered("<", self.constant(0.0), largest),
                 build.fcmp_ordered("<", largest, self.constant(np.inf)),
             )
-            regular = build.select(usable, build.load(self._at("regular")), self.constant(0.0))
-            build.store(regular, self._at("regular"))
+            regular = build.select(usable, build.load(self._array("regular")), self.constant(0.0))
+            build.store(regular, self._array("regular"))
             with self.counted(m) as c:
                 one, other = build.load(entry(j, c)), build.load(entry(chosen, c))
                 build.store(other, entry(j, c))
@@ -212,11 +306,9 @@ class _Solve(Writer):
     def _array(self, name: str) -> ir.Value:
         return self.builder.gep(self.s, [self.whole_number(self.layout.rows[name])])
 
-    _at = _array
-
     def _is(self, name: str, relation: str, number: float) -> ir.Value:
         compare = self.builder.fcmp_unordered if relation == "!=" else self.builder.fcmp_ordered
-        return compare(relation, self.builder.load(self._at(name)), self.constant(number))
+        return compare(relation, self.builder.load(self._array(name)), self.constant(number))
 
     def _holds(self, name: str) -> ir.Value:
         """Whether a piece, asked anew, finds that what it is named after is so."""

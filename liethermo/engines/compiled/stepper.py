@@ -27,7 +27,7 @@ from ..rules import RULES, Rules
 from .form import Form, numbers_of
 from .loop import Layout, Piece, step_loop
 from .machine_code import MachineCode
-from .newton import solver
+from .newton import newton_pieces, solver
 
 FIELDS = State._fields
 ITERATION = ("guess", "update", "best", "stalled", "rate", "made")
@@ -154,7 +154,6 @@ class Stepper:
         shapes |= {name: self._shapes.get(name, ()) for name in working}
         # Newton's method is handed these in the block; without it they stay in registers
         self._layout = Layout(shapes, working if method.explicit else ())
-        self._height = self._layout.height
 
     @property
     def operations(self) -> int:
@@ -184,19 +183,19 @@ class Stepper:
     def _part(self, blocks: np.ndarray, name: str) -> np.ndarray:
         """A field of blocks, shape (blocks, entries, lanes)."""
         first, size = self._layout.rows[name], self._layout.sizes[name]
-        return blocks.reshape(len(blocks), self._height, self.lanes)[:, first : first + size]
+        return blocks.reshape(len(blocks), self._layout.height, self.lanes)[:, first : first + size]
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields of :class:`.array.State`, trajectories first."""
         if len(fields["x"]) == self.lanes == 1 and not self._varies.any():  # nothing to rearrange
-            whole = np.zeros((1, self._height))
+            whole = np.zeros((1, self._layout.height))
             for name, values in fields.items():
                 first = self._layout.rows[name]
                 whole[0, first : first + self._layout.sizes[name]] = np.ravel(values[0])
             return whole
         number, lanes, rows = len(fields["x"]), self.lanes, self._layout.rows
         count = -(-number // lanes)
-        blocks = np.zeros((count, self._height, lanes))
+        blocks = np.zeros((count, self._layout.height, lanes))
 
         def fill(first, values):
             values = np.asarray(values, dtype=np.float64).reshape(number, -1)
@@ -260,99 +259,6 @@ class Stepper:
                 shapes = {name: self._shapes.get(name, ()) for name in sorted(names)} | linear
                 self._newton = solver(pieces, shapes, self._layout, self._varies, self.lanes)
             return self._newton.address("solve")
-
-
-def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> dict[str, Piece]:
-    """The programs of Newton's method: see :func:`.newton.solver`.
-
-    Parameters
-    ----------
-    both : function from parameters to a system and a method
-    piece : function from a function, the names of its arguments and of its results
-    """
-
-    def fresh(k):
-        one = jnp.ones(())
-        return k, one * jnp.inf, one * jnp.inf, 0 * one, 0 * one, 0 * one, one * rules.reuse, one, one, 0 * one
-
-    def begin(p, k, before):
-        return fresh(both(p)[1].predict(k, before))
-
-    def rest(k):
-        return fresh(jnp.zeros_like(k))
-
-    def misfit(p, x, low, h, k):
-        system, method = both(p)
-        new = method.slopes(system, x, low, h, k)
-        return new, jnp.max(jnp.abs(new - k)), jnp.linalg.norm(new - k)
-
-    def along(p, x, low, h, k, direction):
-        system, method = both(p)
-        return method.change(system, x, low, h, k, direction)
-
-    def direct(k, new, used, renew):
-        return new - k, jnp.where(renew > 0.0, 0.0, used)
-
-    def moved(k, step, found):
-        return k - step, k, found, jnp.ones(()), jnp.max(jnp.abs(step))
-
-    def worse(x, h, k, damped, found, sought, factor, length):
-        scale = array.scale_of(x, h, k, rules)
-        halve = (damped > 0.0) & (factor > 0.5**rules.halvings) & (length > rules.plateau * scale)
-        return jnp.where(halve & ~(found < sought), 1.0, 0.0)
-
-    def halved(k, step, factor, length):
-        return k + 0.5 * factor * step, 0.5 * factor, 0.5 * length
-
-    def judge(x, h, k, old, update, best, stalled, rate, made, used, factor, found, missed, noise, regular):
-        s = Iteration(old, update, best, stalled, rate, made).after(k, rules)
-        scale = array.scale_of(x, h, k, rules)
-        defined = jnp.isfinite(found + scale) & (regular > 0.0)
-        plain, used = s.settled(scale, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
-        converged = defined & (plain | s.settled(scale, rules, missed, noise))
-        goes_on = defined & ~converged & (s.made < rules.newton)
-        uncertain = defined & ~converged & (s.stalled >= 2) & (noise == 0.0)
-        renew = (used >= rules.reuse) | (s.rate >= rules.stale)
-        return (
-            *s[1:],
-            used,
-            *(jnp.where(t, 1.0, 0.0) for t in (goes_on, renew, converged, defined, uncertain)),
-            jnp.where(plain, 0.0, noise),
-        )
-
-    def sound(p, x):
-        return array.noise_of(both(p)[0], x)
-
-    def settle(missed, noise, goes_on):
-        settled = missed <= rules.plateau * noise
-        return jnp.where(settled, 1.0, 0.0), jnp.where(settled, 0.0, goes_on)
-
-    def count(made, newtons, update, defined):
-        return newtons + made, jnp.where(defined > 0.0, update, jnp.nan)
-
-    iteration = "guess update best stalled rate made"
-    start = (*iteration.split(), "used", "renew", "goes_on", "noise")
-    judged = (*iteration.split()[1:], "used", "goes_on", "renew", "converged", "defined", "uncertain", "noise")
-    # of a derivative, what is the same in every direction is computed once a Jacobian
-    whole = piece(along, "p x low h guess direction", ("changes",))
-    first, rest_of_it = whole.program.split([5])
-    return {
-        "begin": piece(begin, "p k before", start),
-        "rest": piece(rest, "k", start),
-        "misfit": piece(misfit, "p x low h guess", ("new", "missed", "found")),
-        "linearise": Piece(first, whole.arguments, ("linear",)),
-        "along": Piece(rest_of_it, (*whole.arguments, "linear"), ("changes",)),
-        "direct": piece(direct, "guess new used renew", ("direction", "used")),
-        "moved": piece(moved, "guess direction found", ("guess", "old", "sought", "factor", "length")),
-        "worse": piece(worse, "x h guess damped found sought factor length", ("worse",)),
-        "halved": piece(halved, "guess direction factor length", ("guess", "factor", "length")),
-        "judge": piece(
-            judge, "x h guess old update best stalled rate made used factor found missed noise regular", judged
-        ),
-        "sound": piece(sound, "p x", ("noise",)),
-        "settle": piece(settle, "missed noise goes_on", ("converged", "goes_on")),
-        "count": piece(count, "made newtons update defined", ("newtons", "update")),
-    }
 
 
 ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
