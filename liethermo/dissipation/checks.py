@@ -10,7 +10,10 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..errors import IndefiniteError, InputError
+from ..functions.conditions import require
 from .geometry import Geometry
+
+NEGATIVE = "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
 
 
 def form_at(form, x):
@@ -27,8 +30,11 @@ def checked_rate(rate) -> jax.Array:
     array = real_array(rate)
     if array.shape != ():
         raise InputError(f"a rate is one number, not an array of shape {array.shape}")
-    if not isinstance(array, jax.core.Tracer) and not float(array) >= 0.0:
-        raise InputError(f"a dissipation rate must be >= 0, not {float(array)}: a negative one would lower the entropy")
+    require(
+        array,
+        lambda rate: rate >= 0.0,
+        "a dissipation rate must be >= 0, not {value}: a negative one would lower the entropy",
+    )
     return array
 
 
@@ -38,6 +44,9 @@ def semidefinite(form, what: str) -> jax.Array:
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
+        eigenvalues = jnp.linalg.eigvalsh((matrix + matrix.T) / 2)
+        allowed = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
+        require(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE}")
         return matrix
     numbers = np.asarray(matrix)
     scale = float(np.abs(numbers).max())
@@ -47,7 +56,7 @@ def semidefinite(form, what: str) -> jax.Array:
     lowest = float(np.linalg.eigvalsh(numbers)[0]) if np.isfinite(numbers).all() else -np.inf
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
-            f"{what} has the negative eigenvalue {lowest:.3g}: it must be positive semidefinite, or entropy would fall",
+            f"{what} {NEGATIVE}".format(value=lowest),
             residual=lowest,
             tolerance=1e-12 * scale * matrix.shape[0],
         )

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
-from ..functions.energy import is_traced
+from ..functions.conditions import require
 
 
 def positive(value, name: str, count: int | None = None) -> jax.Array:
@@ -15,8 +15,7 @@ def positive(value, name: str, count: int | None = None) -> jax.Array:
     if array.shape != (() if count is None else (count,)):
         wanted = "one number" if count is None else f"{count} numbers"
         raise InputError(f"{name} is {wanted}, not an array of shape {array.shape}")
-    if not is_traced(array) and not bool(((array > 0.0) & jnp.isfinite(array)).all()):
-        raise InputError(f"{name} must be positive and finite, not {array.tolist()}")
+    require(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, not {value}")
     return array
 
 

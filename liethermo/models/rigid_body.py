@@ -14,6 +14,7 @@ from manifolds.errors import warn
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
 from ..errors import InputError
+from ..functions.conditions import require
 from ..functions.energy import Quadratic, is_traced
 from ..systems import LiePoissonSystem
 
@@ -66,8 +67,7 @@ def _inertia(inertia) -> np.ndarray | jax.Array:
     moments = jnp.asarray(inertia, dtype=jnp.float64) if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
     if moments.shape != (3,):
         raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
-    if not is_traced(moments) and not (np.all(moments > 0.0) and np.isfinite(moments).all()):
-        raise InputError(f"moments of inertia are positive and finite, not {moments.tolist()}")
+    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia are positive and finite, not {value}")
     if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())
         if largest > others * (1 + 1e-12):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import functools
 import math
 import os
@@ -35,6 +36,7 @@ from ..results.evidence import (
     sizes,
     spread,
 )
+from ..results.many import laws_of_many
 from ..results.status import Laws
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import at_points
@@ -171,29 +173,11 @@ class Ensemble:
             If there is no tolerance of a name, or it is negative.
         """
         accepted = Tolerances.of(energy=energy, entropy=entropy, **tolerances)
-        rows, moved, name = [], self.steps > 0, " minus ".join(["energy", *self.laws.balance])
-
-        def worst(law, values, allowed):
-            values, allowed = np.where(moved, values, 0.0), np.broadcast_to(allowed, len(self))
-            i = int(np.argmax(values - allowed))
-            passed = bool(values[i] <= allowed[i])
-            rows.append(AuditRow(law, float(values[i]), float(allowed[i]), passed, f"worst is trajectory {i}"))
-
-        terms = self.evidence.terms
-        rounding = Rounding(self.first_energy, self.energy_sensitivity, terms.get("energy", 0.0))
-        if self.laws.energy == "conserved":
-            worst(f"{name} drift", self.energy_drift, rounding.allowed(accepted.energy))
-        elif self.laws.energy == "nonincreasing":
-            increment = self.largest_energy_increment / rounding.size
-            worst(f"relative {name} increment", increment, rounding.allowed(accepted.energy))
-        if self.laws.entropy == "nondecreasing":
-            rounding = Rounding(self.entropy_scale, self.entropy_sensitivity, terms.get("entropy", 0.0))
-            fall = -self.least_entropy_increment / rounding.size
-            worst("relative fall of the entropy", fall, rounding.allowed(accepted.entropy))
-            in_all = -self.entropy_change / rounding.size
-            if (in_all > rounding.allowed(accepted.casimirs)).any():  # each step below what rounding hides
-                worst("the same in all", in_all, rounding.allowed(accepted.casimirs))
-        worst("stage residual", np.where(self.ok, self.residual, 0.0), accepted.residual)
+        moved, terms = self.steps > 0, self.evidence.terms
+        rows = []
+        for law in laws_of_many(self, self.laws, accepted, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
+            i = law.worst
+            rows.append(law.as_row(i, f"worst is trajectory {i}"))
         if self.witness is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, accepted))
         failed = int((~self.ok & (self.status != 3)).sum())
@@ -204,7 +188,7 @@ class Ensemble:
 
 
 def ensemble(
-    system: System | Callable[[Any], System],
+    system: System | Callable[[Any], System] | Family,
     x0s,
     t_span: tuple[float, float],
     step: float,
@@ -252,7 +236,7 @@ def ensemble(
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     family = Family.of(system, parameters)
-    member = family.member(0)
+    member = family.representative
     states = np.atleast_2d(np.asarray(member.state(x0s, batch=True)))
     if states.ndim > 2:
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
@@ -431,9 +415,14 @@ KEPT_AFTER = tuple(name for name in array.State._fields if name not in ("low", "
 """Fields of the states of a batch that its record is made from."""
 
 
+THREADS: contextvars.ContextVar[int | None] = contextvars.ContextVar("THREADS", default=None)
+"""Threads of an ensemble at most: for those who run several in several processes of one machine."""
+
+
 def _cores() -> int:
     """That this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, THREADS.get() or cores)
 
 
 def _run_compiled(family: Family, method, states: np.ndarray, times: Timetable, record: _Record) -> None:

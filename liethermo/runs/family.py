@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -33,22 +33,34 @@ class Family:
         The parameters of all members, members first; one member where all have the same.
     alike : System, optional
         The one system that all members are: what has been found for it once need not be found again.
+    example : System, optional
+        The member that stands for all where one is looked at, for whoever has checked the members. Which functions a
+        method preserves, for one, is then the same for every part of a family.
+    given : int
+        How many of the values, the first ones, are what a function that builds systems is given.
     """
 
     form: Form
     values: list[np.ndarray]
     alike: System | None = None
+    example: System | None = None
+    given: int = 0
 
     @classmethod
     def of(cls, system, parameters) -> Family:
         """From what :func:`liethermo.ensemble` is given."""
+        if isinstance(system, Family):
+            return system
         if isinstance(system, System):
             return cls._of_named(system, {} if parameters is None else parameters)
         if not callable(system):
             raise InputError(f"the first argument is a system, or a function that builds one, not {system!r}")
         if parameters is None:
             raise InputError("a function that builds systems needs parameters=..., one set for each trajectory")
-        return cls._of_function(system, parameters)
+        family = cls.of_function(system, parameters)
+        for i in family.extremes():  # the constructors of systems check what they are given
+            family.member(i)
+        return family.traced()
 
     @classmethod
     def _of_named(cls, system: System, parameters) -> Family:
@@ -70,7 +82,8 @@ class Family:
         return cls(Form.of(system), list(values.values()), None if parameters else system)
 
     @classmethod
-    def _of_function(cls, build: Callable, parameters) -> Family:
+    def of_function(cls, build: Callable, parameters) -> Family:
+        """The members as the function builds them."""
         found, structure = jax.tree_util.tree_flatten(parameters)
         values = [np.asarray(value, dtype=np.float64) for value in found]
         if not values or any(value.ndim == 0 for value in values):
@@ -83,36 +96,43 @@ class Family:
             return system
 
         shapes = tuple(value.shape[1:] for value in values)
-        family = cls(Form((build, structure), shapes, rebuild), values)
-        for i in family.extremes():  # the constructors of systems check what they are given
-            family.member(i)
+        return cls(Form((build, structure), shapes, rebuild), values, given=len(values))
+
+    def traced(self) -> Family:
+        """The same family, built by one program that is traced: its numbers are parameters that all members share.
+
+        Raises
+        ------
+        InputError
+            If the function that builds members has to see the values of its parameters.
+        """
         rest = None
 
         def arrays_of(*arrays):
             nonlocal rest
-            arrays, rest = eqx.partition(rebuild(arrays), eqx.is_array)
+            arrays, rest = eqx.partition(self.form.rebuild(list(arrays)), eqx.is_array)
             return arrays
 
         try:
-            program = traced(arrays_of, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes))
+            program = traced(arrays_of, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.form.shapes))
         except jax.errors.ConcretizationTypeError as error:
             raise InputError(
                 f"the function that builds systems must accept traced JAX arrays, as under jax.vmap: {error}"
             ) from error
-        return family if fingerprint(rest) is None else cls._of_program(program, rest, values)
-
-    @classmethod
-    def _of_program(cls, program: Traced, rest, values: list[np.ndarray]) -> Family:
-        """From a program that makes the arrays of a system; the numbers in it are parameters that all members share."""
-        given = len(values)
+        if fingerprint(rest) is None:
+            return self
+        given = self.given
 
         def rebuild(arrays):
             return eqx.combine(Traced(tuple(arrays[given:]), program.content, program.label)(*arrays[:given]), rest)
 
-        values = [*values, *(np.asarray(number)[None] for number in program.numbers)]
-        return cls(
-            Form((program.content, fingerprint(rest)), tuple(value.shape[1:] for value in values), rebuild), values
-        )
+        values = [*self.values, *(np.asarray(number)[None] for number in program.numbers)]
+        form = Form((program.content, fingerprint(rest)), tuple(value.shape[1:] for value in values), rebuild)
+        return replace(self, form=form, values=values)
+
+    def with_values(self, given: list[np.ndarray]) -> Family:
+        """The family of the same form whose members are built from other values."""
+        return replace(self, values=[*given, *self.values[self.given :]])
 
     def through(self, change: Callable[..., System]) -> Family:
         """The family of what a function, one that has an identity, makes of the members."""
@@ -133,6 +153,11 @@ class Family:
     def member(self, i: int) -> System:
         return self.form.rebuild(self.arrays(i)) if self.alike is None else self.alike
 
+    @property
+    def representative(self) -> System:
+        """The member that is looked at for all: an example where there is one, the first otherwise."""
+        return self.member(0) if self.example is None else self.example
+
     def extremes(self) -> list[int]:
         """The members with the smallest and the largest parameters: what is out of range shows there."""
         found = {0: None}
@@ -142,14 +167,14 @@ class Family:
         return list(found)[:PROBES]
 
     def check(self, states: np.ndarray) -> None:
-        """Test the axioms for members with extreme parameters, each at its initial state.
+        """Test the axioms for members with extreme parameters, each at its initial state, unless that has been done.
 
         Raises
         ------
         InputError
             If one fails there.
         """
-        for i in self.extremes() if self.size > 1 else ():
+        for i in self.extremes() if self.size > 1 and self.example is None else ():
             report = self.member(i).check(points=states[i])
             if not report.passed:
                 raise InputError(f"with the parameters of trajectory {i}:\n{report}")

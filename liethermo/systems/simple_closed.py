@@ -17,7 +17,8 @@ from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.checks import check_shape
-from ..functions.energy import Energy, Quadratic, is_traced, needed_arguments
+from ..functions.conditions import require
+from ..functions.energy import Energy, Quadratic, needed_arguments
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities
@@ -309,8 +310,9 @@ def _force(friction, n: int, what: str) -> Callable | None:
         raise InputError(f"a coefficient of {what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
     if R.ndim == 2:
         return _Linear(semidefinite(R, f"the coefficient of {what}"))
-    if not is_traced(R) and not (np.asarray(R) >= 0.0).all():
-        raise InputError(f"a coefficient of {what} must be >= 0, not {np.min(np.asarray(R)):g}: it would inject energy")
+    require(
+        R.min(), lambda r: r >= 0.0, f"a coefficient of {what} must be >= 0, not {{value:g}}: it would inject energy"
+    )
     return _Linear(R)
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from ...dissipation.checks import semidefinite
 from ...errors import InputError
 from ...functions.checks import check_scalar, recognised
+from ...functions.conditions import require
 from ...functions.each import Each
-from ...functions.energy import Energy, Quadratic, as_energy, is_traced
+from ...functions.energy import Energy, Quadratic, as_energy
 from ...tracing.traced import converted
 
 
@@ -174,6 +175,5 @@ def _friction_of_many(friction, count: int, dim: int, name: str):
 
 
 def _not_negative(R: jax.Array, name: str) -> jax.Array:
-    if not is_traced(R) and not (np.asarray(R) >= 0.0).all():
-        raise InputError(f"friction of {name} must be >= 0, not {np.min(np.asarray(R)):g}: it would cool the body")
+    require(R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, not {{value:g}}: it would cool the body")
     return R

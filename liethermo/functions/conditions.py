@@ -1,0 +1,70 @@
+"""Conditions on parameters: refused where their values are known, noted for later where they are being traced."""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+from .energy import is_traced
+
+
+class Condition(NamedTuple):
+    """What has to hold of a value that is being traced.
+
+    Attributes
+    ----------
+    holds : traced truth value
+    value : traced array
+    message : str
+        Why a value is refused, with a place for it: ``"a rate must be >= 0, not {value}"``.
+    """
+
+    holds: Any
+    value: Any
+    message: str
+
+
+_noted: contextvars.ContextVar[list[Condition] | None] = contextvars.ContextVar("noted", default=None)
+
+
+@contextlib.contextmanager
+def noting() -> Iterator[list[Condition]]:
+    """Note the conditions on traced values meanwhile: those who sweep parameters evaluate them at every point."""
+    found: list[Condition] = []
+    token = _noted.set(found)
+    try:
+        yield found
+    finally:
+        _noted.reset(token)
+
+
+def require(value, test: Callable, message: str) -> None:
+    """Refuse a value of which the test is not true everywhere; note the test where the value is traced.
+
+    Parameters
+    ----------
+    value : array
+    test : function from an array to an array of truth values
+    message : str
+        With a place for the value, or for its numbers as a list.
+
+    Raises
+    ------
+    InputError
+    """
+    if is_traced(value):
+        if (noted := _noted.get()) is not None:
+            noted.append(Condition(jnp.all(test(value)), value, message))
+    elif not bool(np.all(test(np.asarray(value)))):
+        raise InputError(refusal(message, value))
+
+
+def refusal(message: str, value) -> str:
+    """The message of a condition with the value in its place."""
+    return message.format(value=np.asarray(value).tolist())
