@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo test test-slow docs bench lock format clean
+.PHONY: help .venv demo test test-slow docs docs-check bench lock format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -18,7 +18,8 @@ help:
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make docs       build the documentation in docs/_build/html"
-	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/benchmarks.md"
+	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
+	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/reference/benchmarks.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for both locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
@@ -61,8 +62,11 @@ test-slow: .venv
 docs: .venv
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
+docs-check: docs
+	$(BIN)/python docs/check_site.py
+
 bench: .venv .venv/bench
-	$(BIN)/python -m benchmarks --page docs/benchmarks.md
+	$(BIN)/python -m benchmarks --page docs/reference/benchmarks.md
 
 format: .venv
 	$(BIN)/ruff check --fix .
@@ -87,6 +91,6 @@ lock:
 	cp "$$folder/lock-bench" requirements-bench.lock
 
 clean:
-	rm -rf .venv build *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/sg_execution_times.rst
+	rm -rf .venv build *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/reference/generated
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -41,9 +41,9 @@ def write(results: Path, page: Path) -> None:
         if report.series:
             from .figures import work_precision
 
-            figure = page.parent / "_static" / f"{name}.svg"
+            figure = page.parent / f"{name}.svg"
             work_precision(report.series, figure)
-            sections.append(f"![Time against error](_static/{figure.name})")
+            sections.append(f"![Time against error]({figure.name})")
     page.write_text("\n\n".join(sections) + "\n")
 
 

@@ -1,13 +1,25 @@
 """Sphinx configuration."""
 
 import os
+import re
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
-# The gallery's examples draw without a screen and run on the CPU.
+# Examples draw without a screen and run on the CPU.
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import liethermo
+
+sys.modules["liethermo.plot"] = liethermo.plot  # imported on demand as an attribute; autodoc asks for a module
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE / "_ext")]
+
+from rooms import draw  # noqa: E402
+
+draw(HERE / "generated" / "rooms.svg")
 
 project = "liethermo"
 author = "The liethermo authors"
@@ -15,45 +27,90 @@ copyright = "2026, The liethermo authors"
 release = installed_version("liethermo")
 version = ".".join(release.split(".")[:2])
 
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))
-
-from rooms import draw  # noqa: E402
-
-draw(HERE / "generated" / "rooms.svg")
-
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "numpydoc",
     "myst_parser",
+    "sphinx_copybutton",
+    "sphinx_design",
     "sphinx_gallery.gen_gallery",
+    "code_links",
+    "executed",
+    "momentum_sphere",
+    "offline_mathjax",
 ]
 
-exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+exclude_patterns = ["_build", "_ext", "generated/executed"]
 nitpicky = False  # types in the docstrings are prose
 
-myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+mathjax_path = "mathjax/tex-chtml-full.js"  # shipped with the site
+
+notebook_folders = ("tutorials/",)
+never_executed = ["reference/changelog"]
 
 autosummary_generate = True
 autodoc_typehints = "none"  # the docstrings state the types
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
+numpydoc_use_plots = False
+
+copybutton_exclude = ".linenos, .gp, .go"
+copybutton_selector = "div:not(.output) > div.highlight > pre"
 
 sphinx_gallery_conf = {
     "examples_dirs": ["../examples"],
     "gallery_dirs": ["gallery"],
+    "subsection_order": [f"../examples/{name}" for name in ("bodies", "algebras", "spins", "heat", "methods")] + ["*"],
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"/(?!plot_)[^/]*\.py$",
     "download_all_examples": False,
     "remove_config_comments": True,
     "reset_modules": ("matplotlib",),
     "show_signature": False,
+    "nested_sections": False,
+    "write_computation_times": False,
 }
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"liethermo {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_js_files = ["momentum_sphere.js"]
 html_show_sourcelink = False
-html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}
+html_theme_options = {
+    "logo": {"text": "liethermo"},
+    "header_links_before_dropdown": 6,
+    "navbar_align": "left",
+    "navbar_persistent": ["search-button"],
+    "navbar_end": ["theme-switcher"],
+    "secondary_sidebar_items": ["page-toc"],
+    "show_prev_next": True,
+    "navigation_with_keys": False,
+    "show_toc_level": 2,
+    "footer_start": ["copyright"],
+    "footer_end": ["theme-version"],
+}
+html_sidebars = {"index": []}
+
+
+def _is_bare_value(app, what, name, value, skip, options):
+    """Leave out attributes that are mere values: autodoc would print the documentation of their type."""
+    told = callable(value) or isinstance(value, (property, classmethod, staticmethod)) or hasattr(value, "__get__")
+    return True if what == "class" and not told else None
+
+
+def _say_what_thumbnails_show(app, pagename, templatename, context, doctree):
+    """Give each picture of the gallery the title of its example as its words."""
+    if pagename.startswith("gallery/") and "body" in context:
+        thumbnail = r'<img alt=""( src="[^"]*_thumb\.png" />(?:(?!<img).)*?sphx-glr-thumbnail-title">)([^<]*)<'
+        context["body"] = re.sub(thumbnail, r'<img alt="Figure of: \2"\1\2<', context["body"], flags=re.DOTALL)
+
+
+def setup(app):
+    app.connect("autodoc-skip-member", _is_bare_value)
+    app.connect("html-page-context", _say_what_thumbnails_show)

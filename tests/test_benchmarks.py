@@ -63,7 +63,7 @@ def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
     (tmp_path / "work_precision.json").write_text(json.dumps(result))
     page.write(tmp_path, tmp_path / "page.md")
     assert "| midpoint, array engine | 500 steps |" in (tmp_path / "page.md").read_text()
-    assert (tmp_path / "_static" / "work_precision.svg").read_text().count("SciPy DOP853") == 1
+    assert (tmp_path / "work_precision.svg").read_text().count("SciPy DOP853") == 1
 
 
 def test_the_driver_refuses_unknown_names(capsys):

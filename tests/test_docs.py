@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 from pathlib import Path
@@ -14,8 +15,12 @@ import liethermo
 import manifolds
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [*ROOT.glob("README.md"), *sorted((ROOT / "docs").glob("*.md"))]
-EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
+BUILT = ("_build", "gallery", "generated")
+PAGES = [
+    ROOT / "README.md",
+    *sorted(page for page in (ROOT / "docs").rglob("*.md") if not set(BUILT) & set(page.relative_to(ROOT).parts)),
+]
+EXAMPLES = sorted((ROOT / "examples").rglob("plot_*.py"))
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -70,6 +75,74 @@ def test_an_example_runs_and_draws(example, scratch):
 
 @pytest.mark.parametrize("package", [liethermo, manifolds], ids=lambda package: package.__name__)
 def test_the_reference_lists_every_public_name(package):
-    (reference,) = (ROOT / "docs").glob("api.*")
+    (reference,) = (ROOT / "docs/reference").glob("api.*")
     listed = re.findall(r"^ {3}([\w.]+)$", reference.read_text(), re.MULTILINE)
     assert sorted(set(package.__all__) - {part for name in listed for part in name.split(".")}) == []
+
+
+LINK = re.compile(
+    r"(?<!`)\[[^\]]*\]\(([^)\s]+)\)|\{(?:doc|download)\}`(?:[^`<]*<)?([^`>]+)>?`|^:link: (\S+)$", re.MULTILINE
+)
+PICTURE = re.compile(r"!\[([^\]]*)\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+
+
+def _words(page: Path) -> str:
+    """A page without its code."""
+    return FENCE.sub("", page.read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_of_a_page_lead_somewhere(page):
+    targets = [a or b or c for a, b, c in LINK.findall(_words(page))]
+    local = [target.partition("#")[0] for target in targets if "://" not in target and not target.startswith("#")]
+    missing = [
+        target
+        for target in local
+        if target != "../gallery/index"  # made by the build
+        and not any((page.parent / f"{target}{suffix}").is_file() for suffix in ("", ".md"))
+    ]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_pictures_are_told_in_words(page):
+    assert [source for words, source in PICTURE.findall(page.read_text()) if not words.strip()] == []
+
+
+def test_every_page_is_in_the_navigation():
+    docs = ROOT / "docs"
+    listed = {"index"}
+    for page in PAGES[1:]:
+        for tree in re.findall(r"^```\{toctree\}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
+            for line in tree.splitlines():
+                if line and not line.startswith(":"):
+                    listed.add(str((page.parent / line).resolve().relative_to(docs)))
+    assert {str(page.relative_to(docs).with_suffix("")) for page in PAGES[1:]} - listed == set()
+    assert {entry for entry in listed if not (docs / f"{entry}.md").is_file()} == {"gallery/index"}
+
+
+def test_names_in_code_font_exist(code_links):
+    """A page may call on nothing that the packages do not have."""
+    unknown = []
+    for page in PAGES:
+        for word in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", _words(page)):
+            try:
+                code_links.resolve(word)
+            except AttributeError as error:
+                unknown.append(f"{_name(page)}: {word}: {error}")
+    assert unknown == []
+
+
+def test_a_name_that_does_not_exist_is_found(code_links):
+    assert code_links.resolve("lt.integrate(...)") == "liethermo.integrate"
+    assert code_links.resolve("LieAlgebra") == "manifolds.LieAlgebra"
+    assert code_links.resolve("step") is None
+    with pytest.raises(AttributeError, match="integrat"):
+        code_links.resolve("lt.integrat")
+
+
+@pytest.fixture
+def code_links(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    return importlib.import_module("code_links")

@@ -115,7 +115,7 @@ def test_a_run_solves_3_12(kind, name):
 
 
 def test_the_matrix_of_regularity():
-    """(5.2)-(5.4) for the mass and spring, with the signs of (3.13). See docs/misprints for what differs in print."""
+    """(5.2)-(5.4) for the mass and spring, with signs of (3.13): docs/reference/misprints.md has the differences."""
     m, k, lam, h, heat = 5.0, 5.0, 10.0, 0.1, 1.5 * 8.31446261815324
     system = lt.models.mass_spring_gas(m, k, lam)
     x0, x1, S0, S1 = 0.3, 0.35, 0.1, 0.2
