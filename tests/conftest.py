@@ -1,4 +1,8 @@
-"""Shared settings: property tests are deterministic, so that a failure here is a failure everywhere."""
+"""Shared settings.
+
+By default property tests are deterministic, so that a failure here is a failure everywhere. The slow tier draws other
+examples each time, and prints how to repeat one that fails.
+"""
 
 import gc
 import resource
@@ -12,7 +16,14 @@ import pytest
 hypothesis.settings.register_profile(
     "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=6
 )
-hypothesis.settings.load_profile("liethermo")
+hypothesis.settings.register_profile(
+    "liethermo-slow", derandomize=False, deadline=None, database=None, print_blob=True, max_examples=10
+)
+
+
+def pytest_configure(config):
+    slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
+    hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -96,14 +96,28 @@ def test_the_printed_coordinate_increment_is_not_symmetric():
     assert np.abs(np.asarray(gradient(energy, x, d) - gradient(energy, x + d, -d))).max() > 1e-3
 
 
-@each_gradient
-def test_coordinate_increment_where_one_coordinate_rests(gradient):
-    energy, x = energy_of(3, 1), np.array([0.4, -0.3, 1.0])
-    found = np.asarray(gradient(energy, x, np.array([0.3, 0.0, 0.0])))
-    assert np.isfinite(found).all()
-    middle = jax.grad(energy.value)(x + np.array([0.3, 0.0, 0.0]))
-    if "increment" in type(gradient).__name__.lower():
-        assert found[2] == pytest.approx(float(middle[2]), rel=0.2)
+def _averaged(slope):
+    points, weights = np.polynomial.legendre.leggauss(20)
+    return 0.5 * sum(w * slope(0.5 * (1.0 + c)) for c, w in zip(points, weights, strict=True))
+
+
+AT_REST = {
+    "gonzalez": lambda slope: slope(0.5),
+    "mean_value": _averaged,
+    "coordinate_increment": lambda slope: slope(1.0),
+    "symmetric_coordinate_increment": lambda slope: 0.5 * (slope(0.0) + slope(1.0)),
+}
+"""What stands in a coordinate that does not move, given the energy's slope along it at ``x + t d``."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_where_one_coordinate_rests(name):
+    """The quotient of that coordinate is 0/0, and each formula has a value of its own in its place."""
+    energy, x, d = energy_of(3, 1), np.array([0.4, -0.3, 1.0]), np.array([0.3, -0.2, 0.0])
+    found = GRADIENTS[name](energy, x, d)
+    assert float(found[2]) == pytest.approx(AT_REST[name](lambda t: float(energy.gradient(x + t * d)[2])), abs=1e-7)
+    others = [float(energy.gradient(x + t * d)[2]) for t in (0.0, 0.5, 1.0)]
+    assert min(np.abs(np.diff(others))) > 1e-4
 
 
 @pytest.mark.sampled(1)
