@@ -1,263 +1,18 @@
-"""Scalar arithmetic that simplifies itself, and the rules by which each JAX primitive becomes such arithmetic.
-
-A scalar is a Python number, known at compile time, or a ``str``, the name of a variable. An array is a NumPy array of
-such objects, so NumPy itself moves data: reshaping, slicing or transposing costs the program nothing.
-"""
+"""The rules by which each JAX primitive becomes scalar arithmetic: ``rule(builder, equation, *arrays)``."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 
-Scalar = str | float | int | bool
-
-
-class Instruction(NamedTuple):
-    """``target = op(*args)``, op a key of :data:`OPERATIONS`."""
-
-    target: str
-    op: str
-    args: tuple[Scalar, ...]
-
-
-def _truncated(a) -> np.ndarray:
-    """As XLA converts to integers: NaN to 0, and what is too large to the nearest one."""
-    a = np.asarray(a, dtype=np.float64)
-    inside = np.abs(a) < 2.0**63
-    outside = np.where(a != a, 0, np.where(a < 0.0, -(2**63), 2**63 - 1))
-    return np.where(inside, np.where(inside, a, 0.0).astype(np.int64), outside)
-
-
-ELEMENTARY: dict[str, Callable[..., Any]] = {
-    **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
-    **{name: getattr(np, name) for name in "sinh cosh tanh floor ceil".split()},
-    **{f"a{name}": getattr(np, f"arc{name}") for name in "sin cos tan tan2 sinh cosh tanh".split()},
-    "erf": scipy.special.erf,
-    "erfc": scipy.special.erfc,
-    "is_finite": np.isfinite,
-    **{name: getattr(operator, name) for name in "eq ne lt le gt ge xor".split()},
-    "and": operator.and_,
-    "or": operator.or_,
-}
-"""Operations that are primitives of the same name, with nothing to simplify."""
-
-OPERATIONS: dict[str, Callable[..., Any]] = ELEMENTARY | {
-    **{name: getattr(operator, name) for name in "add sub mul neg".split()},
-    "div": operator.truediv,
-    "pow": operator.pow,
-    "rem": np.fmod,
-    "trunc": np.trunc,
-    "rint": np.rint,
-    "max": np.maximum,  # like XLA's, NaN if either is
-    "min": np.minimum,
-    "not": np.logical_not,
-    "select": np.where,
-    "float": lambda a: np.asarray(a, dtype=np.float64),
-    "int": lambda a: np.asarray(a, dtype=np.int64),
-    "truncate": _truncated,
-}
-"""What each operation means, on numbers and on NumPy arrays of them."""
-
-TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
-"""Operations on numbers that give a truth value."""
-
-OF_TESTS = {"and", "or", "xor", "not"}
-"""Those on truth values."""
-
-COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
-
-
-class LimitExceededError(Exception):
-    """More instructions than allowed."""
-
-
-class Builder:
-    """Collects instructions; each method returns the scalar that holds its result.
-
-    Nothing is emitted for a result that is known, equals an earlier one, or is one but for a sign that can be moved on.
-    All this is exact, save for the sign of a zero and one licence: a structural zero times anything, or divided by
-    anything, is zero. Sums are never reassociated.
-    """
-
-    def __init__(self, limit: int):
-        self.limit = limit
-        self.instructions: list[Instruction] = []
-        self._emitted: dict[tuple[str, ...], str] = {}
-        self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
-
-    def op(self, op: str, *args: Scalar) -> Scalar:
-        """The result of an operation, with no simplification but constants folded and equal expressions merged."""
-        if not any(type(a) is str for a in args):
-            return fold(op, *args)
-        if op in COMMUTATIVE:
-            args = tuple(sorted(args, key=str))
-        key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
-        name = self._emitted.get(key)
-        if name is None:
-            if len(self.instructions) >= self.limit:
-                raise LimitExceededError
-            name = self._emitted[key] = f"t{len(self.instructions)}"
-            self.instructions.append(Instruction(name, op, args))
-        return name
-
-    def add(self, a, b):
-        if type(a) is not str and type(b) is not str:
-            return a + b
-        if a == 0:
-            return b
-        if b == 0:
-            return a
-        if b in self._opposite:
-            return self.sub(a, self._opposite[b])
-        if a in self._opposite:
-            return self.sub(b, self._opposite[a])
-        return self.op("add", a, b)
-
-    def sub(self, a, b):
-        if type(a) is not str and type(b) is not str:
-            return a - b
-        if b == 0:
-            return a
-        if a == 0:
-            return self.neg(b)
-        if b in self._opposite:
-            return self.add(a, self._opposite[b])
-        return self.op("sub", a, b)
-
-    def neg(self, a):
-        if type(a) is not str:
-            return -a
-        if a in self._opposite:
-            return self._opposite[a]
-        result = self.op("neg", a)
-        self._opposite[result] = a
-        return result
-
-    def mul(self, a, b):
-        if type(a) is not str and type(b) is not str:
-            return a * b
-        if a == 0 or b == 0:
-            return abs(a if a == 0 else b)
-        if a == 1:
-            return b
-        if b == 1:
-            return a
-        return self._signed(self.mul, "mul", a, b)
-
-    def div(self, a, b):
-        if type(a) is not str and type(b) is not str:
-            return fold("div", a, b)
-        if a == 0:
-            return abs(a)
-        if b == 1:
-            return a
-        return self._signed(self.div, "div", a, b)
-
-    def _signed(self, method, op, a, b):
-        """A product or quotient, minus signs taken out of it."""
-        for x, result in (a, lambda y: method(y, b)), (b, lambda y: method(a, y)):
-            opposite = self._opposite.get(x) if type(x) is str else -x if x < 0 else None
-            if opposite is not None:
-                return self.neg(result(opposite))
-        return self.op(op, a, b)
-
-    def integer_pow(self, a, n: int, one: Scalar = 1.0):
-        """``a**n`` by repeated squaring."""
-        if n < 0:
-            return self.div(one, self.integer_pow(a, -n))
-        result = one
-        while n:
-            if n & 1:
-                result = self.mul(result, a)
-            n >>= 1
-            if n:
-                a = self.mul(a, a)
-        return result
-
-    def pow(self, a, b):
-        if type(b) is not str and float(b).is_integer() and abs(b) <= 3:
-            return self.integer_pow(a, int(b))
-        return self.op("pow", a, b)
-
-    def select(self, condition, a, b):
-        """``a if condition else b``."""
-        if type(condition) is not str:
-            return a if condition else b
-        return a if type(a) is type(b) and repr(a) == repr(b) else self.op("select", condition, a, b)
-
-    def max(self, a, b):
-        return self.op("max", a, b)
-
-    def min(self, a, b):
-        return self.op("min", a, b)
-
-    def logistic(self, a):
-        return self.div(1.0, self.add(1.0, self.op("exp", self.neg(a))))
-
-    def round_half_away(self, a):
-        whole = self.op("trunc", a)
-        beyond = self.op("ge", self.op("abs", self.sub(a, whole)), 0.5)  # false at infinity
-        return self.select(beyond, self.add(whole, self.op("sign", a)), whole)
-
-    def all(self, conditions):
-        result: Scalar = True
-        for condition in conditions:
-            result = self.op("and", result, condition)
-        return result
-
-
-def fold(op: str, *args: Scalar) -> Scalar:
-    """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
-    with np.errstate(all="ignore"):
-        value = OPERATIONS[op](*(np.float64(a) if type(a) is float else a for a in args))
-    return value.item() if isinstance(value, np.generic | np.ndarray) else value
-
-
-# -- arrays of scalars ----------------------------------------------------------------------------------------------
-
-
-def constant(value, dtype=None) -> np.ndarray:
-    """An array of numbers as an array of scalars."""
-    return np.asarray(value, dtype=dtype).astype(object)
-
-
-def array(scalars: Sequence[Scalar], shape) -> np.ndarray:
-    result = np.empty(len(scalars), object)
-    result[:] = scalars
-    return result.reshape(shape)
-
-
-def elementwise(function: Callable[..., Scalar], *arrays: np.ndarray) -> np.ndarray:
-    """Apply a function entry by entry."""
-    arrays = np.broadcast_arrays(*arrays)
-    return array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
-
-
-def integers(x: np.ndarray) -> np.ndarray:
-    """An array of scalars as the integers they must be to serve as indices."""
-    if any(type(i) is str for i in x.flat):
-        raise NotImplementedError("with indices known only at run time")
-    return x.astype(np.int64)
-
-
-def _rows(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
-    """The entries along some axes, for each place on the others; and the shape of those others."""
-    kept = [i for i in range(x.ndim) if i not in axes]
-    shape = tuple(x.shape[i] for i in kept)
-    size = math.prod(x.shape[i] for i in axes)
-    return x.transpose(*kept, *axes).reshape(math.prod(shape), size).tolist(), shape
-
-
-# -- the rules: rule(builder, equation, *arrays) -> array or list of arrays -------------------------------------------
+from .builder import ELEMENTARY, Builder, Scalar, array, constant, elementwise, entries_along, integers
 
 Rule = Callable[..., "np.ndarray | list[np.ndarray]"]
 
@@ -350,7 +105,7 @@ def _convert(b, eqn, x):
 
 def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> Rule:
     def rule(b, eqn, x):
-        rows, shape = _rows(x, eqn.params["axes"])
+        rows, shape = entries_along(x, eqn.params["axes"])
         if start is None and not all(rows):
             raise NotImplementedError("of no entries")
         empty: Scalar = 0.0 if start is None else _dtype(eqn).type(start).item()
@@ -375,7 +130,7 @@ def _arg_extreme(better: str) -> Rule:
         return at
 
     def rule(b, eqn, x):
-        rows, shape = _rows(x, eqn.params["axes"])
+        rows, shape = entries_along(x, eqn.params["axes"])
         return array([first(b, row) for row in rows], shape)
 
     return rule
@@ -384,7 +139,7 @@ def _arg_extreme(better: str) -> Rule:
 def _cumulative(combine: Callable[..., Scalar]) -> Rule:
     def rule(b, eqn, x):
         axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
-        rows, shape = _rows(x, (axis,))
+        rows, shape = entries_along(x, (axis,))
         sums = [list(itertools.accumulate(row[::step], lambda u, v: combine(b, u, v)))[::step] for row in rows]
         return np.moveaxis(array([a for row in sums for a in row], (*shape, x.shape[axis])), -1, axis)
 

@@ -18,11 +18,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ..errors import InputError, LiethermoError
-from .primitives import (
+from .builder import (
     OF_TESTS,
     OPERATIONS,
-    PARAMETERS,
-    RULES,
     TESTS,
     Builder,
     Instruction,
@@ -32,6 +30,7 @@ from .primitives import (
     constant,
     elementwise,
 )
+from .primitives import PARAMETERS, RULES
 
 LIMIT = 200_000
 """Instructions that a program may have: far more than compile in reasonable time."""

@@ -16,7 +16,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from llvmlite import ir
 
-from ...tracing.primitives import Scalar
+from ...tracing.builder import Scalar
 from ...tracing.scalarize import Program, UnsupportedPrimitive
 
 NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
@@ -73,7 +73,7 @@ class Writer:
         return ir.Constant(kind, plain if self.lanes == 1 else [plain] * self.lanes)
 
     def operation(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """The result of one operation, a key of :data:`liethermo.tracing.primitives.OPERATIONS`."""
+        """The result of one operation, a key of :data:`liethermo.tracing.builder.OPERATIONS`."""
         build, (x, *rest) = self.builder, args
         real = x.type == self.number
         if op in ARITHMETIC:

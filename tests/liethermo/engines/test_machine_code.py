@@ -11,7 +11,7 @@ from llvmlite import ir
 
 from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.machine_code import NUMBER, MachineCode, Writer
-from liethermo.tracing.primitives import OF_TESTS, OPERATIONS, TESTS, Instruction
+from liethermo.tracing.builder import OF_TESTS, OPERATIONS, TESTS, Instruction
 from liethermo.tracing.scalarize import Program, UnsupportedPrimitive
 from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
 from tests.machine_code import compiled, memory_maps

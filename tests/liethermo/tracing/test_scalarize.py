@@ -22,7 +22,8 @@ from jax.extend.core import jaxprs_in_params
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
-from liethermo.tracing.primitives import OPERATIONS, RULES, Instruction
+from liethermo.tracing.builder import OPERATIONS, Instruction
+from liethermo.tracing.primitives import RULES
 from liethermo.tracing.scalarize import CONTROL, Program, UnsupportedPrimitive, scalarize
 from manifolds.matrices.linear import solve
 from tests.cases import DISSIPATIONS, EPS, build, state_of

@@ -1,0 +1,218 @@
+"""Numbers taken out of a jaxpr: programs that differ in them alone become one, with parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+
+CALLS = ("jit", "pjit", "closed_call", "core_call")
+"""Primitives that call a jaxpr, which takes their place here."""
+
+
+class Lifting:
+    """The numbers of a jaxpr made its first arguments: all literals of double precision but zeros, and all constants.
+
+    Zeros stay, since what vanishes belongs to the operations; so do the exponents that have instructions of their own,
+    and numbers that truth values or integers come from.
+    """
+
+    def __init__(self):
+        self.loops = False
+
+    def whole(self, closed: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
+        """The jaxpr, its remaining constants, and the numbers: scalars in one array, then arrays."""
+        body = _Body(self)
+        body.bind(closed.jaxpr, closed.consts, closed.jaxpr.invars)
+        scalars = [(v, x) for v, x in body.numbers if isinstance(x, float)]
+        arrays = [(v, x) for v, x in body.numbers if not isinstance(x, float)]
+        invars = [v for v, _ in (*scalars, *arrays)] + list(closed.jaxpr.invars)
+        jaxpr = Jaxpr(
+            list(body.constants), invars, body.outputs, body.equations, closed.jaxpr.effects, _unnamed(closed.jaxpr)
+        )
+        with jax.ensure_compile_time_eval():  # numbers, whatever is being traced around
+            packed = jnp.asarray(np.array([x for _, x in scalars], dtype=np.float64))
+            values = [x if isinstance(x, jax.Array) else jnp.asarray(np.asarray(x)) for _, x in arrays]
+        return jaxpr, list(body.constants.values()), (packed, *values)
+
+    def inner(self, closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[tuple[Var, Any]]]:
+        """The jaxpr of a loop or a branch, its numbers in front of its arguments, and those numbers."""
+        body = _Body(self)
+        fresh = [Var(v.aval) for v in closed.jaxpr.invars]
+        body.bind(closed.jaxpr, closed.consts, fresh)
+        invars = [v for v, _ in body.numbers] + fresh
+        jaxpr = Jaxpr(
+            list(body.constants), invars, body.outputs, body.equations, closed.jaxpr.effects, _unnamed(closed.jaxpr)
+        )
+        return ClosedJaxpr(jaxpr, list(body.constants.values())), body.numbers
+
+
+class _Body:
+    """Equations under construction."""
+
+    def __init__(self, lifting: Lifting):
+        self.lifting = lifting
+        self.equations: list[JaxprEqn] = []
+        self.numbers: list[tuple[Var, Any]] = []
+        self.constants: dict[Var, Any] = {}
+        self.outputs: list = []
+        self._fixed: dict[
+            Var, Any
+        ] = {}  # what does not depend on the arguments: a number, or the equation that makes it
+
+    def bind(self, jaxpr: Jaxpr, consts: Sequence, arguments: Sequence) -> None:
+        env: dict[Var, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
+        self.outputs = self._run(jaxpr, consts, env)
+
+    def _run(self, jaxpr: Jaxpr, consts: Sequence, env: dict[Var, Any]) -> list:
+        exponents = {eqn.invars[1] for eqn in jaxpr.eqns if eqn.primitive.name == "pow" and type(eqn.invars[1]) is Var}
+        for var, value in zip(jaxpr.constvars, consts, strict=True):
+            env[var] = self._constant(var, value, var in exponents)
+
+        def read(atom):
+            return atom if isinstance(atom, Literal) else env[atom]
+
+        for eqn in jaxpr.eqns:
+            inputs = [read(a) for a in eqn.invars]
+            if eqn.primitive.name in CALLS and isinstance(eqn.params.get("jaxpr"), ClosedJaxpr):
+                inner = eqn.params["jaxpr"]
+                found = self._run(inner.jaxpr, inner.consts, dict(zip(inner.jaxpr.invars, inputs, strict=True)))
+                env.update(zip(eqn.outvars, found, strict=True))
+                continue
+            fixed = self._value_of(eqn, inputs)
+            if fixed is not None:
+                for var, value in zip(eqn.outvars, fixed, strict=True):
+                    env[var] = self._keep(Var(var.aval), value)
+                continue
+            inputs, params = self._lifted(eqn, inputs)
+            outputs = [type(v)(v.aval) for v in eqn.outvars]
+            env.update(zip(eqn.outvars, outputs, strict=True))
+            self.equations.append(eqn.replace(invars=inputs, outvars=outputs, params=params))
+            if all(isinstance(a, Literal) or a in self._fixed for a in inputs) and not eqn.effects:
+                self._fixed.update((v, (self.equations[-1], i)) for i, v in enumerate(outputs))
+        return [self._number(a.val, a.aval) if _is_number(a) else a for a in map(read, jaxpr.outvars)]
+
+    # -- numbers and constants ------------------------------------------------------------------------------------
+
+    def _number(self, value, aval) -> Var:
+        var = Var(aval)
+        concrete = np.shape(value) == () and not isinstance(value, jax.Array)
+        self.numbers.append((var, float(value) if concrete else value))
+        self._fixed[var] = value
+        return var
+
+    def _keep(self, var: Var, value) -> Var:
+        self.constants[var] = self._fixed[var] = value
+        return var
+
+    def _constant(self, var: Var, value, exponent: bool):
+        if isinstance(value, jax.core.Tracer):
+            return self._number(value, var.aval)
+        if getattr(var.aval, "dtype", None) == np.float64 and not exponent:
+            return self._number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
+        return self._keep(Var(var.aval), value)
+
+    def _lifted(self, eqn: JaxprEqn, inputs: list) -> tuple[list, dict]:
+        """The inputs and parameters of an equation, its numbers taken out."""
+        name, params = eqn.primitive.name, dict(eqn.params)
+        more: list = []
+        if name == "scan":
+            params["jaxpr"], numbers = self.lifting.inner(params["jaxpr"])
+            more = self._taken(numbers)
+            params["num_consts"] += len(more)
+            inputs = more + self._without_numbers(inputs)
+        elif name == "cond":
+            params["branches"], inputs = self._branches(params["branches"], inputs)
+        elif name == "while":
+            self.lifting.loops = True
+            inputs = self._without_numbers(inputs)
+        else:
+            if not self.lifting.loops:
+                self.lifting.loops = any(_loops(p) for p in params.values())
+            keep = name == "pow" and isinstance(inputs[1], Literal) and float(2.0 * inputs[1].val).is_integer()
+            inputs = self._without_numbers(inputs[:1]) + inputs[1:] if keep else self._without_numbers(inputs)
+        return inputs, params
+
+    def _without_numbers(self, inputs: list) -> list:
+        return [self._number(a.val, a.aval) if _is_number(a) else a for a in inputs]
+
+    def _taken(self, numbers: list[tuple[Var, Any]]) -> list[Var]:
+        return [self._number(value, var.aval) for var, value in numbers]
+
+    def _branches(self, branches, inputs: list) -> tuple[tuple, list]:
+        """Branches of a choice, which all take the numbers of all of them."""
+        found = [self.lifting.inner(branch) for branch in branches]
+        every = [var for _, numbers in found for var, _ in numbers]
+        taken = [atom for _, numbers in found for atom in self._taken(numbers)]
+        new = []
+        for closed, numbers in found:
+            own = closed.jaxpr.invars[len(numbers) :]
+            mine = {var for var, _ in numbers}
+            front = [var if var in mine else Var(var.aval) for var in every]
+            new.append(ClosedJaxpr(closed.jaxpr.replace(invars=[*front, *own]), closed.consts))
+        index, *operands = inputs
+        return tuple(new), [index, *taken, *self._without_numbers(operands)]
+
+    # -- what follows from numbers alone ----------------------------------------------------------------------------
+
+    def _value_of(self, eqn: JaxprEqn, inputs: list) -> list | None:
+        """The values of truths or integers that follow from numbers alone: they belong to the operations."""
+        if eqn.effects or all(_is_inexact(v.aval) for v in eqn.outvars):
+            return None
+        if not any(_is_inexact(a.aval) for a in inputs):
+            return None
+        if not all(isinstance(a, Literal) or a in self._fixed for a in inputs):
+            return None
+        memo: dict[Var, Any] = {}
+
+        def value(atom):
+            if isinstance(atom, Literal):
+                return atom.val
+            if atom not in memo:
+                found = self._fixed[atom]
+                if isinstance(found, tuple):
+                    equation, i = found
+                    found = _evaluated(equation, [value(a) for a in equation.invars])[i]
+                memo[atom] = found
+            return memo[atom]
+
+        values = [value(a) for a in inputs]
+        if any(isinstance(v, jax.core.Tracer) for v in values):
+            return None
+        return _evaluated(eqn, values)
+
+
+def _evaluated(eqn: JaxprEqn, values: Sequence) -> list:
+    inputs = [Var(a.aval) for a in eqn.invars]
+    jaxpr = Jaxpr([], inputs, eqn.outvars, [eqn.replace(invars=list(inputs))], debug_info=DebugInfo("", "", None, None))
+    with jax.ensure_compile_time_eval():
+        return jaxpr_as_fun(ClosedJaxpr(jaxpr, []))(*values)
+
+
+def _unnamed(jaxpr: Jaxpr) -> DebugInfo:
+    return jaxpr.debug_info._replace(arg_names=None, result_paths=None)  # there are more arguments now
+
+
+def _is_inexact(aval) -> bool:
+    dtype = getattr(aval, "dtype", None)
+    return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
+
+
+def _is_number(atom) -> bool:
+    """Whether it is a literal to be lifted."""
+    if not isinstance(atom, Literal) or getattr(atom.aval, "dtype", None) != np.float64:
+        return False
+    return bool(atom.val != 0.0) and np.shape(atom.val) == ()
+
+
+def _loops(parameter) -> bool:
+    """Whether a parameter of an equation has a jaxpr with a loop of unknown length."""
+    if isinstance(parameter, ClosedJaxpr):
+        parameter = parameter.jaxpr
+    if isinstance(parameter, Jaxpr):
+        return any(e.primitive.name == "while" or any(map(_loops, e.params.values())) for e in parameter.eqns)
+    return isinstance(parameter, tuple | list) and any(map(_loops, parameter))
