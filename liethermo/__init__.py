@@ -12,10 +12,13 @@ import manifolds  # noqa: F401  (switches 64-bit mode on before anything is trac
 from . import models, testing
 from .dissipation.base import Dissipation
 from .dissipation.double_bracket import DoubleBracket
+from .dissipation.factor import Factor
 from .dissipation.force import EulerPoincareForce
 from .dissipation.four_bracket import FourBracket
+from .dissipation.friction import Friction
 from .dissipation.friction_operator import FrictionOperator
 from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import ProjectedMetric
 from .errors import (
     AxiomError,
@@ -79,6 +82,7 @@ from .systems import (
 from .systems.composed.graph_files import Graph, read_graph
 
 __all__ = [
+    "ActivatedFriction",
     "Adaptive",
     "AttitudeSystem",
     "Audit",
@@ -90,9 +94,11 @@ __all__ = [
     "ConvergenceError",
     "CoordinateIncrement",
     "Copies",
+    "CoulombFriction",
     "DiscreteGradient",
     "DiscreteHerglotz",
     "Dissipation",
+    "DissipationPotential",
     "DoubleBracket",
     "DrivenSystem",
     "Each",
@@ -102,9 +108,11 @@ __all__ = [
     "EulerPoincareForce",
     "EulerPoincareSystem",
     "EvolutionSystem",
+    "Factor",
     "FileError",
     "FiniteDifference",
     "FourBracket",
+    "Friction",
     "FrictionOperator",
     "Function",
     "FunctionError",
@@ -130,6 +138,7 @@ __all__ = [
     "NonFiniteError",
     "OneStepMethod",
     "Potential",
+    "PowerLawFriction",
     "ProjectedMetric",
     "Quadratic",
     "Reference",

@@ -193,6 +193,21 @@ DISSIPATIONS = [
     ),
     Case("four_bracket", _curvature_tensor),
     Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian),
+    Case("potential_coulomb", lambda g, H, rng: lt.DissipationPotential(lt.CoulombFriction(0.3, 0.1)), _line),
+    Case(
+        "potential_power_law",
+        lambda g, H, rng: lt.DissipationPotential(
+            lt.PowerLawFriction(2.5, 0.2, each=True), of=lt.ProjectedMetric(0.3 * _spd(rng, g.dim))
+        ),
+        _line,
+    ),
+    Case(
+        "potential_activated",
+        lambda g, H, rng: lt.DissipationPotential(
+            lt.ActivatedFriction(0.3, 2.0), of=lt.InnerProductDissipation(0.1 * _spd(rng, g.dim))
+        ),
+        _abelian,
+    ),
     Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian),
     Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian),
     Case(

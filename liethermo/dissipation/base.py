@@ -18,6 +18,7 @@ import scipy.sparse
 
 from ..functions.energy import Energy
 from ..functions.indices import union
+from .factor import Factor, beside
 from .geometry import Geometry
 
 Law = Literal["conserved", "nondecreasing", "nonincreasing"]
@@ -98,6 +99,15 @@ class Dissipation(eqx.Module):
             Gradients of the functions in :attr:`preserve`, in their order.
         """
 
+    def factor(self, system: Geometry, x, dH, dL) -> Factor | None:
+        """A matrix B with ``B B^T = K``, of the friction matrix K that the force is K dS with; None where it has none.
+
+        Of a dissipation that lowers the energy the force is ``-K dH``. Noise is made with B, and so are potentials of
+        forces; ``B^T dH = 0`` and ``B^T dL = 0`` for whatever gradients it is handed, where these are conserved.
+        """
+        del system, x, dH, dL
+        return None
+
     def momentum(self, dH, turned) -> jax.Array | None:
         """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].
 
@@ -154,6 +164,11 @@ class Several(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         return sum(part.force(system, x, dH, dS, own) for part, own in portions(self, dL))
+
+    def factor(self, system, x, dH, dL):
+        found = [part.factor(system, x, dH, own) for part, own in portions(self, dL)]
+        given = [B for B in found if B is not None]
+        return beside(given) if len(given) == len(found) else None
 
 
 def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:

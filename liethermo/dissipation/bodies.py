@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from manifolds.structures.contact import Places
 
 from ..functions.indices import Indices, as_pattern, cliques
 from .base import Dissipation, Law, SkewFriction
 from .edges import Edges
+from .factor import Factor
 
 
 class HeatConduction(Dissipation):
@@ -49,6 +51,16 @@ class HeatConduction(Dissipation):
         heat = self.conductance * (along[i] * T[j] - along[j] * T[i])
         return jnp.zeros_like(x).at[S[i]].add(heat / T[i]).at[S[j]].add(-heat / T[j])
 
+    def factor(self, system, x, dH, dL):
+        S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
+        T = _positive(dH[S])
+        root = jnp.sqrt(self.conductance * T[i] * T[j])
+
+        def times(w):
+            return jnp.zeros_like(x).at[S[i]].add(root * w / T[i]).at[S[j]].add(-root * w / T[j])
+
+        return Factor(len(i), times)
+
     def couplings(self, system):
         S = _places(system).S
         return cliques(np.stack([S[np.asarray(self.first)], S[np.asarray(self.second)]], axis=1), system.dim)
@@ -71,13 +83,29 @@ class LinearFriction(Dissipation):
     body: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
-        places = _places(system)
-        mine = np.arange(len(places.p)) if self.body is None else np.flatnonzero(places.owner == self.body)
-        p, S = places.p[mine], places.S[places.owner[mine]]
-        R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
+        p, S, R = self._here(system, x)
         v, T = dH[p], _positive(dH[S])
         flux = _apply(R, (v * dS[S] - T * dS[p]) / T)
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
+
+    def factor(self, system, x, dH, dL):
+        p, S, R = self._here(system, x)
+        v, T = dH[p], _positive(dH[S])
+        full = semidefinite_root if callable(self.R) else semidefinite_factor
+        root = jnp.sqrt(R) if jnp.ndim(R) < 2 else full(R)
+
+        def times(w):
+            flux = _apply(root, w) / jnp.sqrt(T)
+            return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
+
+        return Factor(len(p), times)
+
+    def _here(self, system, x):
+        """Where the momenta and the entropies are, and R."""
+        places = _places(system)
+        mine = np.arange(len(places.p)) if self.body is None else np.flatnonzero(places.owner == self.body)
+        R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
+        return places.p[mine], places.S[places.owner[mine]], R
 
     def couplings(self, system):
         return _within(_places(system), system.dim)
@@ -113,6 +141,20 @@ class Drag(Dissipation):
         flux = self.coefficient[edge] * along * (2.0 * T_i * T_j / (T_i + T_j))
         made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
         return made.at[p_i].add(-flux).at[p_j].add(flux)
+
+    def factor(self, system, x, dH, dL):
+        places = _places(system)
+        i, j, edge = _pairs(self.first, self.second, places)
+        S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
+        T_i, T_j, w_ij = _positive(dH[S_i]), _positive(dH[S_j]), dH[p_i] - dH[p_j]
+        root = jnp.sqrt(self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j)))
+
+        def times(w):
+            flux = root * w
+            made = jnp.zeros_like(x).at[S_i].add(0.5 * w_ij * flux / T_i).at[S_j].add(0.5 * w_ij * flux / T_j)
+            return made.at[p_i].add(-flux).at[p_j].add(flux)
+
+        return Factor(len(edge), times)
 
     def couplings(self, system):
         places = _places(system)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import jax
 
+from manifolds.matrices.symmetric import semidefinite_factor
+
 from .base import Dissipation
 from .checks import check_matrix, checked_rate, semidefinite
+from .factor import Factor
 
 
 class DoubleBracket(Dissipation):
@@ -54,3 +57,9 @@ class DoubleBracket(Dissipation):
         motion = system.poisson.sharp(x, dH)
         lowered = system.lowered(x, motion) if self.metric is None else self.metric @ motion
         return self.rate * system.poisson.sharp(x, lowered)
+
+    def factor(self, system, x, dH, dL):
+        if self.metric is None and system.space is not None:
+            return None
+        root = None if self.metric is None else semidefinite_factor(self.metric)
+        return Factor(system.dim, lambda w: system.poisson.sharp(x, w if root is None else root @ w)).scaled(self.rate)

@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import InputError
+from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
+
+from ..errors import IndefiniteError, InputError
 from .base import Dissipation
 from .checks import check_matrix, form_at, semidefinite, zero_state
+from .factor import Factor
 from .inner_product import InnerProductDissipation, KillingDissipation
 
 
@@ -65,6 +68,19 @@ class FourBracket(Dissipation):
     def force(self, system, x, dH, dS, dL):
         return jnp.einsum("ijkl,j,k,l->i", form_at(self.tensor, x), dH, dS, dH)
 
+    def factor(self, system, x, dH, dL):
+        """Of R as a form on pairs of covectors, which has to be semidefinite: ``R = sum A (x) A``, columns ``A dH``."""
+        i, j = np.triu_indices(system.dim, 1)
+        form = form_at(self.tensor, x)[i, j][:, i, j]
+        _check_on_pairs(form)
+        root = semidefinite_root(form) if callable(self.tensor) else semidefinite_factor(form)
+
+        def times(w):
+            A = jnp.zeros((system.dim, system.dim)).at[i, j].add(root @ w)
+            return (A - A.T) @ dH
+
+        return Factor(len(i), times, solenoidal=not callable(self.tensor))
+
 
 class KulkarniNomizu(Dissipation):
     """The 4-bracket of two forms; see :meth:`FourBracket.kulkarni_nomizu`."""
@@ -87,6 +103,33 @@ class KulkarniNomizu(Dissipation):
         from_sigma = jnp.dot(mH, dH) * (sigma @ dS) - jnp.dot(mH, dS) * sH
         from_mu = jnp.dot(sH, dH) * (mu @ dS) - jnp.dot(sH, dS) * mH
         return from_sigma + from_mu
+
+    def factor(self, system, x, dH, dL):
+        """Columns ``(m_j . dH) s_i - (s_i . dH) m_j``, of divergence zero where the forms are constant."""
+        n, constant = system.dim, not (callable(self.sigma) or callable(self.mu))
+        s, m = (
+            semidefinite_root(form(x)) if callable(form) else semidefinite_factor(form)
+            for form in (self.sigma, self.mu)
+        )
+
+        def times(w):
+            w = w.reshape(n, n)
+            return s @ (w @ (dH @ m)) - m @ ((dH @ s) @ w)
+
+        return Factor(n * n, times, constant)
+
+
+def _check_on_pairs(form) -> None:
+    if isinstance(form, jax.core.Tracer):
+        return
+    lowest, size = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
+    if lowest < -1e-12 * size * len(form):
+        raise IndefiniteError(
+            f"the 4-bracket has no factor: on pairs of covectors it has the negative eigenvalue {lowest:.3g}. "
+            "What it makes of two covectors may be semidefinite all the same: give that as a FrictionOperator",
+            residual=lowest,
+            tolerance=1e-12 * size * len(form),
+        )
 
 
 def _check_curvature_symmetries(R) -> None:

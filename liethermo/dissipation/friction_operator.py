@@ -8,8 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
+
 from .base import Dissipation
 from .checks import check_matrix, checked_rate, form_at, semidefinite
+from .factor import Factor
 
 KERNEL = "K grad H = 0, as given"
 """The row of a check on a friction operator before it is projected."""
@@ -57,12 +60,28 @@ class FrictionOperator(Dissipation):
         return {KERNEL: missed / jnp.where(size > 0.0, size, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
-        gradient, raised, K = system.raised(x, system.energy.gradient(x)), system.raised(x, dH), form_at(self.K, x)
+        along = self._along(system, x, dH)
+        image = form_at(self.K, x) @ (dS - jnp.dot(along, dS) * dH)
+        return self.rate * (image - jnp.dot(dH, image) * along)
+
+    def factor(self, system, x, dH, dL):
+        """The symmetric root of K(x), or a Cholesky factor of a constant K, likewise projected."""
+        root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
+        along = self._along(system, x, dH)
+
+        def times(w):
+            image = root @ w
+            return image - jnp.dot(dH, image) * along
+
+        return Factor(system.dim, times).scaled(self.rate)
+
+    @staticmethod
+    def _along(system, x, dH):
+        """The vector a with ``a . dH = 1`` that P projects along."""
+        gradient, raised = system.raised(x, system.energy.gradient(x)), system.raised(x, dH)
         overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
         safe = overlap > 1e-3 * square
         along = jnp.where(safe, gradient, raised)
         overlap = jnp.where(safe, overlap, square)
-        along = along / jnp.where(overlap > 0.0, overlap, 1.0)
-        image = K @ (dS - jnp.dot(along, dS) * dH)
-        return self.rate * (image - jnp.dot(dH, image) * along)
+        return along / jnp.where(overlap > 0.0, overlap, 1.0)

@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..errors import IndefiniteError, InputError
 from .base import Dissipation
 from .checks import checked_rate, needed_algebra, semidefinite
+from .factor import Factor
 
 
 class InnerProductDissipation(Dissipation):
@@ -45,6 +47,9 @@ class InnerProductDissipation(Dissipation):
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
         return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
+
+    def factor(self, system, x, dH, dL):
+        return _factor(system, dH, self.K)
 
 
 class KillingDissipation(Dissipation):
@@ -105,3 +110,12 @@ class KillingDissipation(Dissipation):
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
         return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
+
+    def factor(self, system, x, dH, dL):
+        return _factor(system, dH, self.form).scaled(self.rate)
+
+
+def _factor(system, dH, form) -> Factor:
+    """Of ``ad*_dH 𝒦 ad_dH``: ``div ad*_dH F = C[a, b, c] H_ab F_c = 0``, C being skew in a, b, the Hessian not."""
+    root, g = semidefinite_factor(form), system.algebra
+    return Factor(form.shape[0], lambda w: g.ad_star(dH, root @ w), solenoidal=True)

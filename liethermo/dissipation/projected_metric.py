@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.checks import recognised
 from ..functions.energy import Energy, as_energy
 from .base import Dissipation
 from .checks import checked_rate, form_at, semidefinite
+from .factor import Factor
 
 
 class ProjectedMetric(Dissipation):
@@ -55,34 +60,73 @@ class ProjectedMetric(Dissipation):
         return eqx.tree_at(lambda d: d.functions, self, tuple(recognised(L, system.dim) for L in self.functions))
 
     def force(self, system, x, dH, dS, dL):
-        G = form_at(self.cometric, x)
-
-        def raised(alpha):
-            return system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
-
+        raised = self._raised(system, x)
         if not dL and not self.normalized:
             GdH = raised(dH)
             return self.rate * (jnp.dot(GdH, dH) * raised(dS) - jnp.dot(GdH, dS) * GdH)
-        frame: list[tuple[jax.Array, jax.Array]] = []  # G-orthonormal covectors and their images under G
+        frame = _Orthonormal.of(raised, (dH, *dL))
+        projected = frame.off_images(raised(frame.off(dS)))
+        return self.rate * (projected if self.normalized else frame.gram * projected)
 
-        def off_frame(alpha):
-            for _ in range(2):  # the second pass removes what rounding left of the first
-                for e, Ge in frame:
-                    alpha = alpha - jnp.dot(Ge, alpha) * e
-            return alpha
+    def factor(self, system, x, dH, dL):
+        """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
 
-        gram = jnp.ones(())
-        for gradient in (dH, *dL):
+        Their divergence is zero where G is constant.
+        """
+        if system.space is not None:
+            return None
+        G, n = form_at(self.cometric, x), system.dim
+        root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
+        if not dL and not self.normalized:
+            above = np.triu_indices(n, 1)
+
+            def turned(w):
+                W = jnp.zeros((n, n)).at[above].add(w)
+                return root @ ((W - W.T) @ (dH @ root))
+
+            return Factor(len(above[0]), turned, solenoidal=not callable(self.cometric)).scaled(self.rate)
+        frame = _Orthonormal.of(self._raised(system, x), (dH, *dL))
+        return Factor(n, lambda w: frame.off_images(root @ w)).scaled(
+            self.rate if self.normalized else self.rate * frame.gram
+        )
+
+    def _raised(self, system, x):
+        G = form_at(self.cometric, x)
+        return lambda alpha: system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
+
+
+class _Orthonormal(NamedTuple):
+    """Orthonormal covectors in the metric G that span some gradients, and their images under G.
+
+    ``gram`` is the determinant of the products of the gradients.
+    """
+
+    pairs: list[tuple[jax.Array, jax.Array]]
+    gram: jax.Array
+
+    @classmethod
+    def of(cls, raised: Callable, gradients: Sequence[jax.Array]) -> _Orthonormal:
+        found = cls([], jnp.ones(()))
+        for gradient in gradients:
             before = jnp.dot(raised(gradient), gradient)
-            rest = off_frame(gradient)
+            rest = found.off(gradient)
             square = jnp.dot(raised(rest), rest)
             # a gradient that depends on the earlier ones adds nothing to project off
             independent = square > 1e-24 * before
             square = jnp.where(independent, square, 0.0)
             e = rest * jnp.where(independent, 1.0 / jnp.sqrt(jnp.where(independent, square, 1.0)), 0.0)
-            frame.append((e, raised(e)))
-            gram = gram * square
-        projected = raised(off_frame(dS))
-        for e, Ge in frame:  # P is G-symmetric: project the image as well, so that K stays symmetric to rounding
-            projected = projected - jnp.dot(e, projected) * Ge
-        return self.rate * (projected if self.normalized else gram * projected)
+            found = cls([*found.pairs, (e, raised(e))], found.gram * square)
+        return found
+
+    def off(self, alpha):
+        """P alpha."""
+        for _ in range(2):  # the second pass removes what rounding left of the first
+            for e, Ge in self.pairs:
+                alpha = alpha - jnp.dot(Ge, alpha) * e
+        return alpha
+
+    def off_images(self, v):
+        """P^T v: as P is G-symmetric, projecting the image as well keeps K symmetric to rounding."""
+        for e, Ge in self.pairs:
+            v = v - jnp.dot(e, v) * Ge
+        return v

@@ -15,6 +15,7 @@ from manifolds._tables import Row, table
 from ..dissipation.base import Dissipation, Law
 from ..dissipation.friction_operator import KERNEL
 from ..dissipation.geometry import Geometry
+from ..dissipation.potential import CONVEX, LEAST
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..tracing.interpret import at_points
@@ -137,6 +138,8 @@ _AXIOMS = {
         "the friction operator does not have grad H in its kernel, and only its projection off grad H would act: give "
         "project=True if that is meant",
     ),
+    CONVEX: (CONVEX, "a dissipation potential has to be convex in the forces, or entropy could fall"),
+    LEAST: (LEAST, "a dissipation potential drives nothing where there is no force: its slope at zero vanishes"),
     "symmetric": ("K symmetric", "the friction matrix must be symmetric"),
     "kernel": ("K grad H = 0", "the dissipation would change the energy"),
     "semidefinite": ("K >= 0", "the friction matrix has a negative eigenvalue, so entropy could fall"),

@@ -214,6 +214,10 @@ class _OnBody(Carried):
         dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
         return jnp.pad(self.part.force(system._now(x), x[:-2], dH[:-2], dS, dL), (0, 2))
 
+    def factor(self, system, x, dH, dL):
+        B = self.part.factor(system._now(x), x[:-2], dH[:-2], tuple(L[:-2] for L in dL))
+        return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, 2)))
+
 
 class _Clock(eqx.Module):
     """From a state with clock and work to x and t."""

@@ -19,6 +19,9 @@ from .stumpff import hyperbolic_stumpff
 _NEARLY_ONE = 0.5
 """Largest entry of w - I up to which the logarithm of w takes the eigenvalues of w - I, not those of w."""
 
+_RANK = 1e-13
+"""Eigenvalues and pivots of semidefinite matrices, relative to the largest, that rounding alone may have made."""
+
 
 def symmetrized(a) -> jax.Array:
     """``(a + a^T) / 2``."""
@@ -116,3 +119,59 @@ def _log_derivative(primals, tangents):
 
     # The derivative of exp is self-adjoint, and a linear solve has derivatives of its own: hence those of higher order.
     return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(dw), in_eigenvectors, symmetric=True)
+
+
+def semidefinite_factor(a) -> jax.Array:
+    """A matrix L with ``L L^T = a``, shape (n, n), for a symmetric positive semidefinite a: Cholesky's, with pivots.
+
+    What is left when the pivots are rounding is dropped: columns of zeros. The factor is no continuous function of a.
+    """
+    n, columns = a.shape[-1], []
+    least = _RANK * jnp.max(jnp.diagonal(a), initial=0.0)
+    for _ in range(n):
+        diagonal = jnp.diagonal(a)
+        pivot = jnp.argmax(diagonal)
+        chosen = jnp.arange(n) == pivot
+        largest_left = jnp.max(diagonal)
+        good = largest_left > least
+        column = jnp.where(good, a @ jnp.where(chosen, 1.0, 0.0) / jnp.sqrt(jnp.where(good, largest_left, 1.0)), 0.0)
+        columns.append(column)
+        a = a - column[:, None] * column[None, :]
+        a = jnp.where(chosen[:, None] | chosen[None, :], 0.0, a)
+    return jnp.stack(columns, axis=-1)
+
+
+@jax.custom_jvp
+def semidefinite_root(a) -> jax.Array:
+    """The symmetric positive semidefinite X with ``X X = a``, shape (..., n, n).
+
+    Eigenvalues that are rounding count as zero. As long as their number does not change X is a smooth function of a.
+    The first derivative is right also where eigenvalues meet; further ones are where none is zero.
+    """
+    values, vectors = _semidefinite(a)
+    return symmetrized((vectors * jnp.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def _semidefinite(a) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues, zero where they are rounding, and eigenvectors."""
+    values, vectors = eigh(a)
+    least = _RANK * jnp.max(jnp.abs(values), axis=-1, keepdims=True)
+    return jnp.where(values > least, values, 0.0), vectors
+
+
+@semidefinite_root.defjvp
+def _root_derivative(primals, tangents):
+    (a,), (da,) = primals, tangents
+    x = semidefinite_root(a)
+    values, vectors = _semidefinite(jax.lax.stop_gradient(a))
+    roots = jnp.sqrt(values)
+    sums = roots[..., :, None] + roots[..., None, :]
+    inverse = jnp.where(sums > 0.0, 1.0 / jnp.where(sums > 0.0, sums, 1.0), 0.0)
+
+    def of_square(dx):  # the derivative of X X, self-adjoint
+        return x @ dx + dx @ x
+
+    def in_eigenvectors(_, b):
+        return vectors @ ((vectors.swapaxes(-1, -2) @ b @ vectors) * inverse) @ vectors.swapaxes(-1, -2)
+
+    return x, jax.lax.custom_linear_solve(of_square, symmetrized(da), in_eigenvectors, symmetric=True)

@@ -1,0 +1,48 @@
+"""Factors of friction matrices: what makes noise of random numbers, and potentials of forces."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Factor(NamedTuple):
+    """A matrix B, shape (n, size), with ``B B^T = K``, as what it does.
+
+    Attributes
+    ----------
+    size : int
+        Number of columns.
+    times : function
+        From w, shape (size,), to ``B w``, shape (n,); linear.
+    solenoidal : bool
+        Whether every column, at the gradients of the functions, is a field of divergence zero.
+    """
+
+    size: int
+    times: Callable[[jax.Array], jax.Array]
+    solenoidal: bool = False
+
+    def transposed(self, alpha) -> jax.Array:
+        """``B^T alpha``, shape (size,)."""
+        return jax.linear_transpose(self.times, jax.ShapeDtypeStruct((self.size,), jnp.float64))(alpha)[0]
+
+    def scaled(self, rate) -> Factor:
+        """Of ``rate * K``, the rate a number, which may depend on the state."""
+        root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)  # zero has a derivative too
+        return self._replace(times=lambda w: root * self.times(w))
+
+
+def beside(factors: Sequence[Factor]) -> Factor:
+    """The factors side by side: that of the sum of the matrices."""
+    ends = list(itertools.accumulate((B.size for B in factors), initial=0))
+
+    def times(w):
+        parts = zip(factors, itertools.pairwise(ends), strict=True)
+        return sum(B.times(w[start:end]) for B, (start, end) in parts)
+
+    return Factor(ends[-1], times, all(B.solenoidal for B in factors))

@@ -1,0 +1,234 @@
+"""Friction that is not linear in the forces: the gradient of a convex potential."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import real_array
+from manifolds.matrices.stumpff import hyperbolic_stumpff
+
+from ..errors import FunctionError, InputError
+from ..functions.energy import needed_arguments
+from .base import Dissipation
+from .checks import zero_state
+from .factor import Factor
+from .projected_metric import ProjectedMetric
+
+CONVEX, LEAST = "psi convex", "psi least at 0"
+"""The rows of a check on a dissipation potential."""
+
+PAIRS, SCALES = 8, (1e-3, 1e-1, 1.0, 10.0)
+"""Random pairs of forces that the convexity of a potential is tried on, and their sizes."""
+
+
+class DissipationPotential(Dissipation):
+    """Dissipation by a potential of the thermodynamic forces: ``force = B grad psi(B^T dS)``.
+
+    B is the factor of another dissipation, ``B B^T = K``. By default it is the orthogonal projector P off dH, and this
+    is ``P grad psi(P dS)``; that of a :class:`ProjectedMetric` with a cometric is an oblique one, with functions to
+    ``preserve`` it is off their gradients too; that of a dissipation on an algebra makes forces ``[dH, dS]`` in the
+    algebra, and that of the conduction of heat one force for each pair of bodies.
+
+    For a psi that is convex and least at zero, ``S' = (B^T dS) . grad psi(B^T dS) >= 0``, and ``B^T dH = 0`` for the
+    discrete gradient too: so every method keeps both laws as it keeps them for K. The potential ``|f|^2 / 2`` is K
+    itself. ``system.check()`` tries whether psi is convex and least at zero, and building a system refuses one that is
+    not; a psi that has a kink is taken with the slope that JAX gives it there, and the iterations of implicit methods
+    want a continuous one.
+
+    Parameters
+    ----------
+    psi : function from the forces, shape (size,), to a scalar; or from a state and the forces
+        :class:`CoulombFriction`, :class:`PowerLawFriction`, :class:`ActivatedFriction`, or one of your own.
+    of : Dissipation, optional
+        Whose factor makes the forces; ``ProjectedMetric(normalized=True)`` by default.
+
+    Raises
+    ------
+    AxiomError
+        When a system is built with a psi that is not convex, or not least at zero.
+    InputError
+        If ``of`` has no factor.
+    """
+
+    psi: Callable
+    of: Dissipation
+    of_state: bool = eqx.field(static=True)
+
+    def __init__(self, psi: Callable, of: Dissipation | None = None):
+        if not callable(psi):
+            raise InputError(f"psi is a function from forces to a number, not {type(psi).__name__}")
+        of = ProjectedMetric(normalized=True) if of is None else of
+        if not isinstance(of, Dissipation):
+            raise InputError(f"of is a dissipation, not {type(of).__name__}")
+        if of.energy_law != "conserved":
+            raise InputError(f"a potential composed with {type(of).__name__} would not keep the energy")
+        self.psi, self.of, self.of_state = psi, of, needed_arguments(psi) == 2
+
+    @property
+    def symmetric(self):
+        return False
+
+    @property
+    def keeps_casimirs(self):
+        return self.of.keeps_casimirs
+
+    @property
+    def preserve(self):
+        return self.of.preserve
+
+    def couplings(self, system):
+        return self.of.couplings(system)
+
+    def prepared(self, system):
+        found = eqx.tree_at(lambda d: d.of, self, self.of.prepared(system))
+        shape = jax.eval_shape(
+            lambda x: found.psi_of(x)(jnp.zeros(found._factor_at(system, x).size)), zero_state(system.dim)
+        )
+        if shape.shape != ():
+            raise FunctionError(f"psi must return one number, but it returns shape {shape.shape}")
+        return found
+
+    def psi_of(self, x) -> Callable:
+        """The potential as a function of the forces at a state."""
+        return lambda f: jnp.asarray(self.psi(x, f) if self.of_state else self.psi(f))
+
+    def own_residuals(self, system, x):
+        """By how much the slope falls between two forces, and by how much it pushes at none."""
+        slope = jax.grad(self.psi_of(x))
+        size = self._factor_at(system, x).size
+        pairs = np.random.default_rng(0).standard_normal((PAIRS, 2, size))
+        pairs = np.concatenate([scale * pairs for scale in SCALES])
+
+        def falls(pair):
+            a, b = pair
+            slopes = jnp.stack([slope(a), slope(b)])
+            length = jnp.linalg.norm(a - b) * jnp.max(jnp.linalg.norm(slopes, axis=1))
+            return jnp.maximum(-jnp.dot(a - b, slopes[0] - slopes[1]), 0.0) / jnp.where(length > 0.0, length, 1.0)
+
+        largest = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
+        at_rest = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(largest > 0.0, largest, 1.0)
+        return self.of.own_residuals(system, x) | {CONVEX: jnp.max(jax.vmap(falls)(pairs)), LEAST: at_rest}
+
+    def force(self, system, x, dH, dS, dL):
+        B = self._needed(system, x, dH, dL)
+        return B.times(jax.grad(self.psi_of(x))(B.transposed(dS)))
+
+    def _factor_at(self, system, x) -> Factor:
+        return self._needed(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
+
+    def _needed(self, system, x, dH, dL) -> Factor:
+        B = self.of.factor(system, x, dH, dL)
+        if B is None:
+            where = "" if system.space is None else f" on {system.space.name}"
+            raise InputError(f"{type(self.of).__name__} gives no factor of its friction matrix{where} to compose with")
+        return B
+
+
+# -- named potentials -------------------------------------------------------------------------------------------------
+
+
+class NamedPotential(eqx.Module):
+    """A sum over the forces, or with ``each=False`` a function of their length: then no choice of axes matters."""
+
+    each: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __call__(self, f):
+        return jnp.sum(self.of_square(f * f)) if self.each else self.of_square(jnp.dot(f, f))
+
+    def of_square(self, q):
+        """As a function of the square of a force."""
+        raise NotImplementedError
+
+
+class CoulombFriction(NamedPotential):
+    """``strength (sqrt(f^2 + width^2) - width)``: what it drives is at most ``strength``, however large the force.
+
+    Smooth; for forces far below the width it is linear, with the coefficient ``strength / width``.
+
+    Parameters
+    ----------
+    strength : float, >= 0
+    width : float, > 0
+    each : bool
+        Of every force by itself, or of their length (by default).
+    """
+
+    strength: jax.Array
+    width: jax.Array
+
+    def __init__(self, strength=1.0, width=1e-2, *, each: bool = False):
+        self.strength, self.width = _number(strength, "the strength", True), _number(width, "the width", False)
+        self.each = bool(each)
+
+    def of_square(self, q):
+        return self.strength * q / (jnp.sqrt(q + self.width**2) + self.width)
+
+
+class PowerLawFriction(NamedPotential):
+    """``strength / p ((f^2 + width^2)^(p/2) - width^p)``: what it drives grows as ``|f|^(p-1)``.
+
+    Smooth for a width > 0. Without one its slope is continuous, and of Hölder class p - 1 at f = 0 for p < 2; a width
+    is what helps where Newton's method stalls there. Quadratic for p = 2.
+
+    Parameters
+    ----------
+    exponent : float, > 1
+    strength, width : float, >= 0
+    each : bool
+        Of every force by itself, or of their length (by default).
+    """
+
+    exponent: jax.Array
+    strength: jax.Array
+    width: jax.Array
+
+    def __init__(self, exponent, strength=1.0, width=0.0, *, each: bool = False):
+        self.exponent = _number(exponent, "the exponent", False)
+        if not isinstance(self.exponent, jax.core.Tracer) and not float(self.exponent) > 1.0:
+            raise InputError(f"the exponent of a power law is > 1, not {float(self.exponent):g}: it has to be convex")
+        self.strength, self.width = _number(strength, "the strength", True), _number(width, "the width", True)
+        self.each = bool(each)
+
+    def of_square(self, q):
+        q = q + self.width**2
+        power = jnp.where(q > 0.0, jnp.where(q > 0.0, q, 1.0) ** (0.5 * self.exponent), 0.0)
+        return self.strength / self.exponent * (power - self.width**self.exponent)
+
+
+class ActivatedFriction(NamedPotential):
+    """``rate scale^2 (cosh(f / scale) - 1)``: what it drives is ``rate scale sinh(f / scale)``, as over a barrier.
+
+    That is the law of mass action, and Eyring's of creep. Smooth; linear with the coefficient ``rate`` for forces far
+    below the scale.
+
+    Parameters
+    ----------
+    rate : float, >= 0
+    scale : float, > 0
+    each : bool
+        Of every force by itself, or of their length (by default).
+    """
+
+    rate: jax.Array
+    scale: jax.Array
+
+    def __init__(self, rate=1.0, scale=1.0, *, each: bool = False):
+        self.rate, self.scale = _number(rate, "the rate", True), _number(scale, "the scale", False)
+        self.each = bool(each)
+
+    def of_square(self, q):
+        return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
+
+
+def _number(value, what: str, zero: bool) -> jax.Array:
+    number = real_array(value)
+    if number.shape != ():
+        raise InputError(f"{what} is one number, not an array of shape {number.shape}")
+    if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if zero else float(number) > 0.0):
+        raise InputError(f"{what} must be {'>=' if zero else '>'} 0, not {float(number):g}")
+    return number

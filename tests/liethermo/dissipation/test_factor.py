@@ -1,0 +1,109 @@
+"""Factors of friction matrices: what they multiply to, whom they leave alone, and the divergence of their columns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.dissipation.noise import divergence, factors
+from liethermo.models.gas_piston import gas_piston_state
+from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
+from tests.cases import DISSIPATIONS, build, state_of
+
+WITHOUT = {"force", "potential_coulomb", "potential_power_law", "potential_activated"}
+WITH = [
+    pytest.param(g, case, id=f"{g.name}-{case.name}")
+    for g in (mf.so(3), mf.se(3))
+    for case in DISSIPATIONS
+    if case.name not in WITHOUT and case.exempt(g) is None
+]
+
+
+@jax.jit
+def measured(system, x, dH, dS, dL):
+    """``B B^T a - K a`` relative to it, ``B^T dH``, and the divergences as stated and by differentiation."""
+    parts, away = factors(system.dissipation, system, x, dH, dL), system.dissipation.energy_law == "conserved"
+    along = dS if away else -dH
+    product = sum(B.times(B.transposed(along)) for _, B in parts)
+    force = system.dissipation.force(system, x, dH, dS, dL)
+    kernel = jnp.concatenate([B.transposed(v) for _, B in parts for v in ((dH, *dL) if away else dL)] or [jnp.zeros(1)])
+
+    def matrix(y):
+        at = factors(
+            system.dissipation, system, y, system.energy.gradient(y), [L.gradient(y) for L in system.preserved]
+        )
+        return jnp.concatenate([jax.vmap(B.times)(jnp.eye(B.size)) for _, B in at])
+
+    traces = jnp.einsum("aii->a", jax.jacfwd(matrix)(x))
+    size = jnp.linalg.norm(force)
+    return (
+        jnp.linalg.norm(product - force) / size,
+        jnp.max(jnp.abs(kernel)),
+        divergence(system.dissipation, system, x) - traces,
+    )
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("g", "case"), WITH)
+def test_factors(g, case):
+    """For gradients of functions and for any others, as discrete gradients are."""
+    system, rng = build(g, case), np.random.default_rng(1)
+    for seed in range(3):
+        x = jnp.asarray(state_of(g, seed))
+        dH = system.energy.gradient(x) + 0.1 * rng.standard_normal(g.dim)
+        dL = tuple(L.gradient(x) + 0.1 * rng.standard_normal(g.dim) for L in system.preserved)
+        product, kernel, missed = measured(system, x, dH, rng.standard_normal(g.dim), dL)
+        assert product < 1e-13
+        assert kernel < 1e-13 * float(jnp.linalg.norm(dH))
+        assert np.abs(missed).max() < 1e-12
+
+
+def test_factors_between_bodies():
+    """Heat that flows and friction that heats: each flow by itself, at any gradient with positive temperatures."""
+    system = lt.models.gas_piston()
+    x = jnp.asarray(gas_piston_state(0.4, (310.0, 290.0, 300.0), p=0.3))
+    rng = np.random.default_rng(0)
+    dH = system.energy.gradient(x) * (1.0 + 0.01 * rng.standard_normal(5))
+    parts = factors(system.dissipation, system, x, dH, ())
+    assert sum(B.size for _, B in parts) == 3
+    dS = rng.standard_normal(5)
+    product = sum(B.times(B.transposed(dS)) for _, B in parts)
+    assert np.allclose(product, system.dissipation.force(system, x, dH, dS, ()), rtol=1e-13)
+    assert max(float(jnp.abs(B.transposed(dH)).max()) for _, B in parts) < 1e-12 * float(jnp.abs(dH).max())
+
+
+def test_a_dissipation_without_a_factor():
+    system = build(mf.so(3), next(case for case in DISSIPATIONS if case.name == "force"))
+    x = jnp.ones(3)
+    with pytest.raises(lt.InputError, match=r"EulerPoincareForce gives no factor"):
+        factors(system.dissipation, system, x, x, ())
+    pairs = np.zeros((3, 3, 3, 3))
+    for i, j, sign in ((0, 1, 1.0), (0, 2, -0.5)):
+        for a, b in ((i, j), (j, i)):
+            for c, d in ((i, j), (j, i)):
+                pairs[a, b, c, d] = sign * (1 if (a, b) == (c, d) else -1)
+    bracket = lt.FourBracket(pairs)
+    with pytest.raises(lt.IndefiniteError, match="pairs of covectors"):
+        bracket.factor(system, x, x, ())
+
+
+@pytest.mark.slow
+def test_roots_of_singular_matrices():
+    """Rank two of four, and its derivative against differences; eigenvalues that meet do no harm."""
+    rng = np.random.default_rng(2)
+    A, direction = rng.standard_normal((4, 2)), rng.standard_normal((4, 2))
+
+    @jax.jit
+    def K(t):
+        return (A + t * direction) @ (A + t * direction).T
+
+    root, h = jax.jit(lambda t: semidefinite_root(K(t))), 1e-5
+    for found in (semidefinite_factor(K(0.0)), root(0.0)):
+        assert np.allclose(found @ found.T, K(0.0), atol=1e-14)
+    assert np.abs(jax.jit(jax.jacfwd(root))(0.0) - (root(h) - root(-h)) / (2 * h)).max() < 1e-8
+    same = jax.jacfwd(lambda t: semidefinite_root(jnp.eye(3) + t * jnp.diag(jnp.array([1.0, 2.0, 3.0]))))(0.0)
+    assert np.allclose(same, np.diag([0.5, 1.0, 1.5]), atol=1e-14)
+    assert np.isfinite(semidefinite_root(jnp.zeros((2, 2)))).all()
+    assert np.isfinite(semidefinite_factor(jnp.zeros((2, 2)))).all()
