@@ -53,10 +53,12 @@ from .integrators import (
     registered_methods,
 )
 from .results.audit import Audit
-from .results.solution import Solution, load
+from .results.ensemble import Ensemble
+from .results.load import load
+from .results.solution import Solution
 from .results.status import Stats, Status
 from .runs.adaptive import Adaptive
-from .runs.ensemble import Ensemble, ensemble
+from .runs.ensemble import ensemble
 from .runs.events import Relaxed
 from .runs.flow import flow
 from .runs.integrate import integrate

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from .results.ensemble import Ensemble
     from .results.solution import Solution
     from .spec import Spec
     from .systems import System
@@ -120,7 +121,7 @@ def models() -> None:
 @_told()
 def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
     """Audit the laws of a saved run."""
-    from .results.solution import load
+    from .results.load import load
 
     solution = load(file)
     typer.echo(
@@ -164,10 +165,15 @@ def _draw(plan: Spec, system: System, solution: Solution, folder: Path) -> list[
     return files
 
 
-def _print_audit(solution: Solution) -> bool:
-    """Print how a run ended and whether its laws held; returns whether they did."""
-    audit = solution.audit()
-    typer.echo(f"{solution.status} ({solution.stats.wall_time:.1f} s)")
+def _print_audit(result: Solution | Ensemble) -> bool:
+    """Print how a run, or each of many, ended and whether the laws held; returns whether they did."""
+    from .results.solution import Solution
+
+    audit = result.audit()
+    if isinstance(result, Solution):
+        typer.echo(f"{result.status} ({result.stats.wall_time:.1f} s)")
+    else:
+        typer.echo(f"{result} ({result.wall_time:.1f} s)")
     rows = [(row.law, row.value, row.tolerance, row.passed, row.note) for row in audit.rows]
     _print_verdicts(("law", "measured", "allowed"), rows)
     typer.echo(audit.verdict)

@@ -16,6 +16,7 @@ class Code(enum.IntEnum):
     STEP_UNDERFLOW = 5
     STEP_LIMIT = 6
     REFERENCE_FAILED = 7
+    INADMISSIBLE = 8
 
     @property
     def text(self) -> str:

@@ -1,4 +1,4 @@
-"""Solutions in NetCDF files: written whole, sealed, and checked before they are read."""
+"""Solutions and ensembles in NetCDF files: written whole, sealed, and checked before they are read."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     import xarray
 
 FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
+ENSEMBLE_FORMAT = "liethermo-ensemble-1"
 
-VARIABLES = ("time", "x", "energy", "entropy", "attitude", "invariant_name", "invariant")
-ATTRIBUTES = ("format", "times", "status", "stats", "laws", "evidence", "provenance", "event_time", "sha256")
-"""What a file has."""
+ATTRIBUTES = tuple(
+    "format times status stats laws evidence provenance event_time engine wall_time reasons sha256".split()
+)
+"""What a file may have."""
 
 SEAL = b"\nliethermo sha256 "
 """What comes after the end of the NetCDF file, with the digest of all before it."""
@@ -69,7 +71,7 @@ def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]
         raise FileError(
             f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
         ) from error
-    if attributes.get("format") not in (FORMAT, *WITHOUT_CHECKSUM):
+    if attributes.get("format") not in (FORMAT, ENSEMBLE_FORMAT, *WITHOUT_CHECKSUM):
         raise FileError(
             f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
         )
@@ -121,12 +123,27 @@ def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
 
     with h5py.File(path) as file:
-        found = {name: file[name] for name in VARIABLES if name in file}
+        found = {name: v for name, v in file.items() if not _is_scale(v)}
         series = {
             name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
         }
         said = {name: np.asarray(file.attrs[name]).item() for name in ATTRIBUTES if name in file.attrs}
         return series, said
+
+
+def _is_scale(variable) -> bool:
+    """Whether a variable is but the length of a dimension."""
+    return bytes(variable.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF variable")
+
+
+def as_parts(values: np.ndarray) -> np.ndarray:
+    """Matrices with real and imaginary parts along a last axis: NetCDF has no complex numbers."""
+    return np.stack([values.real, values.imag][: 1 + np.iscomplexobj(values)], axis=-1)
+
+
+def from_parts(parts: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`as_parts`."""
+    return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]
 
 
 def checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:

@@ -85,7 +85,7 @@ def laws_of_many(
     found, moved, name = [], many.steps > 0, " minus ".join(["energy", *laws.balance])
 
     def judge(law: str, values, allowed) -> LawOfMany:
-        return LawOfMany(law, np.where(moved, values, 0.0), np.broadcast_to(allowed, moved.shape))
+        return LawOfMany(law, np.where(moved, values, 0.0), np.where(moved, allowed, 0.0))
 
     rounding = Rounding(many.first_energy, many.energy_sensitivity, energy_terms)
     if laws.energy == "conserved":

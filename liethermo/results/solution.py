@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import FileError, InputError
+from ..errors import InputError
 from .audit import Audit, Tolerances, audit
 from .evidence import Evidence
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, checksum, read, write
+from .files import FORMAT, as_parts, checksum, from_parts, write
 from .status import Laws, Stats, Status
 
 
@@ -118,9 +118,8 @@ class Solution:
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
         variables: dict[str, Any] = {"x": (("time", "component"), self.x), **series}
-        if self.attitude is not None:  # NetCDF has no complex numbers
-            parts = np.stack([self.attitude.real, self.attitude.imag][: 1 + np.iscomplexobj(self.attitude)], axis=-1)
-            variables["attitude"] = (("time", "row", "column", "part"), parts)
+        if self.attitude is not None:
+            variables["attitude"] = (("time", "row", "column", "part"), as_parts(self.attitude))
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
@@ -147,26 +146,9 @@ class Solution:
     def __repr__(self) -> str:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
 
-
-_LISTS = ("conserved", "ledger", "inexact", "balance", "unpromised")
-"""The fields of :class:`Laws` that are tuples of names."""
-
-
-def load(path: str | os.PathLike) -> Solution:
-    """Read a file written by :meth:`Solution.save`.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, cut short, damaged, or not a result of this library.
-
-    Warns
-    -----
-    UserWarning
-        If an earlier version wrote the file, without a checksum: damage may show in nothing.
-    """
-    series, attributes = read(path)
-    try:
+    @classmethod
+    def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
+        """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
         stored = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
         t, x = series["time"], series["x"]
         if len(t) != int(attributes["times"]):
@@ -174,9 +156,8 @@ def load(path: str | os.PathLike) -> Solution:
         names = [str(name) for name in series["invariant_name"]]
         if stored["stats"]["energy_range"] is not None:
             stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        stored["laws"] |= {name: tuple(stored["laws"].get(name, ())) for name in _LISTS}
         evidence = Evidence(**json.loads(attributes.get("evidence", "{}")))
-        return Solution(
+        return cls(
             t=t,
             x=x,
             energy=series["energy"],
@@ -184,15 +165,9 @@ def load(path: str | os.PathLike) -> Solution:
             casimirs=dict(zip(names, series["invariant"], strict=True)),
             status=Status(**stored["status"]),
             stats=Stats(**stored["stats"]),
-            laws=Laws(**stored["laws"]),
+            laws=Laws.of(stored["laws"]),
             provenance=stored["provenance"],
             event_time=json.loads(attributes.get("event_time", "null")),
-            attitude=_attitude(series["attitude"]) if "attitude" in series else None,
+            attitude=from_parts(series["attitude"]) if "attitude" in series else None,
             witness=lambda: evidence,
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
-
-
-def _attitude(parts: np.ndarray) -> np.ndarray:
-    return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
@@ -15,7 +17,7 @@ class Status:
     Attributes
     ----------
     code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
-"reference_failed"}
+"reference_failed", "inadmissible"}
         Or its :class:`liethermo.engines.codes.Code`.
     message : str
         A full sentence: what happened, where, and what to try.
@@ -103,3 +105,9 @@ class Laws:
     inexact: tuple[str, ...] = ()
     balance: tuple[str, ...] = ()
     unpromised: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Laws:
+        """From what is stored in a file, where tuples are lists; what an earlier version did not know is empty."""
+        names = {f.name for f in fields(cls) if f.name not in ("energy", "entropy")}
+        return cls(**{**stored, **{name: tuple(stored.get(name, ())) for name in names}})

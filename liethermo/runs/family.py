@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -11,14 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds import ManifoldsError
+
 from ..engines.compiled.form import Form
-from ..errors import InputError
+from ..errors import InputError, LiethermoError
 from ..systems import System
 from ..tracing.remembered import fingerprint
 from ..tracing.traced import Traced, traced
 
 PROBES = 8
 """Members of a family that are built, and so checked, one by one."""
+
+HOPELESS = 32
+"""Members that are tried before it is said that none can be run."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class Family:
         method preserves, for one, is then the same for every part of a family.
     given : int
         How many of the values, the first ones, are what a function that builds systems is given.
+    refused : dict from int to str
+        Members that cannot be built, and why.
     """
 
     form: Form
@@ -45,6 +52,7 @@ class Family:
     alike: System | None = None
     example: System | None = None
     given: int = 0
+    refused: Mapping[int, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, system, parameters) -> Family:
@@ -58,9 +66,9 @@ class Family:
         if parameters is None:
             raise InputError("a function that builds systems needs parameters=..., one set for each trajectory")
         family = cls.of_function(system, parameters)
-        for i in family.extremes():  # the constructors of systems check what they are given
-            family.member(i)
-        return family.traced()
+        # the constructors of systems check what they are given; a program that is traced does not
+        refused = family.found_wanting(lambda i: why_not(lambda: family.member(i)))
+        return replace(family.traced(), refused=refused)
 
     @classmethod
     def _of_named(cls, system: System, parameters) -> Family:
@@ -166,18 +174,56 @@ class Family:
             found |= dict.fromkeys(int(i) for i in (*rows.argmin(axis=0), *rows.argmax(axis=0)))
         return list(found)[:PROBES]
 
-    def check(self, states: np.ndarray) -> None:
-        """Test the axioms for members with extreme parameters, each at its initial state, unless that has been done.
+    def found_wanting(self, reason: Callable[[int], str], known: Mapping[int, str] | None = None) -> dict[int, str]:
+        """Members that cannot be run, and why: those with extreme parameters are tried, and the next where one cannot.
+
+        Parameters
+        ----------
+        reason : function from the number of a member to why it cannot be run, or an empty text
+        known : dict, optional
+            Members that are known to be such.
 
         Raises
         ------
         InputError
-            If one fails there.
+            If none can, or none of the first :data:`HOPELESS` that are tried.
         """
-        for i in self.extremes() if self.size > 1 and self.example is None else ():
-            report = self.member(i).check(points=states[i])
-            if not report.passed:
-                raise InputError(f"with the parameters of trajectory {i}:\n{report}")
+        found = dict(known or {}) | self._not_numbers()
+        left, tried = np.setdiff1d(np.arange(self.size), list(found)), dict[int, str]()
+        while left.size:
+            new = [i for i in map(int, left[self.select(left).extremes()]) if i not in tried]
+            tried |= {i: reason(i) for i in new}
+            wanting = {i: tried[i] for i in new if tried[i]}
+            found |= wanting
+            left = np.setdiff1d(left, list(wanting))
+            if not wanting or (len(tried) >= HOPELESS and all(tried.values())):
+                break
+        if not left.size or (tried and all(tried.values())):
+            first = min(found)
+            raise InputError(f"no trajectory can be started; trajectory {first}: {found[first]}")
+        return found
+
+    def complaint(self, i: int, x: np.ndarray) -> str:
+        """What the axioms say of a member at a state; an empty text where they hold."""
+        report = None
+
+        def check():
+            nonlocal report
+            report = self.member(i).check(points=x)
+
+        return why_not(check) or ("" if report is None or report.passed else str(report))
+
+    def _not_numbers(self) -> dict[int, str]:
+        """Members that have parameters that are NaN."""
+        bad = np.zeros(self.size, dtype=bool)
+        for value in self.values:
+            bad |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
+        return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(bad)}
+
+    def select(self, chosen: np.ndarray) -> Family:
+        """The family of some members."""
+        values = [value[chosen] if len(value) > 1 else value for value in self.values]
+        return replace(self, values=values, refused={})
 
     # -- as the engines take them -----------------------------------------------------------------------------------
 
@@ -207,3 +253,12 @@ def common_size(*sizes: int) -> int:
     if 0 in several:
         raise InputError("an ensemble has at least one trajectory")
     return several.pop() if several else 1
+
+
+def why_not(call: Callable[[], Any]) -> str:
+    """What a call complains of; an empty text where it does not."""
+    try:
+        call()
+    except (LiethermoError, ManifoldsError, ValueError, ArithmeticError) as error:
+        return str(error) or type(error).__name__
+    return ""

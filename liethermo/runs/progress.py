@@ -10,10 +10,20 @@ if TYPE_CHECKING:
 
 
 class Progress:
-    """A progress bar on the standard error, shown only where someone is there to see it."""
+    """A progress bar on the standard error, shown only where someone is there to see it.
 
-    def __init__(self, span: tuple[float, float], wanted: bool | None):
-        self.span = span
+    Parameters
+    ----------
+    span : (float, float)
+        What is shown at the start and at the end: a time, or how much is done.
+    wanted : bool or None
+        None where the standard error tells.
+    text : str
+        Of the place between these.
+    """
+
+    def __init__(self, span: tuple[float, float], wanted: bool | None, text: str = "t = {:.4g}"):
+        self.span, self.text = span, text
         self.bar: Bar | None = None
         self.wanted = sys.stderr.isatty() if wanted is None else wanted
 
@@ -23,15 +33,15 @@ class Progress:
             from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
 
-            columns = (TextColumn("t = {task.fields[t]:.4g}"), BarColumn(), TimeRemainingColumn())
+            columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
             self.bar = bar = Bar(*columns, console=Console(stderr=True, force_terminal=True), transient=True)
             bar.start()
-            self.task = bar.add_task("", total=self.span[1] - self.span[0], t=self.span[0])
+            self.task = bar.add_task(self.text.format(self.span[0]), total=self.span[1] - self.span[0])
         return self
 
     def update(self, t: float) -> None:
         if self.bar is not None:
-            self.bar.update(self.task, completed=t - self.span[0], t=t)
+            self.bar.update(self.task, completed=t - self.span[0], description=self.text.format(t))
 
     def __exit__(self, *_):
         if self.bar is not None:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
-import functools
 import time
-from importlib import metadata
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..engines import array
-from ..engines.choice import (
-    Chosen,
-)
+from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..integrators import OneStepMethod, Reference
 from ..results.dense import Dense
-from ..results.evidence import MEASURED, Witness, spread
 from ..results.solution import Solution
 from ..results.status import Stats, Status
 from ..systems import System
@@ -29,7 +22,7 @@ from ..tracing.programs import program
 from .adaptive import Adaptive
 from .ending import given_up, stats_of, status_of
 from .events import Event
-from .preparation import prepared
+from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, stops_of
 from .stepwise import run as run_stepwise
 from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
@@ -206,37 +199,24 @@ class Run:
 
     def solution(self) -> Solution:
         """What there is so far."""
-        system = self.system
         x = np.concatenate(self.states)
-        invariants, laws = prepared(system, self.method)
         energy, entropy = np.concatenate(self.values).T
-        wall = time.perf_counter() - self.started
-        found = Solution(
+        same = [self.table.h if self.table.full else self.table.last] * (len(x) - 1)
+        return presented(
+            self.system,
+            self.method,
+            x,
             t=np.array(self.times),
-            x=x,
             energy=energy,
-            entropy=None if system.entropy is None else entropy,
-            casimirs={
-                name: at_points(_value, function, x)
-                for name, function in {**{name: f for name, (f, _) in invariants.items()}, **system.ledger}.items()
-            },
+            entropy=entropy,
+            steps=np.array((self.longest or same)[: len(x) - 1]),
+            again=Again(self.engine, self.capacity),
             status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.times[-1]),
-            stats=dataclasses.replace(self.stats, wall_time=wall),
-            laws=laws,
+            stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
-            witness=self._witness(x, {name: f for name, (f, _) in invariants.items()}),
         )
-        return system.presented(found)
-
-    def _witness(self, x: np.ndarray, functions: dict) -> Witness:
-        """What finds the evidence for an audit."""
-        some = spread(len(x), MEASURED)
-        same = [self.table.h if self.table.full else self.table.last] * (len(x) - 1)
-        h = np.array((self.longest or same)[: len(x) - 1])
-        again = _Again(self.engine, self.capacity)
-        return Witness(self.system, self.method, functions, x[some], np.array(self.times)[some], h[some[:-1]], again)
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:
@@ -245,35 +225,11 @@ class Run:
             self.written = time.perf_counter()
 
     def _provenance(self) -> dict[str, Any]:
-        algebra = getattr(self.system, "algebra", None)
         return {
-            "library": f"liethermo {_version()}",
-            "jax": jax.__version__,
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "method": str(self.method),
+            **provenance_of(self.system, self.method, self.step, (self.table.start, self.table.end), self.table.every),
             "engine": None if isinstance(self.method, Reference) else self.engine.name,
-            "step": self.step if isinstance(self.step, float) else dataclasses.asdict(self.step),
-            "t_span": [self.table.start, self.table.end],
-            "save_every": self.table.every,
             "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,
-            "system": type(self.system).__name__,
-            "algebra": None if algebra is None else algebra.name,
-            "dissipation": None if self.system.dissipation is None else type(self.system.dissipation).__name__,
         }
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Again:
-    """One step from any state, by the program that a run has compiled; ``capacity`` is None for single steps."""
-
-    engine: Chosen
-    capacity: int | None
-
-    def __call__(self, x: np.ndarray, h: float):
-        state = self.engine.begin(jnp.asarray(x))
-        if self.capacity is None:
-            return self.engine.step(state, h)
-        return self.engine.advance(state, h, 1, 1, self.capacity)[0]
 
 
 @program
@@ -281,18 +237,6 @@ def _along(system: System, method: OneStepMethod, x, v):
     return jax.vmap(lambda x, v: method.along(system, x, v))(x, v)
 
 
-def _value(function, x):
-    return function.value(x)
-
-
 def _power_of_two(n: int) -> int:
     """The next power of two: few distinct chunk sizes, so few compilations."""
     return 1 << max(0, n - 1).bit_length()
-
-
-@functools.cache
-def _version() -> str:
-    try:
-        return metadata.version("liethermo")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -82,6 +83,55 @@ class Timetable:
             done += kept * every
         if self.last:
             yield self.last, 1, 1
+
+
+class Course:
+    """Equal steps from stop to stop: a :class:`Timetable` for each part of a span, one after another.
+
+    Parameters
+    ----------
+    span, step, every
+        As for :class:`Timetable`.
+    stops : array, optional
+        Times at which steps end and states are kept, the end of the span the last; every so-manieth otherwise.
+
+    Attributes
+    ----------
+    start, end, h : float
+    parts : list of Timetable
+    """
+
+    def __init__(self, span, step, every: int | None, stops: np.ndarray | None = None):
+        whole = Timetable(span, step, every)
+        self.start, self.end, self.h = whole.start, whole.end, whole.h
+        self.every, self.parts = every, [whole]
+        if stops is not None:
+            ends = [float(t) for t in stops if t > self.start]
+            self.parts = [Timetable(part, step, None) for part in itertools.pairwise([self.start, *ends])]
+
+    @property
+    def steps(self) -> int:
+        """How many steps there are."""
+        return sum(part.steps for part in self.parts)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Steps after which states are kept, 0 (the start) and the last among them."""
+        before = np.cumsum([0, *(part.steps for part in self.parts)])
+        return np.unique(np.concatenate([n + part.counts for n, part in zip(before, self.parts, strict=False)]))
+
+    @property
+    def times(self) -> np.ndarray:
+        """The times at :attr:`counts`."""
+        return np.unique(np.concatenate([part.times for part in self.parts]))
+
+    def reached(self, steps: np.ndarray) -> np.ndarray:
+        """The times after so many steps."""
+        before = np.cumsum([0, *(part.steps for part in self.parts)])
+        place = np.clip(np.searchsorted(before, steps, side="right") - 1, 0, len(self.parts) - 1)
+        starts, ends = (np.array([getattr(part, name) for part in self.parts])[place] for name in ("start", "end"))
+        last = steps >= before[place + 1]
+        return np.where(last, ends, np.minimum(starts + (steps - before[place]) * self.h, ends))
 
 
 def _checked_span(span) -> tuple[float, float]:

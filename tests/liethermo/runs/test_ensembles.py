@@ -8,6 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.runs import batches
 from liethermo.runs import ensemble as ensembles
 
 BODY = lt.models.rigid_body()
@@ -127,7 +128,9 @@ def test_a_failure_stays_where_it_is(engine):
     assert np.isnan(many.x[7, kept:]).all()
     assert np.isfinite(np.delete(many.x, 7, axis=0)).all()
     assert not many.audit().passed
-    assert f"non_finite: trajectory 7, after step {one.status.step}" in str(many)
+    assert f"non_finite: trajectory 7: NaN or infinity in step {one.status.step + 1}" in str(many)
+    assert many[7].status.code == "non_finite"
+    assert many[7].t[-1] == many.t[kept - 1]
 
 
 @pytest.mark.sampled(1)
@@ -176,7 +179,7 @@ def test_interrupted(monkeypatch):
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ensembles, "_advance_all", interrupt)
+    monkeypatch.setattr(batches, "advance_all", interrupt)
     many = lt.ensemble(BODY, states(3), (0.0, 1.0), 0.1, engine="array")
     assert [ensembles.STATUSES[code] for code in many.status] == ["interrupted"] * 3
     assert not many.steps.any()
@@ -212,10 +215,16 @@ def test_what_cannot_be_compiled():
         ({"parameters": {"dissipation.rate": np.ones((2, 2))}}, r"have shape \(trajectories\), not \(2, 2\)"),
         ({"parameters": np.ones(2)}, "a dict from names to arrays"),
         ({"parameters": {"dissipation.rate": np.ones(2)}, "x0s": np.ones((3, 3))}, r"different numbers .*\[2, 3\]"),
-        ({"parameters": {"dissipation.rate": np.array([1.0, -1.0, 2.0])}}, "trajectory 1"),
+        ({"parameters": {"dissipation.rate": -np.ones(3)}}, "no trajectory can be started; trajectory 0"),
+        ({"save_at": [0.5], "outputs": "final"}, 'save_at is for outputs="trajectory"'),
+        ({"save_at": [0.5, 1.5]}, "outside"),
+        ({"x0s": np.full((3, 3), np.nan)}, "no trajectory can be started; trajectory 0: the state is not finite"),
         ({"system": lambda p: 3.0, "parameters": np.ones(2)}, "must return a system"),
         ({"system": lambda p: lt.models.rigid_body(rate=float(p)), "parameters": np.ones(2)}, "traced JAX arrays"),
-        ({"system": lambda p: lt.models.rigid_body(rate=p), "parameters": np.array([1.0, -1.0])}, "rate must be >= 0"),
+        (
+            {"system": lambda p: lt.models.rigid_body(rate=p), "parameters": -np.ones(500)},
+            "trajectory 0: .*must be >= 0",
+        ),
     ],
 )
 def test_bad_input(arguments, message):

@@ -1,0 +1,365 @@
+"""What an ensemble of runs returns: all trajectories with their laws, and how each of them ended."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..engines.codes import TEXTS, Code
+from ..errors import InputError
+from .audit import Audit, AuditRow, Tolerances, accuracy_row
+from .evidence import Evidence
+from .files import ENSEMBLE_FORMAT, as_parts, checksum, from_parts, write
+from .many import laws_of_many
+from .solution import Solution
+from .status import Laws, Stats, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+STATUSES = TEXTS
+
+SENTENCES = {
+    Code.COMPLETED: "reached t = {t:.15g} in {n} steps",
+    Code.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration stopped at "
+    "a residual of {r:.2g} relative to the state; try a smaller step",
+    Code.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy or the vector field "
+    "is not finite there; check the domain of the functions, or try a smaller step",
+    Code.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
+    Code.EVENT: "the event happened at t = {t:.15g} in {n} steps",
+    Code.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
+    "below what rounding allows, or the functions not smooth there",
+    Code.STEP_LIMIT: "as many steps were tried as are allowed, and t = {t:.15g} is reached: Adaptive(most_steps=...) "
+    "allows more, and a larger tolerance takes fewer",
+    Code.INADMISSIBLE: "{reason}",
+}
+"""How a trajectory ended, by its time t, its steps n, its residual r."""
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """What :func:`ensemble` returns; trajectories come first in every array, and B is their number.
+
+    ``e[i]`` is one trajectory as a :class:`Solution`, and a loop over an ensemble is one over these.
+
+    Attributes
+    ----------
+    t : ndarray, shape (times,)
+        Start, saves and end for ``outputs="trajectory"``; otherwise the end alone, shape (1,).
+    x : ndarray or None
+        Final states, shape (B, n), or trajectories, shape (B, times, n), with NaN from where one failed; None for
+        ``outputs="summary"``.
+    energy, entropy : ndarray, shape (B,) or (B, times), as x has
+        Final ones for ``"summary"``. ``entropy`` is None for a system without one.
+    status : ndarray of int8, shape (B,)
+        Places in ``STATUSES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 8 inadmissible: a trajectory
+        that could not be started, with its parameters or from its state.
+    steps : ndarray of int64, shape (B,)
+        Steps taken; where the status is not 0 the one after is the one that failed.
+    residual : ndarray, shape (B,)
+        ``h |k - slopes(k)| / |x|`` of the last step tried.
+    energy_drift : ndarray, shape (B,)
+        ``max |H - H0|`` over every step, relative to the size at which H is rounded: as for :class:`Audit`.
+    largest_energy_increment, least_entropy_increment : ndarray, shape (B,)
+        Of one step, over every step.
+    entropy_scale : ndarray, shape (B,)
+        ``max(|S(0)|, |S(T)|)``.
+    energy_sensitivity, entropy_sensitivity : ndarray, shape (B,)
+        Largest :meth:`liethermo.Energy.sensitivity` over every step: what rounding is measured against.
+    first_energy : ndarray, shape (B,)
+    entropy_change : ndarray, shape (B,)
+        ``S(T) - S(0)``.
+    relaxation_time : ndarray, shape (B,)
+        ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
+        relaxation that is over by T. The energy takes the place of S under a double bracket. NaN where nothing relaxes.
+    iterations : ndarray, shape (B,)
+        Of the solver, in all.
+    smallest_energy, largest_energy : ndarray, shape (B,)
+        Over every step, less the work done from outside.
+    end_time : ndarray, shape (B,)
+        Time reached.
+    x0 : ndarray, shape (B, n)
+        Initial states.
+    laws : Laws
+    engine : str
+    wall_time : float
+        Seconds, compilation included.
+    attitude : ndarray, shape (B, m, m) or (B, times, m, m), or None
+        Elements of the group, where the system has one and states are kept.
+    attitude0 : ndarray, shape (B, m, m), or None
+        Those at the start.
+    work : ndarray, shape (B,) or (B, times), or None
+        Done on the system from outside, where its energy depends on time; the drift and the increments of the energy
+        are then those of the energy less the work.
+    reasons : mapping from int to str
+        Why trajectories are inadmissible.
+    provenance : dict
+        Library version, method, step, system, date: JSON data.
+    """
+
+    t: np.ndarray
+    x: np.ndarray | None
+    energy: np.ndarray
+    entropy: np.ndarray | None
+    status: np.ndarray
+    steps: np.ndarray
+    residual: np.ndarray
+    energy_drift: np.ndarray
+    largest_energy_increment: np.ndarray
+    least_entropy_increment: np.ndarray
+    entropy_scale: np.ndarray
+    energy_sensitivity: np.ndarray
+    entropy_sensitivity: np.ndarray
+    first_energy: np.ndarray
+    entropy_change: np.ndarray
+    relaxation_time: np.ndarray
+    iterations: np.ndarray
+    smallest_energy: np.ndarray
+    largest_energy: np.ndarray
+    end_time: np.ndarray
+    x0: np.ndarray
+    laws: Laws
+    engine: str
+    wall_time: float
+    attitude: np.ndarray | None = None
+    attitude0: np.ndarray | None = None
+    work: np.ndarray | None = None
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+    alone: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        """What an audit needs besides the series: found when first asked for."""
+        return Evidence() if self.witness is None else self.witness()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
+        return {**vars(self), "evidence": self.evidence, "witness": None, "alone": None}
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Which trajectories came to their end, shape (B,)."""
+        return np.isin(self.status, (Code.COMPLETED, Code.EVENT))
+
+    # -- one trajectory -------------------------------------------------------------------------------------------
+
+    def __getitem__(self, i: int) -> Solution:
+        """One trajectory, with what is recorded along a run: at the times kept, or at its start and its end.
+
+        Its Casimirs, and the evidence for its audit, are found now; an ensemble from a file has none.
+
+        Raises
+        ------
+        IndexError
+            If there is no such trajectory.
+        InputError
+            If no states were kept, or the trajectory is inadmissible.
+        """
+        i = self._place(i)
+        if self.x is None:
+            raise InputError('no states were kept: outputs="final" or "trajectory" keeps some')
+        if self.status[i] == Code.INADMISSIBLE:
+            raise InputError(self.message(i))
+        return self.member(i) if self.alone is None else self.alone(self, i)
+
+    def __iter__(self) -> Iterator[Solution]:
+        return (self[i] for i in range(len(self)))
+
+    def _place(self, i) -> int:
+        if isinstance(i, bool) or not isinstance(i, int | np.integer):
+            raise InputError(f"a trajectory is chosen by a number, not by {i!r}")
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"there is no trajectory {i} among {len(self)}")
+        return int(i) % len(self)
+
+    def message(self, i: int) -> str:
+        """How a trajectory ended, in words, its index first."""
+        i = self._place(i)
+        facts = {"t": self.end_time[i], "n": self.steps[i], "next": self.steps[i] + 1, "r": self.residual[i]}
+        text = SENTENCES[Code(self.status[i])].format(reason=self.reasons.get(i, ""), **facts)
+        return f"trajectory {i}: {text}"
+
+    def status_of(self, i: int) -> Status:
+        """How a trajectory ended."""
+        i = self._place(i)
+        residual = float(np.nan_to_num(self.residual[i]))
+        return Status(Code(self.status[i]), self.message(i), int(self.steps[i]), float(self.end_time[i]), residual)
+
+    def stats_of(self, i: int) -> Stats:
+        """What was counted of a trajectory, and its extremes; the iterations of both kinds together."""
+        moved = self.steps[i] > 0
+        entropy = float(self.least_entropy_increment[i]) if moved else None
+        return Stats(
+            steps=int(self.steps[i]),
+            fixed_point_iterations=int(self.iterations[i]),
+            worst_residual=float(self.residual[i]) if self.ok[i] else 0.0,
+            energy_range=(float(self.smallest_energy[i]), float(self.largest_energy[i])) if moved else None,
+            least_entropy_increment=entropy,
+            largest_energy_increment=float(self.largest_energy_increment[i]) if moved else None,
+            wall_time=self.wall_time,
+        )
+
+    def member(self, i: int) -> Solution:
+        """One trajectory as it is kept here, without Casimirs."""
+        path = self.energy.ndim == 2
+        reached = np.isfinite(self.energy[i]) if path else np.array([True])
+        work = None if self.work is None else self.work[i]
+
+        def series(values, first):
+            """Of the times kept; or of both ends."""
+            return values[i][reached] if path else np.stack([first, values[i]])
+
+        assert self.x is not None
+        first = self.first_energy[i]
+        entropy = None if self.entropy is None else float(self.entropy_sensitivity[i])
+        attitude = None
+        if self.attitude is not None and self.attitude0 is not None:
+            attitude = series(self.attitude, self.attitude0[i])
+        evidence = Evidence(energy=float(self.energy_sensitivity[i]), entropy=entropy)
+        return Solution(
+            t=self.t[reached] if path else np.array([self.provenance["t_span"][0], self.end_time[i]]),
+            x=series(self.x, self.x0[i]),
+            energy=series(self.energy, first),
+            entropy=None if self.entropy is None else series(self.entropy, self._first_entropy(i)),
+            casimirs={} if work is None else {"work": work[reached] if path else np.stack([0.0 * work, work])},
+            status=self.status_of(i),
+            stats=self.stats_of(i),
+            laws=self.laws,
+            provenance={**self.provenance, "trajectory": i, "x0": self.x0[i].tolist()},
+            attitude=attitude,
+            witness=lambda: evidence,
+        )
+
+    def _first_entropy(self, i: int) -> float:
+        assert self.entropy is not None
+        return self.entropy[i, 0] if self.entropy.ndim == 2 else self.entropy[i] - self.entropy_change[i]
+
+    # -- all of them ----------------------------------------------------------------------------------------------
+
+    def __str__(self) -> str:
+        counts = [f"{(self.status == code).sum()} {name}" for code, name in enumerate(STATUSES) if code in self.status]
+        lines = [f"{len(self)} trajectories to t = {self.t[-1]:g}: {', '.join(counts)}"]
+        failed = np.flatnonzero(~self.ok)
+        lines += [f"  {STATUSES[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
+        lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
+        return "\n".join(lines)
+
+    def audit(
+        self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
+    ) -> Audit:
+        """The laws at every step of every trajectory, each by the one that kept it worst; printing it gives a table.
+
+        The local error is estimated in the first step of at most 32 trajectories.
+
+        Parameters
+        ----------
+        energy, entropy, casimirs, residual, accuracy : float
+            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
+
+        Raises
+        ------
+        InputError
+            If there is no tolerance of a name, or it is negative.
+        """
+        accepted = Tolerances.of(energy=energy, entropy=entropy, **tolerances)
+        moved, terms = self.steps > 0, self.evidence.terms
+        rows = []
+        for law in laws_of_many(self, self.laws, accepted, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
+            i = law.worst
+            rows.append(law.as_row(i, f"worst is trajectory {i}"))
+        if self.witness is not None or self.evidence.local_error is not None:
+            rows.append(accuracy_row(self.evidence, accepted))
+        failed = int((~self.ok & (self.status != Code.INTERRUPTED)).sum())
+        rows.append(AuditRow("trajectories that failed", float(failed), 0.0, failed == 0))
+        least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
+        drift, residual = (float(a.max(initial=0.0, where=moved)) for a in (self.energy_drift, self.residual))
+        return Audit(drift, least, np.nan, residual, tuple(rows))
+
+    # -- files --------------------------------------------------------------------------------------------------------
+
+    def to_xarray(self) -> xarray.Dataset:
+        """An ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; what is no array as attributes (JSON).
+
+        ``status_text`` and ``message`` say of every trajectory how it ended.
+        """
+        import xarray
+
+        path = self.energy.ndim == 2
+        each = ("trajectory", "time") if path else ("trajectory",)
+        variables: dict[str, Any] = {
+            name: (each if name in SERIES else ("trajectory",), value)
+            for name in (*SERIES, *NUMBERS)
+            if (value := getattr(self, name)) is not None
+        }
+        for name, dims in (("x", each), ("x0", ("trajectory",))):
+            if (value := getattr(self, name)) is not None:
+                variables[name] = ((*dims, "component"), value)
+        for name, dims in (("attitude", each), ("attitude0", ("trajectory",))):
+            if (value := getattr(self, name)) is not None:
+                variables[name] = ((*dims, "row", "column", "part"), as_parts(value))
+        variables["status_text"] = ("trajectory", np.array([STATUSES[code] for code in self.status], dtype=object))
+        failed = ~self.ok
+        messages = [self.message(i) if failed[i] else "" for i in range(len(self))]
+        variables["message"] = ("trajectory", np.array(messages, dtype=object))
+        attributes = {
+            "format": ENSEMBLE_FORMAT,
+            "times": len(self.t),
+            "laws": json.dumps(asdict(self.laws)),
+            "evidence": json.dumps(asdict(self.evidence)),
+            "provenance": json.dumps(self.provenance),
+            "engine": self.engine,
+            "wall_time": self.wall_time,
+            "reasons": json.dumps({str(i): text for i, text in self.reasons.items()}),
+        }
+        dataset = xarray.Dataset(variables, {"time": self.t, "trajectory": np.arange(len(self))}, attributes)
+        content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
+        return dataset.assign_attrs(sha256=checksum(content, attributes))
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all."""
+        return write(self.to_xarray(), path)
+
+    @classmethod
+    def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
+        """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
+        if len(series["time"]) != int(attributes["times"]):
+            raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
+        evidence = Evidence(**json.loads(attributes["evidence"]))
+        arrays: dict[str, Any] = {name: series[name] for name in NEEDED}
+        arrays |= {name: series.get(name) for name in ("x", "entropy", "work")}
+        arrays |= {name: from_parts(series[name]) for name in ("attitude", "attitude0") if name in series}
+        return cls(
+            t=series["time"],
+            **arrays,
+            laws=Laws.of(json.loads(attributes["laws"])),
+            engine=str(attributes["engine"]),
+            wall_time=float(attributes["wall_time"]),
+            reasons={int(i): text for i, text in json.loads(attributes["reasons"]).items()},
+            provenance=json.loads(attributes["provenance"]),
+            witness=lambda: evidence,
+        )
+
+
+SERIES = ("energy", "entropy", "work")
+"""Of the times kept."""
+
+NUMBERS = tuple(
+    "status steps residual energy_drift largest_energy_increment least_entropy_increment entropy_scale "
+    "energy_sensitivity entropy_sensitivity first_energy entropy_change relaxation_time iterations smallest_energy "
+    "largest_energy end_time".split()
+)
+"""One of each trajectory."""
+
+NEEDED = ("energy", "x0", *NUMBERS)
+"""What every ensemble has."""

@@ -1,0 +1,187 @@
+"""Equal steps of many trajectories: in lanes over threads, or all of a batch in one program."""
+
+from __future__ import annotations
+
+import contextvars
+import math
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..engines import array
+from ..engines.compiled import stepper as compiled
+from ..engines.compiled.form import numbers_of
+from ..integrators import OneStepMethod
+from ..tracing.programs import program
+from .family import Family
+from .record import Record
+from .timetable import CHUNK_STEPS, Course
+
+LANES = 8
+"""Trajectories in a block of the compiled engine: one AVX-512 vector or two of AVX2."""
+
+BATCH = 4096
+"""Trajectories that a thread of the compiled engine takes at once: enough to hide the cost of Python."""
+
+ARRAY_BATCH = 65_536
+"""Trajectories that the array engine takes at once: bounded memory."""
+
+KEPT_BEFORE = ("x", "energy", "entropy")
+KEPT_AFTER = tuple(name for name in array.State._fields if name not in ("low", "k", "before"))
+"""Fields of the states of a batch that its record is made from."""
+
+
+class Tally:
+    """Counts how many trajectories are done, parts of them among them, from any thread."""
+
+    def __init__(self, tell: Callable[[float], None]):
+        self._tell, self._done, self._lock = tell, 0.0, threading.Lock()
+
+    def add(self, trajectories: float) -> None:
+        with self._lock:
+            self._done += trajectories
+            self._tell(self._done)
+
+
+# -- the compiled engine ----------------------------------------------------------------------------------------------
+
+
+def by_threads(work: Callable[[slice, threading.Event], None], size: int) -> None:
+    """Portions of trajectories, dealt out to a thread for each core; Ctrl-C sets the event."""
+    cores, stop = _cores(), threading.Event()
+    portion = min(BATCH, LANES * math.ceil(size / (LANES * 2 * cores)))
+    with ThreadPoolExecutor(cores) as pool:
+        starts = range(0, size, portion)
+        tasks = [pool.submit(work, slice(first, min(first + portion, size)), stop) for first in starts]
+        try:
+            for task in tasks:
+                task.result()
+        except KeyboardInterrupt:
+            stop.set()
+        except BaseException:
+            stop.set()
+            raise
+
+
+THREADS: contextvars.ContextVar[int | None] = contextvars.ContextVar("THREADS", default=None)
+"""Threads of an ensemble at most: for those who run several in several processes of one machine."""
+
+
+def _cores() -> int:
+    """That this process may use, where the system tells."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, THREADS.get() or cores)
+
+
+class Lanes:
+    """The stepper of a family and a method, and the parameters of its trajectories."""
+
+    def __init__(self, family: Family, method: OneStepMethod, lanes: int = LANES):
+        self.family, self.own = family, numbers_of(method)
+        self.first = np.append(family.flat(slice(0, 1), 1)[0], self.own)
+        self.varies = np.append(family.varies, np.zeros(len(self.own), dtype=bool))
+        self.stepper = compiled.stepper_of(family.form, self.first, method, lanes, self.varies)
+
+    def parameters(self, chosen: slice, number: int) -> np.ndarray:
+        if not self.varies.any():
+            return self.first
+        return np.hstack([self.family.flat(chosen, number), np.broadcast_to(self.own, (number, len(self.own)))])
+
+
+def run_compiled(family: Family, method: OneStepMethod, record: Record, tally: Tally) -> None:
+    """Blocks of lanes; the loop does not hold the interpreter's lock."""
+    lanes = Lanes(family, method)
+    stepper, course = lanes.stepper, record.course
+
+    def work(chosen: slice, stop: threading.Event) -> None:
+        if stop.is_set():
+            return
+        number = chosen.stop - chosen.start
+        blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
+        before = {name: value[:number].copy() for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
+        record.begin(chosen, before["x"], before["energy"], before["entropy"])
+        for h, saves, every, place in calls(course, CHUNK_STEPS * 16 // max(number, LANES)):
+            if stop.is_set():
+                break
+            states = stepper.run(lanes.first, blocks, h, saves, every)[:number]
+            if place is not None:
+                record.keep(chosen, place, states)
+            tally.add(number * saves * every / course.steps)
+        after = {name: value[:number] for name, value in stepper.fields(blocks, KEPT_AFTER).items()}
+        record.put(chosen, before, after)
+
+    by_threads(work, len(record.x0))
+
+
+def first_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: float) -> dict[str, np.ndarray]:
+    """The states after one step of all members of a small family."""
+    lanes, number = Lanes(family, method), len(x)
+    blocks = lanes.stepper.begin(lanes.parameters(slice(None), number), x)
+    lanes.stepper.run(lanes.first, blocks, h, 1, 1)
+    return {name: values[:number] for name, values in lanes.stepper.fields(blocks).items()}
+
+
+def calls(course: Course, limit: int):
+    """The calls ``(h, saves, every)`` of an engine, and the place of the first state that is kept of each, if any."""
+    place = 1
+    for part in course.parts:
+        done = 0
+        for h, saves, every in part.calls(limit):
+            done += saves * every
+            kept = part.every is not None or done >= part.steps
+            yield h, saves, every, place if kept else None
+            place += saves if kept else 0
+
+
+# -- the array engine -------------------------------------------------------------------------------------------------
+
+
+def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tally) -> None:
+    """All trajectories of a batch in one program, by ``vmap``."""
+    size, course, interrupted = len(record.x0), record.course, False
+    portion = min(ARRAY_BATCH, size)
+    for start in range(0, size, portion):
+        chosen = slice(start, min(start + portion, size))
+        parameters, axes = family.batched(chosen)
+        state = before = begin_all(family.form, parameters, axes, method, jnp.asarray(record.x0[chosen]))
+        first = {name: np.asarray(value) for name, value in before._asdict().items()}
+        record.begin(chosen, first["x"], first["energy"], first["entropy"])
+        try:
+            for h, saves, every, place in calls(course, CHUNK_STEPS):
+                numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
+                state, kept = advance_all(family.form, parameters, axes, method, state, *numbers)
+                if place is not None:
+                    columns = [kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])]
+                    record.keep(chosen, place, np.concatenate(columns, axis=-1))
+                tally.add((chosen.stop - chosen.start) * saves * every / course.steps)
+        except KeyboardInterrupt:
+            interrupted = True
+        record.put(chosen, first, {name: np.asarray(value) for name, value in state._asdict().items()})
+        if interrupted:
+            return
+
+
+def first_array(family: Family, method: OneStepMethod, x: np.ndarray, h: float) -> dict[str, np.ndarray]:
+    """The states after one step of all members of a small family."""
+    parameters, axes = family.batched(slice(None))
+    state = begin_all(family.form, parameters, axes, method, jnp.asarray(x))
+    state, _ = advance_all(family.form, parameters, axes, method, state, jnp.asarray(h), 1, jnp.asarray(1))
+    return {name: np.asarray(value) for name, value in state._asdict().items()}
+
+
+@program
+def begin_all(form, parameters, axes, method, x):
+    return jax.vmap(lambda p, x: array.begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
+
+
+@program
+def advance_all(form, parameters, axes, method, state, h, saves: int, every):
+    def one(p, state):
+        return array.advance(form.rebuild(p), method, state, h, saves, every, saves)
+
+    return jax.vmap(one, in_axes=(axes, 0))(parameters, state)

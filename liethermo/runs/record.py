@@ -1,0 +1,231 @@
+"""What is kept of the trajectories of an ensemble, and where the evidence for its audit comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..engines import array
+from ..engines.choice import Chosen
+from ..engines.codes import Code
+from ..engines.compiled.form import Form
+from ..integrators import OneStepMethod
+from ..results.audit import Rounding
+from ..results.ensemble import Ensemble
+from ..results.evidence import (
+    STEPS_AGAIN,
+    STILL,
+    WHOLE,
+    Evidence,
+    error_at,
+    laws_functions,
+    sizes,
+    spread,
+)
+from ..results.solution import Solution
+from ..systems import AttitudeSystem, DrivenSystem, System
+from ..tracing.interpret import at_points
+from .family import Family
+from .presented import Again, presented
+from .timetable import Course
+
+NUMBERS = (
+    "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale relaxation_time "
+    "residual energy_sensitivity entropy_sensitivity first_energy entropy_change smallest_energy largest_energy "
+    "end_time distance"
+).split()
+
+Part = slice | np.ndarray
+"""Which trajectories, of those that are run."""
+
+
+class Record:
+    """What is kept of each trajectory, filled in part by part.
+
+    Parameters
+    ----------
+    family : Family
+        Of the systems that are run.
+    member : System
+        One of them.
+    x0 : array, shape (B, n)
+    course : Course
+    outputs : {"final", "trajectory", "summary"}
+    """
+
+    def __init__(self, family: Family, member: System, x0: np.ndarray, course: Course, outputs: str):
+        self.family, self.member, self.x0, self.course = family, member, x0, course
+        self.times, self.counts, self.total = course.times, course.counts, course.steps
+        size = len(x0)
+        self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in NUMBERS}
+        self.status = np.full(size, Code.INTERRUPTED, dtype=np.int8)
+        self.steps, self.iterations = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
+        self.rows["end_time"][:] = course.start
+        self.x = np.full((size, member.dim), np.nan) if outputs == "final" else None
+        self.path = np.full((size, len(self.times), member.dim + 2), np.nan) if outputs == "trajectory" else None
+        self.work = np.full(size, np.nan)
+
+    def begin(self, chosen: Part, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
+        """The states at the start."""
+        if self.path is not None:
+            self.path[chosen, 0] = np.column_stack([x, energy, entropy])
+
+    def keep(self, chosen: Part, first: int, states: np.ndarray) -> None:
+        """States at the kept times from the so-manieth on, with energy and entropy, shape (trajectories, m, n + 2)."""
+        if self.path is not None:
+            self.path[chosen, first : first + states.shape[1]] = states
+
+    def put(self, chosen: Part, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
+        """The outcome of some trajectories of equal steps: fields of :class:`liethermo.engines.array.State`."""
+        steps = after["step"].astype(np.int64)
+        status = np.where((after["status"] == 0) & (steps < self.total), Code.INTERRUPTED, after["status"])
+        self.finish(chosen, before, after, status, self.course.reached(steps))
+        if self.path is not None:
+            late = np.arange(len(self.counts)) >= np.searchsorted(self.counts, steps, side="right")[:, None]
+            self.path[chosen] = np.where(late[..., None], np.nan, self.path[chosen])
+
+    def finish(self, chosen: Part, before: Mapping, after: Mapping, status: np.ndarray, end_time: np.ndarray) -> None:
+        """How some trajectories ended, and when."""
+        rows, energy, first = self.rows, after["energy"], before["energy"]
+        rows["energy"][chosen], rows["entropy"][chosen] = energy, after["entropy"]
+        drift = np.maximum(after["largest_energy"] - first, first - after["smallest_energy"])
+        rows["energy_drift"][chosen] = drift / Rounding(first, after["energy_sensitivity"]).size
+        for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy", "smallest_energy", "largest_energy"):
+            rows[name][chosen] = after[name]
+        rows["entropy_change"][chosen] = after["entropy"] - before["entropy"]
+        rows["distance"][chosen] = np.abs(after["x"] - before["x"]).max(axis=1)
+        rows["largest_energy_increment"][chosen] = after["largest_energy_increment"]
+        rows["least_entropy_increment"][chosen] = after["least_entropy_increment"]
+        rows["entropy_scale"][chosen] = np.maximum(np.abs(before["entropy"]), np.abs(after["entropy"]))
+        rows["residual"][chosen] = after["residual"]
+        rows["end_time"][chosen] = end_time
+        start, end = (np.asarray(array.relaxing(self.member, f["energy"], f["entropy"])) for f in (before, after))
+        change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
+        rows["relaxation_time"][chosen] = (end * (end_time - self.course.start) - after["integral"]) / change
+        self.status[chosen], self.steps[chosen] = status, after["step"]
+        self.iterations[chosen] = after["fixed_point"] + after["newton"]
+        if self.x is not None:
+            self.x[chosen] = after["x"]
+        if isinstance(self.member, DrivenSystem):
+            self.work[chosen] = self.member.work(after["x"])
+
+    # -- the result ---------------------------------------------------------------------------------------------------
+
+    def result(self, run: np.ndarray, size: int, **fields: Any) -> Ensemble:
+        """All trajectories, ``run`` being the places of those that were, and the others' reasons among the fields."""
+
+        def placed(values, empty: Any = np.nan):
+            if values is None or len(run) == size:
+                return values
+            whole = np.full((size, *values.shape[1:]), empty, dtype=values.dtype)
+            whole[run] = values
+            return whole
+
+        rows = {name: placed(values) for name, values in self.rows.items() if name != "distance"}
+        x, energy, entropy, t = self.x, rows.pop("energy"), rows.pop("entropy"), self.times[-1:]
+        if self.path is not None:
+            x, energy, entropy = self.path[..., :-2], placed(self.path[..., -2]), placed(self.path[..., -1])
+            t = self.times
+        x0, attitude, attitude0, work = self.x0, None, None, None
+        if isinstance(self.member, AttitudeSystem):
+            x0, attitude0 = map(np.asarray, self.member.split(x0))
+            if x is not None:
+                x, attitude = map(np.asarray, self.member.split(x))
+        if isinstance(self.member, DrivenSystem):
+            work = placed(self.work if self.path is None else np.asarray(self.member.work(x)))
+            x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
+        return Ensemble(
+            t=t,
+            x=placed(x),
+            energy=energy,
+            entropy=None if self.member.entropy is None else entropy,
+            status=placed(self.status, Code.INADMISSIBLE),
+            steps=placed(self.steps, 0),
+            iterations=placed(self.iterations, 0),
+            x0=placed(x0),
+            attitude=placed(attitude),
+            attitude0=placed(attitude0),
+            work=work,
+            **rows,
+            **fields,
+        )
+
+
+class Alone:
+    """Finds one trajectory of an ensemble as a run of its own would present it."""
+
+    def __init__(self, record: Record, method: OneStepMethod, run: np.ndarray):
+        self.record, self.method, self.places = record, method, {int(i): j for j, i in enumerate(run)}
+
+    def __call__(self, many: Ensemble, i: int) -> Solution:
+        record, j, plain = self.record, self.places[i], many.member(i)
+        system = record.family.member(j)
+        if record.path is None:
+            assert record.x is not None
+            x = np.stack([record.x0[j], record.x[j]])
+        else:
+            x = record.path[j, : len(plain.t), :-2]
+        steps = np.minimum(np.diff(plain.t), record.course.h)
+        energy = plain.energy_balance
+        found = presented(
+            system,
+            self.method,
+            x,
+            t=plain.t,
+            energy=energy,
+            entropy=plain.entropy,
+            steps=steps,
+            again=Again(Chosen(system, self.method, "auto", 1), None),
+            status=plain.status,
+            stats=plain.stats,
+            provenance=plain.provenance,
+        )
+        return replace(found, provenance=plain.provenance)
+
+
+class FirstSteps:
+    """Finds the local errors of first steps, and how the laws' functions are rounded there, when it is called."""
+
+    def __init__(self, record: Record, method: OneStepMethod, step_all: Callable, h: float):
+        some = spread(len(record.x0), STEPS_AGAIN)
+        self.family, self.member, self.method = record.family.select(some), record.member, method
+        self.x, self.distance = np.ascontiguousarray(record.x0[some]), record.rows["distance"][some]
+        self.h, self.start, self.step_all = h, record.course.start, step_all
+
+    def __call__(self) -> Evidence:
+        form, number = self.family.form, len(self.x)
+        own = self.family.flat(slice(None), number)
+        after = self.step_all(self.family, self.method, self.x, self.h)
+        moved = np.abs(self._seen(after["x"] + after["low"]) - self._seen(self.x)).max(axis=1)
+        found = Evidence(terms=self._terms(own))
+        told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
+        if not told.any():
+            return found
+        h = np.full((number, 1), self.h)
+        steps = np.concatenate([own, self.x, h, after["k"].reshape(number, -1)], axis=1)[told]
+        errors = at_points(_first_errors, (form, self.method, len(own[0])), steps)
+        relative = errors / np.fmax(moved, WHOLE * self.distance)[told]
+        return replace(found, local_error=float(np.nan_to_num(relative).max()), error_time=self.start)
+
+    def _terms(self, own: np.ndarray) -> dict[str, float]:
+        """The sizes at which the energy and the entropy are rounded, the largest of some trajectories."""
+        at = np.concatenate([own, self.x], axis=1)
+        largest = at_points(_first_terms, (self.family.form, own.shape[1]), at).max(axis=0)
+        return {name: float(size) for name, size in zip(("energy", "entropy"), np.nan_to_num(largest), strict=False)}
+
+    def _seen(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(self.member.points(x)).reshape(len(x), -1)
+
+
+def _first_terms(model: tuple[Form, int], at):
+    form, p = model
+    return sizes(laws_functions(form.build(at[:p])), at[p:])[1]
+
+
+def _first_errors(model: tuple[Form, OneStepMethod, int], step):
+    form, method, p = model
+    system = form.build(step[:p])
+    return error_at(system, method, step[p:])
