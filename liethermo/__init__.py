@@ -6,6 +6,7 @@ Importing this package switches JAX to 64-bit floating point (see :mod:`manifold
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 
@@ -174,4 +175,6 @@ __all__ = [
 def __getattr__(name: str):
     if name == "plot":  # matplotlib is imported only when a picture is wanted
         return importlib.import_module(".results.plot", __name__)
+    if name == "__version__":
+        return importlib.metadata.version("liethermo")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -32,6 +32,24 @@ app = typer.Typer(
     help="Integrate systems that obey the two laws of thermodynamics, and see that they do.",
     epilog="Exit status: 0 where all laws hold, 1 where one fails or the run stopped early, 2 for a bad spec or file.",
 )
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"liethermo {version('liethermo')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Say the version and exit.")
+    ] = False,
+) -> None: ...
+
+
 SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, described in TOML.")]
 
 

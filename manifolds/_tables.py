@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from html import escape
 
 VERDICT = {True: "ok", False: "FAILS", None: "-"}
 
@@ -28,3 +29,26 @@ def table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str
         allowed = " " * 9 if row.allowed is None else f"{row.allowed:9.1e}"
         lines.append(f"{row.name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT[row.passed]:<5} {row.note}".rstrip())
     return "\n".join([*lines, last])
+
+
+def html_table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str:
+    """The same table for a notebook."""
+    cells = [
+        (
+            row.name,
+            f"{row.value:.2e}",
+            "" if row.allowed is None else f"{row.allowed:.1e}",
+            VERDICT[row.passed],
+            row.note,
+        )
+        for row in rows
+    ]
+    return html_grid([*headings, "", ""], cells, last)
+
+
+def html_grid(headings: Iterable[str], rows: Iterable[Iterable[str]], last: str = "") -> str:
+    """A table of texts for a notebook, with a line below it."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in headings)
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
+    below = f"<p><strong>{escape(last)}</strong></p>" if last else ""
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"

@@ -53,6 +53,8 @@ def run(code: str, namespace: dict[str, Any], name: str, line: int) -> Output:
     figures = [plt.figure(number) for number in plt.get_fignums()]
     if value is not None and not figures:
         output.html = getattr(value, "_repr_html_", lambda: None)()
+        if output.html is None and hasattr(value, "_repr_latex_"):
+            output.html = f'<div class="math notranslate nohighlight">\\({value._repr_latex_().strip("$")}\\)</div>'
         if output.html is None:
             output.text += f"{value!r}\n"
     for figure in figures:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from manifolds._tables import Row, table
+from manifolds._tables import Row, html_table, table
 
 from ..engines.codes import Code
 from ..errors import InputError
@@ -168,7 +168,16 @@ class Audit:
         return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __str__(self) -> str:
-        return table([row.as_row() for row in self.rows], ("law", "measured", "allowed"), self.verdict)
+        return table(*self._table())
+
+    def __repr__(self) -> str:
+        return f"<Audit of {len(self.rows)} rows: {self.verdict}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._table())
+
+    def _table(self) -> tuple[list[Row], tuple[str, str, str], str]:
+        return [row.as_row() for row in self.rows], ("law", "measured", "allowed"), self.verdict
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from manifolds._tables import html_grid
+
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import Audit, AuditRow, Tolerances, accuracy_row
 from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, as_parts, checksum, from_parts, write
+from .files import ENSEMBLE_FORMAT, as_parts, checksum, describe, from_parts, write
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -255,6 +257,11 @@ class Ensemble:
         lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        counts = [(STATUSES[code], str(int((self.status == code).sum()))) for code in np.unique(self.status)]
+        drift = f"largest relative energy drift {np.max(self.energy_drift, initial=0.0):.1e}"
+        return html_grid((f"{len(self)} trajectories to t = {self.t[-1]:g}", ""), counts, drift)
+
     def audit(
         self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
     ) -> Audit:
@@ -288,10 +295,21 @@ class Ensemble:
 
     # -- files --------------------------------------------------------------------------------------------------------
 
-    def to_xarray(self) -> xarray.Dataset:
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """An ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; what is no array as attributes (JSON).
 
-        ``status_text`` and ``message`` say of every trajectory how it ended.
+        ``status_text`` and ``message`` say of every trajectory how it ended. Each variable says its long
+        name, energy and entropy the law that the system promises of them.
+
+        Parameters
+        ----------
+        units : dict of str, optional
+            Units by the name of a variable, such as ``{"time": "s", "energy": "J"}``: the library cannot know yours.
+
+        Raises
+        ------
+        InputError
+            If there is no variable of a name.
         """
         import xarray
 
@@ -323,12 +341,27 @@ class Ensemble:
             "reasons": json.dumps({str(i): text for i, text in self.reasons.items()}),
         }
         dataset = xarray.Dataset(variables, {"time": self.t, "trajectory": np.arange(len(self))}, attributes)
+        describe(dataset, {"energy": self.laws.energy, "entropy": self.laws.entropy}, units or {})
         content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
         return dataset.assign_attrs(sha256=checksum(content, attributes))
 
-    def save(self, path: str | os.PathLike) -> Path:
-        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all."""
-        return write(self.to_xarray(), path)
+    def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
+        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+        units : dict of str, optional
+            Units by the name of a variable: see :meth:`to_xarray`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written.
+        InputError
+            If there is no variable of a name in ``units``.
+        """
+        return write(self.to_xarray(units), path)
 
     @classmethod
     def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:

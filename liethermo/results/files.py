@@ -13,7 +13,7 @@ import numpy as np
 
 from manifolds.errors import warn
 
-from ..errors import FileError
+from ..errors import FileError, InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -28,6 +28,36 @@ ATTRIBUTES = tuple(
 
 SEAL = b"\nliethermo sha256 "
 """What comes after the end of the NetCDF file, with the digest of all before it."""
+
+
+LONG_NAMES = {
+    "time": "time",
+    "x": "state of the system, a component in each column",
+    "energy": "energy",
+    "entropy": "entropy",
+    "x0": "state at the start",
+    "attitude0": "element of the Lie group of the system at the start",
+    "work": "work done on the system from outside",
+    "status": "how the run ended, as a number",
+    "status_text": "how the run ended",
+    "attitude": "element of the Lie group of the system, real part and, where it has one, imaginary part",
+    "invariant_name": "names of the recorded functions",
+    "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
+}
+
+
+def describe(dataset: xarray.Dataset, laws: Mapping[str, str | None], units: Mapping[str, str]) -> None:
+    """Say of each variable what it is, in which unit, and what law the system promises of it; in place."""
+    unknown = [name for name in units if name not in dataset.variables]
+    if unknown:
+        raise InputError(f"a result has no variable {unknown[0]!r}; it has {', '.join(map(str, dataset.variables))}")
+    for name, variable in dataset.variables.items():
+        said = {
+            "long_name": LONG_NAMES.get(str(name), str(name).replace("_", " ")),
+            "units": units.get(str(name)),
+            "law": laws.get(str(name)),
+        }
+        variable.attrs.update({key: text for key, text in said.items() if text is not None})
 
 
 def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:

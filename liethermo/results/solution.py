@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from manifolds._tables import html_grid
 
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, as_parts, checksum, from_parts, write
+from .files import FORMAT, as_parts, checksum, describe, from_parts, write
+from .sketch import sketch
 from .status import Laws, Stats, Status
 
 
@@ -110,8 +113,21 @@ class Solution:
         """The same solution with more said about where it comes from."""
         return replace(self, provenance={**self.provenance, **entries})
 
-    def to_xarray(self) -> xarray.Dataset:
-        """An ``xarray.Dataset`` with coordinate ``time`` and all series; the rest as attributes (JSON)."""
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """An ``xarray.Dataset`` with coordinate ``time`` and all series; the rest as attributes (JSON).
+
+        Each variable says its long name, energy and entropy the law that the system promises of them.
+
+        Parameters
+        ----------
+        units : dict of str, optional
+            Units by the name of a variable, such as ``{"time": "s", "energy": "J"}``: the library cannot know yours.
+
+        Raises
+        ------
+        InputError
+            If there is no variable of a name.
+        """
         import xarray
 
         series = {"energy": ("time", self.energy)}
@@ -136,15 +152,45 @@ class Solution:
             "event_time": json.dumps(self.event_time),
         }
         dataset = xarray.Dataset(variables, coordinates, attributes)
+        describe(dataset, {"energy": self.laws.energy, "entropy": self.laws.entropy}, units or {})
         content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
         return dataset.assign_attrs(sha256=checksum(content, attributes))
 
-    def save(self, path: str | os.PathLike) -> Path:
-        """Write a NetCDF file; it appears whole or not at all."""
-        return write(self.to_xarray(), path)
+    def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
+        """Write a NetCDF file; it appears whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+        units : dict of str, optional
+            Units by the name of a variable: see :meth:`to_xarray`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written.
+        InputError
+            If there is no variable of a name in ``units``.
+        """
+        return write(self.to_xarray(units), path)
 
     def __repr__(self) -> str:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: how the run ended, and small pictures. The laws are for :meth:`audit` to judge."""
+        facts = [
+            ("system", str(self.provenance.get("system", "-"))),
+            ("method", str(self.provenance.get("method", "-"))),
+            ("status", str(self.status)),
+            ("kept", f"{len(self.t)} times of {self.stats.steps} steps, states of {self.x.shape[1]} components"),
+            ("energy", f"{self.energy[0]:.10g} to {self.energy[-1]:.10g}"),
+        ]
+        pictures = [sketch(self.t, self.x, "the components of the state along time")]
+        if self.entropy is not None:
+            facts.append(("entropy", f"{self.entropy[0]:.10g} to {self.entropy[-1]:.10g}"))
+            pictures.append(sketch(self.t, self.entropy[:, None], "the entropy along time"))
+        return html_grid(("Solution", ""), facts) + "<div>" + " ".join(pictures) + "</div>"
 
     @classmethod
     def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:

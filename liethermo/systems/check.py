@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._tables import Row, table
+from manifolds._tables import Row, html_table, table
 
 from ..dissipation.base import Dissipation, Law
 from ..dissipation.friction_operator import KERNEL
@@ -56,9 +56,21 @@ class CheckReport:
         return all(row.passed is not False for row in self.rows)
 
     def __str__(self) -> str:
-        total = "all axioms hold" if self.passed else "NOT metriplectic"
+        return table(*self._table())
+
+    def __repr__(self) -> str:
+        return f"<CheckReport of {len(self.rows)} axioms: {self._total}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._table())
+
+    def _table(self) -> tuple[list[Row], tuple[str, str, str], str]:
         rows = [row.as_row() for row in self.rows]
-        return table(rows, ("axiom", "residual", "tolerance"), f"{total} (at {self.points} points)")
+        return rows, ("axiom", "residual", "tolerance"), f"{self._total} (at {self.points} points)"
+
+    @property
+    def _total(self) -> str:
+        return "all axioms hold" if self.passed else "NOT metriplectic"
 
 
 class Subject(Geometry, Protocol):

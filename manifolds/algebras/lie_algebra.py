@@ -28,6 +28,7 @@ from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, rational_array
 from .axioms import AXIOM_TOLERANCE, check_axioms, checked_constants, real_columns, without_rounding
 from .casimirs import casimirs
+from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space
 from .polynomial_casimirs import casimir_count
 
@@ -317,6 +318,9 @@ class LieAlgebra:
 
     def __repr__(self) -> str:
         return f"LieAlgebra({self.name!r}, dim={self.dim})"
+
+    def _repr_html_(self) -> str:
+        return algebra_html(self.name, self.structure_constants, self.basis_names)
 
     def __eq__(self, other) -> bool:
         return isinstance(other, LieAlgebra) and self._key == other._key

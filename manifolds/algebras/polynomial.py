@@ -167,6 +167,11 @@ class Polynomial:
     def __repr__(self) -> str:
         return f"<Polynomial {self}>"
 
+    def _repr_latex_(self) -> str:
+        """As a notebook typesets it."""
+        text = " + ".join(_latex_term(power, coefficient, self.names) for power, coefficient in self.terms)
+        return f"$\\displaystyle {text.replace('+ -', '- ') or '0'}$"
+
 
 def _coefficient(value) -> Coefficient:
     if isinstance(value, Rational):
@@ -182,3 +187,16 @@ def _term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ..
     if factors and number in ("1", "-1"):
         return number[:-1] + "*".join(factors)
     return "*".join([number, *factors])
+
+
+def _latex_term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...] | None) -> str:
+    letters = [rf"\mu_{{{i + 1}}}" for i in range(len(power))] if names is None else [rf"\mathrm{{{n}}}" for n in names]
+    factors = " ".join(letter + (f"^{{{e}}}" if e > 1 else "") for letter, e in zip(letters, power, strict=True) if e)
+    if isinstance(coefficient, Fraction):
+        over, under = abs(coefficient.numerator), coefficient.denominator
+        number = str(over) if under == 1 else rf"\tfrac{{{over}}}{{{under}}}"
+    else:
+        digits, _, exponent = f"{abs(coefficient):.15g}".partition("e")
+        number = digits + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")
+    sign = "-" if coefficient < 0 else ""
+    return sign + (factors if factors and number == "1" else f"{number} {factors}".strip())

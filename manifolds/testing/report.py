@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._tables import Row, table
+from .._tables import Row, html_table, table
 from ..errors import ManifoldsError
 
 
@@ -22,8 +22,14 @@ class Report:
         return all(row.passed is not False for row in self.rows)
 
     def __str__(self) -> str:
+        return table(*self._table())
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._table())
+
+    def _table(self) -> tuple[tuple[Row, ...], tuple[str, str, str], str]:
         last = "all of them hold" if self.passed else "NOT ALL OF THEM HOLD"
-        return table(self.rows, (f"properties of {self.of}", "residual", "allowed"), last)
+        return self.rows, (f"properties of {self.of}", "residual", "allowed"), last
 
 
 class PropertyError(ManifoldsError, AssertionError):

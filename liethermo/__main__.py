@@ -1,0 +1,5 @@
+"""``python -m liethermo`` is the command ``liethermo``."""
+
+from .cli import main
+
+main()
