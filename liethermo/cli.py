@@ -136,6 +136,21 @@ def models() -> None:
 
 
 @app.command()
+def methods() -> None:
+    """List the methods that a spec file can name, with their orders, what they keep exactly, and what they are for."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from .integrators import registered_methods
+
+    table = Table("method", "order", "keeps exactly", "for", box=None, pad_edge=False)
+    for method in registered_methods(special=True):
+        kept = ", ".join(sorted(name.replace("_", " ") for name in method.preserves))
+        table.add_row(str(method), str(method.order), kept or "-", method.systems)
+    Console(markup=False).print(table)
+
+
+@app.command()
 @_told()
 def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
     """Audit the laws of a saved run."""

@@ -251,6 +251,47 @@ def test_models_lists_all_with_their_parameters():
     assert "rate=1.0" in result.stdout
 
 
+def test_methods_are_listed_with_what_they_keep():
+    result = CliRunner().invoke(app, ["methods"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    for method in lt.registered_methods(special=True):
+        line = next(line for line in lines if line.startswith(str(method)))
+        assert f" {method.order} " in line
+        assert all(name.replace("_", " ") in line for name in method.preserves)
+    assert any("simple closed systems" in line for line in lines)
+
+
+def test_a_variational_scheme_by_its_name(tmp_path):
+    """It keeps the second law and not the energy, and the exit status says so."""
+    spec = tmp_path / "spring.toml"
+    spec.write_text(
+        """
+        [model]
+        name = "mass_spring_gas"
+        [run]
+        initial = [0.3, 0.5, 0.0]
+        t_span = [0.0, 1.0]
+        step = 0.1
+        [method]
+        name = "VariationalIntegrator"
+        phi = "{}"
+        [outputs]
+        figures = []
+        """.replace("{}", "symmetrised")
+    )
+    result = CliRunner().invoke(app, ["run", str(spec), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 1, result.output
+    assert str(lt.VariationalIntegrator.symmetrised()) in result.stdout
+    verdicts = {law: next(line for line in result.stdout.splitlines() if law in line) for law in ("energy", "entropy")}
+    assert "FAILS" in verdicts["energy"]
+    assert "ok" in verdicts["entropy"]
+    spec.write_text(spec.read_text().replace("symmetrised", "symmetrized"))
+    result = CliRunner().invoke(app, ["run", str(spec), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "did you mean" in result.output.lower()
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["check", "-h"], ["audit", "-h"]])
 def test_help(arguments):
     assert CliRunner().invoke(app, arguments).exit_code == 0
@@ -373,4 +414,4 @@ def test_spec_errors_derive_from_the_library_and_the_builtin():
 
 
 def test_every_registered_integrator_can_be_named():
-    assert {type(method).__name__ for method in lt.registered_methods()} | {"Reference"} == set(METHODS)
+    assert {type(method).__name__ for method in lt.registered_methods(special=True)} | {"Reference"} == set(METHODS)

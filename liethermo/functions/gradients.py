@@ -15,6 +15,7 @@ shut out where it is rounding noise, by a gate that is continuous, scale free, a
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import fields
 from typing import NamedTuple
 
 import equinox as eqx
@@ -64,6 +65,10 @@ class DiscreteGradient(eqx.Module):
     @abstractmethod
     def general(self, term: Energy, x, d, low) -> jax.Array:
         """The discrete gradient of a term that need not be quadratic."""
+
+    def __str__(self) -> str:
+        chosen = [f"{f.name}={getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name) != f.default]
+        return type(self).__name__ + (f"({', '.join(chosen)})" if chosen else "")
 
 
 class Gonzalez(DiscreteGradient):

@@ -16,7 +16,7 @@ from .variational.schemes import VariationalIntegrator
 DEFAULT_METHOD = MetriplecticGauss(1)
 """Of order 2; where energy and entropy are quadratic it is the midpoint scheme."""
 
-METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods()} | {
+METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods(special=True)} | {
     "Reference": Reference
 }
 """The integrators by name, as spec files give them; one registered in a module imported above is among them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,6 +18,8 @@ from ..systems import System
 from .tableaus import MOST_STAGES, at_start, beyond, gauss, integrated
 
 _registry: list[OneStepMethod] = []
+
+EVERY_SYSTEM = "every system"
 
 
 class OneStepMethod(eqx.Module):
@@ -37,7 +40,11 @@ class OneStepMethod(eqx.Module):
         (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"casimirs"`` (those known to be
         conserved) and ``"quadratic_casimirs"`` (quadratic ones, where the dissipation keeps them by construction).
     stages : int
+    systems : str
+        What it is for, in words; :meth:`check` refuses others.
     """
+
+    systems: ClassVar[str] = EVERY_SYSTEM
 
     @property
     @abstractmethod
@@ -200,6 +207,12 @@ def register(*methods: OneStepMethod) -> None:
     _registry.extend(methods)
 
 
-def registered_methods() -> Iterator[OneStepMethod]:
-    """The registered instances, one after another."""
-    yield from _registry
+def registered_methods(special: bool = False) -> Iterator[OneStepMethod]:
+    """The registered instances, one after another.
+
+    Parameters
+    ----------
+    special : bool
+        Those for one kind of system too: see :attr:`OneStepMethod.systems`.
+    """
+    yield from (method for method in _registry if special or method.systems == EVERY_SYSTEM)

@@ -34,6 +34,8 @@ class DiscreteHerglotz(OneStepMethod):
         The action of a step, such as ``h L``; :meth:`midpoint` makes one from a Lagrangian.
     """
 
+    systems = "evolution systems"
+
     discrete_lagrangian: Callable
 
     @classmethod

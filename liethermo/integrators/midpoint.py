@@ -76,7 +76,7 @@ class MetriplecticMidpoint(OneStepMethod):
         return h * k[0]
 
     def __str__(self) -> str:
-        return f"MetriplecticMidpoint(gradient={type(self.gradient).__name__})"
+        return f"MetriplecticMidpoint(gradient={self.gradient})"
 
 
 register(

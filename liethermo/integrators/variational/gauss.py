@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from manifolds.matrices.linear import solve
 
 from ...systems import SimpleClosedSystem, System
-from ..base import GaussMethod, checked_stages
+from ..base import GaussMethod, checked_stages, register
 from ..tableaus import gauss
 from .schemes import need_simple_closed, velocity_slope
 
@@ -34,6 +34,8 @@ class VariationalGauss(GaussMethod):
     stages : int
         1 to 8.
     """
+
+    systems = "simple closed systems"
 
     def __init__(self, stages: int = 2):
         self.number = checked_stages(stages)
@@ -72,3 +74,6 @@ class VariationalGauss(GaussMethod):
 
     def __str__(self) -> str:
         return f"VariationalGauss(stages={self.number})"
+
+
+register(*map(VariationalGauss, (1, 2, 3)))

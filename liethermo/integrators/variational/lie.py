@@ -13,7 +13,7 @@ from manifolds.matrices.linear import solve
 from ...errors import InputError
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import program
-from ..base import OneStepMethod
+from ..base import OneStepMethod, register
 
 NEWTON_STEPS = 20
 """For the velocities between the states of a finished run."""
@@ -35,6 +35,8 @@ class LieVariational(OneStepMethod):
 
     :meth:`attitudes` gives the group elements g_k of a run.
     """
+
+    systems = "Euler-Poincaré systems with entropy"
 
     @property
     def stages(self) -> int:
@@ -147,3 +149,6 @@ def _turns(system: EulerPoincareClosedSystem, x, h):
         return cayley(system.algebra, h * xi)
 
     return jax.vmap(one)(x[:-1], x[1:])
+
+
+register(LieVariational())

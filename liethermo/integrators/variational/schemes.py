@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from ...errors import InputError
 from ...systems import SimpleClosedSystem, System
 from ...tracing.interpret import polynomial_degree
 from ...tracing.programs import program
-from ..base import OneStepMethod
+from ..base import OneStepMethod, register
 from .discrete import DiscreteSystem, FiniteDifference, Pair
 
 CONSTRAINT_TOLERANCE = 1e-10
@@ -24,7 +25,7 @@ CONSTRAINT_TOLERANCE = 1e-10
 SINGULAR = 1e13
 """Condition number, of rows scaled alike, from which a matrix counts as singular."""
 
-Maps = FiniteDifference | Sequence[FiniteDifference]
+Maps = FiniteDifference | Sequence[FiniteDifference] | str
 
 
 class VariationalIntegrator(OneStepMethod):
@@ -50,11 +51,13 @@ class VariationalIntegrator(OneStepMethod):
 
     Parameters
     ----------
-    phi : FiniteDifference, or a sequence of them
+    phi : FiniteDifference, a sequence of them, or one of "verlet", "midpoint", "symmetrised"
         For the discrete Lagrangian.
     forces, constraint : likewise, optional
         For the forces and the constraint, where they are chosen separately [GBY Remark 3.5]; phi by default.
     """
+
+    systems = "simple closed systems"
 
     phi: tuple[FiniteDifference, ...]
     forces: tuple[FiniteDifference, ...]
@@ -68,7 +71,7 @@ class VariationalIntegrator(OneStepMethod):
     @classmethod
     def verlet(cls) -> VariationalIntegrator:
         """Scheme 1: everything at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction."""
-        return cls(FiniteDifference(0.0))
+        return cls("verlet")
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5) -> VariationalIntegrator:
@@ -78,7 +81,7 @@ class VariationalIntegrator(OneStepMethod):
     @classmethod
     def symmetrised(cls) -> VariationalIntegrator:
         """Scheme 3: the mean of both ends; order 2."""
-        return cls((FiniteDifference(0.0), FiniteDifference(1.0)))
+        return cls("symmetrised")
 
     @property
     def stages(self) -> int:
@@ -280,10 +283,22 @@ def need_simple_closed(system: System, name: str) -> None:
         raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {system.kind}")
 
 
+SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
+    "verlet": (FiniteDifference(0.0),),
+    "midpoint": (FiniteDifference(0.5),),
+    "symmetrised": (FiniteDifference(0.0), FiniteDifference(1.0)),
+}
+"""The schemes of GBY §3.3 by name."""
+
+
 def _maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
-    found = (maps,) if isinstance(maps, FiniteDifference) else tuple(maps) if isinstance(maps, Sequence) else ()
+    named = SCHEMES.get(maps, ()) if isinstance(maps, str) else maps
+    found: tuple[Any, ...] = tuple(named) if isinstance(named, Sequence) else (named,)
     if not found or not all(isinstance(map, FiniteDifference) for map in found):
-        raise InputError(f"{what} must be an lt.FiniteDifference or a sequence of them, not {maps!r}")
+        raise InputError(
+            f"{what} must be an lt.FiniteDifference, a sequence of them, or one of {', '.join(map(repr, SCHEMES))}, "
+            f"not {maps!r}"
+        )
     return found
 
 
@@ -326,3 +341,6 @@ def _energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, befo
 @program
 def _regularity(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.regularity_matrix(q0, q1, S0, S1)
+
+
+register(VariationalIntegrator.verlet(), VariationalIntegrator.midpoint(), VariationalIntegrator.symmetrised())

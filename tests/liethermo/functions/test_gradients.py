@@ -165,6 +165,13 @@ def test_nan_is_not_hidden(gradient):
     assert not np.isfinite(np.asarray(gradient(energy, np.array([0.5]), np.array([-0.6])))).all()
 
 
+def test_each_has_a_name_of_its_own():
+    """It stands in the provenance of a run."""
+    names = {str(lt.MetriplecticMidpoint(name)) for name in GRADIENTS} | {str(lt.MetriplecticMidpoint(lt.MeanValue(3)))}
+    assert len(names) == len(GRADIENTS) + 1
+    assert "MetriplecticMidpoint(gradient=CoordinateIncrement(symmetric=True))" in names
+
+
 def test_unknown_names_and_bad_nodes_are_refused():
     with pytest.raises(lt.InputError, match="'gonzalez', 'mean_value'"):
         lt.MetriplecticMidpoint(gradient="gonzales")

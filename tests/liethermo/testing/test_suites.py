@@ -16,8 +16,8 @@ TRIED = {
 }
 
 
-@pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods()])
-@pytest.mark.sampled(1)
+@pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods(special=True)])
+@pytest.mark.sampled(2)
 def test_methods(method):
     assert testing.check_method(method).passed
 
