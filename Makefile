@@ -75,7 +75,7 @@ format: .venv
 lock:
 	$(call require,[:2] == (3$(comma) 11),The lock is made with Python 3.11$(comma) the oldest one supported: make lock PYTHON=python3.11)
 	@set -e; folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
-	"$(PYTHON)" -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; print(*p["dependencies"], *e["test"], *e["docs"], "setuptools", "wheel", sep="\n")' > "$$folder/wanted"; \
+	"$(PYTHON)" -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; print(*p["dependencies"], *e["test"], *e["docs"], *e["studies"], "setuptools", "wheel", sep="\n")' > "$$folder/wanted"; \
 	echo "$(LOCK_CONSTRAINTS)" > "$$folder/constraints"; \
 	"$(PYTHON)" -m venv "$$folder/venv"; \
 	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check --upgrade -c "$$folder/constraints" -r "$$folder/wanted"; \

@@ -64,6 +64,10 @@ from .runs.events import Relaxed
 from .runs.flow import flow
 from .runs.integrate import integrate
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
+from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
+from .studies.measures import At
+from .studies.progress import StudyStatus
+from .studies.study import Study, load_study
 from .systems import (
     AttitudeSystem,
     ChartSystem,
@@ -87,6 +91,7 @@ from .systems.composed.graph_files import Graph, read_graph
 __all__ = [
     "ActivatedFriction",
     "Adaptive",
+    "At",
     "AttitudeSystem",
     "Audit",
     "AxiomError",
@@ -151,6 +156,8 @@ __all__ = [
     "SpecError",
     "Stats",
     "Status",
+    "Study",
+    "StudyStatus",
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
@@ -158,17 +165,23 @@ __all__ = [
     "VariationalGauss",
     "VariationalIntegrator",
     "WithAttitude",
+    "Zipped",
     "ensemble",
     "flow",
     "integrate",
+    "latin_hypercube",
     "load",
+    "load_study",
     "models",
     "plot",
     "read_graph",
     "registered_methods",
+    "replicas",
+    "sobol",
     "suggest_method",
     "suggest_step",
     "testing",
+    "zipped",
 ]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,18 +19,18 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
-from ..errors import FileError, InputError
+from ..errors import InputError
 from ..systems import System
 from .audit import EPS, LAW_FAILS, Audit
+from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, finished, writable
 from .solution import Solution
+from .study_plot import study
 
-SUFFIXES = (".pdf", ".png", ".svg")
-DPI = 150
+__all__ = ["laws", "momentum_sphere", "study"]
+
 MOST_SEGMENTS = 20_000
 """A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""
 
-# Colours that colour-blind readers tell apart [Okabe & Ito 2008], and a map that is even in lightness.
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.55"
 TIME_MAP = plt.get_cmap("viridis")
 
 Function = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
@@ -78,7 +77,7 @@ def momentum_sphere(
     FileError
         If the file cannot be written.
     """
-    path = _writable(path)
+    path = writable(path)
     if solution.x.shape[1] != 3:
         raise InputError(
             f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any"
@@ -115,7 +114,7 @@ def momentum_sphere(
     ax.set_box_aspect((1, 1, 1), zoom=0.95)
     ax.set_aspect("equal", adjustable="datalim")
     ax.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
-    return _finished(ax.figure, path)
+    return finished(ax.figure, path)
 
 
 @dataclass(frozen=True)
@@ -365,7 +364,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     FileError
         If the file cannot be written.
     """
-    path = _writable(path)
+    path = writable(path)
     panels, audit = 1 if solution.entropy is None else 3, solution.audit()
     figure, axes = plt.subplots(
         panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
@@ -380,7 +379,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     axes[-1, 0].set_xlabel("time")
     figure.align_ylabels()
     figure.suptitle(_verdict(audit), color="black" if audit.passed else RED, fontsize="medium")
-    return _finished(figure, path)
+    return finished(figure, path)
 
 
 def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, less: str) -> None:
@@ -444,25 +443,3 @@ def _verdict(audit: Audit) -> str:
         )
     shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
     return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in shown)
-
-
-# -- files --------------------------------------------------------------------------------------------------------
-
-
-def _writable(path: str | os.PathLike | None) -> Path | None:
-    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
-        raise InputError(f"a figure is written as {', '.join(SUFFIXES)}, and {Path(path).name!r} ends in none of them")
-    return None if path is None else Path(path)
-
-
-def _finished(figure: Figure, path: Path | None) -> Figure:
-    """The figure, written to the path and closed if there is one."""
-    if path is not None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path)
-        except OSError as error:
-            raise FileError(f"cannot write {path}: {error}") from error
-        finally:
-            plt.close(figure)
-    return figure

@@ -1,0 +1,37 @@
+"""What all pictures share: colours, and how a figure becomes a file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from ..errors import FileError, InputError
+
+SUFFIXES = (".pdf", ".png", ".svg")
+DPI = 150
+
+# Colours that colour-blind readers tell apart [Okabe & Ito 2008].
+BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.55"
+
+
+def writable(path: str | os.PathLike | None) -> Path | None:
+    """The path of a figure, whose suffix is one of those that can be written."""
+    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"a figure is written as {', '.join(SUFFIXES)}, and {Path(path).name!r} ends in none of them")
+    return None if path is None else Path(path)
+
+
+def finished(figure: Figure, path: Path | None) -> Figure:
+    """The figure, written to the path and closed if there is one."""
+    if path is not None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path)
+        except OSError as error:
+            raise FileError(f"cannot write {path}: {error}") from error
+        finally:
+            plt.close(figure)
+    return figure

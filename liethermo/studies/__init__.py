@@ -1,0 +1,1 @@
+"""Parameter studies: grids and samples of runs, on cores or a cluster, kept in a store."""

@@ -1,0 +1,265 @@
+"""The files of a store: arrays of Zarr v3 in a folder, every file written whole, every chunk with a checksum.
+
+The chunks are written here and not by the ``zarr`` package, whose writer takes two milliseconds for each, and which
+reads a chunk that is missing as one of fill values. What is written is plain Zarr v3 with the codecs "bytes" or
+"vlen-utf8" and "crc32c", and ``zarr`` and ``xarray`` read it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import math
+import os
+import socket
+import struct
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FileError
+
+PART = ".part"
+"""How the name of a file ends that is being written."""
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array of a store.
+
+    Attributes
+    ----------
+    name : str
+    dims : tuple of str
+    shape, chunks : tuple of int
+    dtype : str
+        A type of Zarr: "int8", "int64", "float64", "complex128", "bool" or "string".
+    attributes : dict
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def fill(self) -> Any:
+        """What stands for a value that is missing, as JSON."""
+        return {"float64": "NaN", "complex128": ["NaN", "NaN"], "int8": -1, "string": "", "bool": False}.get(
+            self.dtype, 0
+        )
+
+    @property
+    def numpy(self) -> np.dtype:
+        return np.dtype(object if self.dtype == "string" else self.dtype).newbyteorder("<")
+
+    def metadata(self) -> dict[str, Any]:
+        """As Zarr v3 has it."""
+        plain = {"name": "bytes", "configuration": {"endian": "little"}}
+        return {
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": list(self.shape),
+            "data_type": self.dtype,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": self.fill,
+            "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else plain, {"name": "crc32c"}],
+            "attributes": self.attributes,
+            "dimension_names": list(self.dims),
+            "storage_transformers": [],
+        }
+
+    @classmethod
+    def of(cls, name: str, metadata: dict[str, Any]) -> Array:
+        """From its metadata."""
+        chunks = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        dims, shape = tuple(metadata["dimension_names"]), tuple(metadata["shape"])
+        return cls(name, dims, shape, tuple(chunks), metadata["data_type"], metadata["attributes"])
+
+    def path(self, index: Sequence[int]) -> str:
+        """Of a chunk, within the store."""
+        return "/".join([self.name, "c", *map(str, index)])
+
+    # -- chunks ---------------------------------------------------------------------------------------------------
+
+    def empty(self) -> np.ndarray:
+        """A chunk of fill values."""
+        if self.dtype == "string":
+            return np.full(self.chunks, "", dtype=object)
+        return np.full(self.chunks, {"int8": -1, "bool": False, "int64": 0}.get(self.dtype, np.nan), dtype=self.numpy)
+
+    def encoded(self, block: np.ndarray) -> bytes:
+        """A chunk as it is in its file."""
+        import google_crc32c
+
+        data = _texts(block.ravel()) if self.dtype == "string" else np.asarray(block, dtype=self.numpy).tobytes()
+        return data + struct.pack("<I", google_crc32c.value(data))
+
+    def decoded(self, data: bytes) -> np.ndarray:
+        """A chunk from its file; ValueError where it is damaged."""
+        import google_crc32c
+
+        content = data[:-4]
+        if len(data) < 4 or struct.pack("<I", google_crc32c.value(content)) != data[-4:]:
+            raise ValueError("it does not have its checksum")
+        if self.dtype == "string":
+            values = np.array([*_from_texts(content), None], dtype=object)[:-1]
+        else:
+            values = np.frombuffer(content, dtype=self.numpy).copy()
+        if values.size != math.prod(self.chunks):
+            raise ValueError(f"it has {values.size} values, and should have {math.prod(self.chunks)}")
+        return values.reshape(self.chunks)
+
+
+def _texts(values: np.ndarray) -> bytes:
+    """As the codec "vlen-utf8" has them."""
+    encoded = [str(value).encode() for value in values]
+    return b"".join([struct.pack("<I", len(encoded)), *(struct.pack("<I", len(text)) + text for text in encoded)])
+
+
+def _from_texts(data: bytes) -> Iterator[str]:
+    (count,), place = struct.unpack_from("<I", data), 4
+    for _ in range(count):
+        (length,) = struct.unpack_from("<I", data, place)
+        yield data[place + 4 : place + 4 + length].decode()
+        place += 4 + length
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file; it appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
+    try:
+        try:
+            part.write_bytes(data)
+        except FileNotFoundError:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(data)
+        os.replace(part, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        kept = "What is done is kept; run the study again to go on"
+        raise FileError(f"cannot write {path}: {_why(error)}. {kept}") from error
+
+
+def _why(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk is full ({error.strerror})"
+    return str(error.strerror or error)
+
+
+def read(path: Path) -> bytes:
+    """The content of a file.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {_why(error)}") from error
+
+
+def write_json(path: Path, content: Any) -> None:
+    write(path, json.dumps(content, indent=1, allow_nan=False).encode())
+
+
+def sweep(root: Path) -> None:
+    """Remove what runs that were killed have left half written."""
+    for folder, _, files in os.walk(root):
+        for name in files:
+            if name.endswith(PART) and name.startswith("."):
+                with contextlib.suppress(OSError):
+                    os.unlink(os.path.join(folder, name))
+
+
+# -- one run at a time ------------------------------------------------------------------------------------------------
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def locked(root: Path) -> Iterator[Callable[[int], None]]:
+    """Be the only run that works on a store; the system lets go of it however a run ends.
+
+    Yields a function that tells others how many points were done when the work began.
+
+    Raises
+    ------
+    FileError
+        If another run does.
+    """
+    try:
+        file = open(root / LOCK, "a+")  # noqa: SIM115  (what follows has errors of its own)
+    except OSError as error:
+        raise FileError(f"cannot write into {root}: {_why(error)}") from error
+    with file:
+        try:
+            if not _held(file):
+                raise FileError(f"another run works on {root}: {holder(root)}. Wait for it, or take another store")
+        except OSError as error:
+            if isinstance(error, FileError):
+                raise
+            raise FileError(f"{root} cannot be locked ({_why(error)}): two runs at once could not be told") from error
+
+        def tell(done: int) -> None:
+            now = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": done}
+            with contextlib.suppress(OSError):  # a full disk shows where results are written
+                file.truncate(0)
+                file.write(json.dumps(now))
+                file.flush()
+
+        yield tell
+
+
+def _held(file, tries: int = 5) -> bool:
+    """Whether the lock was free; somebody who looks whether it is holds it for a moment too."""
+    for _ in range(tries):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            time.sleep(0.02)
+    return False
+
+
+def holder(root: Path) -> str:
+    """Who works on a store, in words."""
+    told = running(root) or {}
+    return f"process {told.get('pid', '?')} on {told.get('host', '?')}"
+
+
+def running(root: Path) -> dict[str, Any] | None:
+    """The run that works on a store now, as it has told; None where there is none."""
+    try:
+        with open(root / LOCK) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                with contextlib.suppress(ValueError):
+                    return dict(json.loads(file.read()))
+                return {}
+    except OSError:
+        pass
+    return None

@@ -1,0 +1,217 @@
+"""What is kept of every point of a study."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..engines.codes import Code
+from ..errors import InputError
+from ..results.ensemble import Ensemble
+from ..runs.events import Relaxed
+from .axes import RESERVED
+
+FIELDS = {
+    "final": "state at the end",
+    "final_attitude": "attitude at the end",
+    "final_energy": "energy at the end",
+    "final_entropy": "entropy at the end",
+    "end_time": "time reached",
+    "relaxation_time": "time constant of the relaxation",
+    "energy_drift": "largest relative drift of the energy",
+    "entropy_change": "entropy at the end less that at the start",
+    "least_entropy_increment": "least increment of the entropy in one step",
+    "work": "work done from outside",
+    "steps": "steps taken",
+    "iterations": "iterations of the solver",
+}
+"""Measures that have a name of their own, and what they are."""
+
+
+@dataclass(frozen=True)
+class At:
+    """The measure of values at given times: steps are made to end there.
+
+    Parameters
+    ----------
+    times : array, shape (times,)
+        Increasing, within the span.
+    what : {"x", "energy", "entropy", "attitude"}
+    """
+
+    times: Any
+    what: str = "x"
+
+    def __post_init__(self):
+        times = np.asarray(self.times, dtype=np.float64)
+        if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
+            raise InputError(f"the times of a measure are finite and increase, and are not {self.times!r:.80}")
+        if self.what not in ("x", "energy", "entropy", "attitude"):
+            raise InputError(f"At keeps x, energy, entropy or attitude, not {self.what!r}")
+        object.__setattr__(self, "times", tuple(times.tolist()))
+
+
+class Measure(Protocol):
+    """One measure.
+
+    Attributes
+    ----------
+    path : bool
+        Whether it needs the states along the run.
+    final : bool
+        Whether it needs the last state.
+    """
+
+    @property
+    def path(self) -> bool: ...
+    @property
+    def final(self) -> bool: ...
+
+    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+        """Its values, shape (B, ...), and why it has none of some trajectories."""
+        ...
+
+    def told(self) -> str:
+        """What it is, in words that tell it from another."""
+        ...
+
+
+@dataclass(frozen=True)
+class Named:
+    """A field of an ensemble."""
+
+    name: str
+    path: bool = False
+
+    @property
+    def final(self) -> bool:
+        return self.name in ("final", "final_attitude")
+
+    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+        field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
+        values = getattr(ensemble, field)
+        if values is None:
+            raise InputError(f"this system has no {field}, so that {self.name!r} is no measure of it")
+        return _last(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
+
+    def told(self) -> str:
+        return FIELDS[self.name]
+
+
+def _last(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
+    """The values where each trajectory ended."""
+    if ensemble.energy.ndim == 1:
+        return values
+    last = np.maximum(np.isfinite(ensemble.energy).sum(axis=1) - 1, 0)
+    return values[np.arange(len(values)), last]
+
+
+@dataclass(frozen=True)
+class EventTime:
+    """When the event of the study happened; NaN where it did not."""
+
+    event: str
+    path: bool = False
+    final: bool = False
+
+    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+        return np.where(ensemble.status == Code.EVENT, ensemble.end_time, np.nan), {}
+
+    def told(self) -> str:
+        return f"time of {self.event}"
+
+
+@dataclass(frozen=True)
+class AtTimes:
+    """Values at given times."""
+
+    at: At
+    path: bool = True
+    final: bool = False
+
+    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+        values = getattr(ensemble, self.at.what)
+        if values is None:
+            raise InputError(f"this system has no {self.at.what}")
+        places = [int(np.argmin(np.abs(ensemble.t - t))) for t in self.at.times]
+        return values[:, places], {}
+
+    def told(self) -> str:
+        return f"{self.at.what} at {list(self.at.times)}"
+
+
+@dataclass(frozen=True)
+class OfSolution:
+    """A user's function of a solution, to a number or an array of a fixed shape."""
+
+    function: Callable
+    path: bool = True
+    final: bool = False
+
+    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+        found: list[Any] = []
+        reasons: dict[int, str] = {}
+        for i in range(len(ensemble)):
+            try:
+                value = np.asarray(self.function(ensemble.member(i)))
+                if value.dtype.kind not in "fiubc":
+                    raise TypeError(f"it returned {value.dtype}, not numbers")
+            except Exception as error:  # the function may be anyone's, and this is the status of one point
+                reasons[i], value = f"{self._name} raised {type(error).__name__}: {error}", None
+            found.append(value)
+        good = next((value for value in found if value is not None), np.asarray(np.nan))
+        for i, value in enumerate(found):
+            if value is not None and value.shape != good.shape:
+                reasons[i] = f"{self._name} returned shape {value.shape}, and {good.shape} at other points"
+        kind = np.result_type(np.float64, *(value for value in found if value is not None))
+        hole = np.full(good.shape, np.nan, dtype=kind)
+        return np.array([hole if i in reasons else value for i, value in enumerate(found)], dtype=kind), reasons
+
+    @property
+    def _name(self) -> str:
+        return getattr(self.function, "__qualname__", type(self.function).__name__)
+
+    def told(self) -> str:
+        return f"function {self._name}"
+
+
+def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
+    """The measures that :class:`Study` is given, by name, and the event at which its runs end.
+
+    Raises
+    ------
+    InputError
+        If one is none, or two of them want the runs to end at different events.
+    """
+    if not isinstance(given, Mapping) or not given:
+        raise InputError(
+            f'measure is a dict such as {{"final": "final", "relaxed": lt.Relaxed(1e-8)}}, not {given!r:.60}'
+        )
+    found: dict[str, Measure] = {}
+    for name, measure in given.items():
+        if isinstance(measure, Relaxed):
+            if until is not None and until != measure:
+                raise InputError(f"the measure {name!r} ends each run at {measure}, but {until!r} is to end it too")
+            until = measure
+    for name, measure in given.items():
+        if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")) or name in RESERVED:
+            raise InputError(f"a measure cannot be called {name!r}")
+        if isinstance(measure, Relaxed):
+            found[name] = EventTime(f"entropy production below {measure.tol:g}")
+        elif isinstance(measure, At):
+            found[name] = AtTimes(measure)
+        elif isinstance(measure, str) and measure in FIELDS:
+            found[name] = Named(measure)
+        elif measure == "event_time" and until is not None:
+            found[name] = EventTime("the event")
+        elif callable(measure):
+            found[name] = OfSolution(measure)
+        else:
+            raise InputError(
+                f"the measure {name!r} is lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
+                f"{', '.join(FIELDS)}" + (", event_time" if until is not None else "") + f"; not {measure!r:.60}"
+            )
+    return found, until

@@ -1,0 +1,244 @@
+"""From the points of a study to systems and initial states, all at once where one program builds them."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+from ..functions.conditions import noting, refusal
+from ..runs.family import Family
+from ..systems import System
+
+LOT = 8192
+"""Points that XLA's programs take at once, always as many: results must not depend on where in a batch a point is."""
+
+ASKED = "and no parameter of an axis is called so"
+
+Points = Mapping[str, np.ndarray]
+
+
+class Watched(dict):
+    """A dict that knows which of its entries have been looked at, and says which there are."""
+
+    def __init__(self, entries: Mapping[str, Any]):
+        super().__init__(entries)
+        self.seen: set[str] = set()
+
+    def __getitem__(self, name):
+        self.seen.add(name)
+        return super().__getitem__(name)
+
+    def __missing__(self, name):
+        raise InputError(f"the builder asks for {name!r}, {ASKED}; the axes have {', '.join(self)}")
+
+    def get(self, name, default=None):
+        self.seen.add(name)
+        return super().get(name, default)
+
+    def __iter__(self):  # so that ** does not go round __getitem__
+        return super().__iter__()
+
+    def keys(self):
+        return super().keys()
+
+    def items(self):
+        self.seen.update(self)
+        return super().items()
+
+    def values(self):
+        self.seen.update(self)
+        return super().values()
+
+
+def builder(build: System | Callable[[dict], System], parameters: tuple[str, ...]) -> Callable[[dict], System]:
+    """The function from a point to its system; of a system, one that changes its parameters.
+
+    Raises
+    ------
+    InputError
+        If the system has no parameter of a name, or neither it nor a function was given.
+    """
+    if not isinstance(build, System):
+        if not callable(build):
+            raise InputError(f"a study takes a system, or a function that builds one, not {build!r:.60}")
+        return build
+    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(build, eqx.is_inexact_array))
+    leaves = {jax.tree_util.keystr(path).removeprefix("."): np.shape(leaf) for path, leaf in paths}
+    places = {}
+    for name in parameters:
+        entry = re.fullmatch(r"(.+?)((?:\[\d+\])+)", name)
+        whole, index = (name, ()) if name in leaves or entry is None else (entry[1], _index(entry[2]))
+        if whole not in leaves or len(index) != len(leaves[whole]) or any(map(int.__ge__, index, leaves[whole])):
+            known = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
+            raise InputError(f"the system has no parameter {name!r} that is one number; it has {known}")
+        places[name] = whole, index
+    return functools.partial(_changed, build, places)
+
+
+def _index(text: str) -> tuple[int, ...]:
+    return tuple(map(int, re.findall(r"\d+", text)))
+
+
+def _changed(system: System, places: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]) -> System:
+    """The system with the parameters of a point."""
+    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+    paths, structure = jax.tree_util.tree_flatten_with_path(dynamic)
+    leaves = {jax.tree_util.keystr(path).removeprefix("."): leaf for path, leaf in paths}
+    for name, (whole, index) in places.items():
+        leaves[whole] = jnp.asarray(leaves[whole]).at[index].set(point[name])
+    return eqx.combine(jax.tree_util.tree_unflatten(structure, list(leaves.values())), static)
+
+
+class Members:
+    """The systems of a study.
+
+    Parameters
+    ----------
+    build : function from the dict of a point to a System
+    parameters : tuple of str
+        The entries of the dict.
+    example : dict
+        A point at which the system can be built. What a method looks at in a system it looks at in this one, for all.
+
+    Attributes
+    ----------
+    example : System
+    family : Family or None
+        Of all systems, where one traced program builds them. None where the builder has to see the values: a Python
+        ``if``, an integer, a text. Each point is then built by itself.
+    reason : str
+        Why there is no family.
+    """
+
+    def __init__(self, build: Callable[[dict], System], parameters: tuple[str, ...], example: Mapping[str, Any]):
+        self._build, self._parameters = build, parameters
+        self.example = self.member(example)
+        self.family: Family | None = None
+        self.reason = ""
+        try:
+            given = {name: np.full(2, example[name], dtype=np.float64) for name in parameters}
+            family = Family.of_function(self._of_dict, given) if given else Family.of(self.example, None)
+            if given:
+                self._refusals = _Refusals(self._of_dict, parameters)
+                family = family.traced()
+            self.family = replace(family, example=self.example)
+        except Exception as error:  # whatever a builder does with a tracer; with numbers it will say what is wrong
+            self.reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+
+    def _of_dict(self, point: Mapping[str, Any]) -> System:
+        return self._build(Watched(point))
+
+    def member(self, point: Mapping[str, Any]) -> System:
+        """The system at a point, whose constructors check what they are given."""
+        system = self._of_dict(plain(point))
+        if not isinstance(system, System):
+            raise InputError(f"the builder must return a system, not {type(system).__name__}")
+        return system
+
+    def refused(self, points: Points, size: int) -> dict[int, str]:
+        """The points whose parameters are not admissible, and why; known where there is a family."""
+        return self._refusals(points, size) if self._parameters else {}
+
+    def at(self, points: Points, chosen: np.ndarray) -> Family:
+        """The family of some points."""
+        assert self.family is not None
+        names = sorted(self._parameters)  # as JAX has dicts
+        return self.family.with_values([np.asarray(points[name][chosen], dtype=np.float64) for name in names])
+
+
+def plain(point: Mapping[str, Any]) -> dict[str, Any]:
+    """A point with Python's own numbers and texts."""
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in point.items()}
+
+
+def in_lots(function: Callable, points: Points, size: int) -> list[np.ndarray]:
+    """What a compiled function of points gives, lot by lot: its arrays one after another."""
+    found = []
+    for start in range(0, size, LOT):
+        rows = np.minimum(np.arange(start, start + LOT), size - 1)
+        lot = {name: np.asarray(values, dtype=np.float64)[rows] for name, values in points.items()}
+        found.append([np.asarray(array)[: size - start] for array in jax.tree_util.tree_leaves(function(lot))])
+    return [np.concatenate(parts) for parts in zip(*found, strict=True)]
+
+
+class _Refusals:
+    """The conditions that a builder states about its parameters, at any points."""
+
+    def __init__(self, build: Callable, parameters: tuple[str, ...]):
+        self._messages: list[str] = []
+
+        def conditions(point):
+            with noting() as noted:
+                build(point)
+            self._messages = [condition.message for condition in noted]
+            return [(condition.holds, condition.value) for condition in noted]
+
+        jax.eval_shape(conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
+        self._evaluate = jax.jit(jax.vmap(conditions))
+
+    def __call__(self, points: Points, size: int) -> dict[int, str]:
+        if not self._messages:
+            return {}
+        found: dict[int, str] = {}
+        results = in_lots(self._evaluate, points, size)
+        for k, message in enumerate(self._messages):
+            for i in map(int, np.flatnonzero(~results[2 * k])):
+                found.setdefault(i, refusal(message, results[2 * k + 1][i]))
+        return found
+
+
+class Given:
+    """Initial states, or attitudes, at the points of a study.
+
+    Parameters
+    ----------
+    given : array, or function from the dict of a point to one
+    parameters : tuple of str
+    what : str
+        For messages.
+    """
+
+    def __init__(self, given: Any, parameters: tuple[str, ...], what: str):
+        self.given, self._parameters, self._what = given, parameters, what
+        self._evaluate = None
+        if callable(given):
+            scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters}
+            try:
+                jax.eval_shape(self._at, scalar)
+                self._evaluate = jax.jit(jax.vmap(self._at))
+            except Exception:  # NumPy, random numbers, texts: such a function is called with the numbers of each point
+                pass
+
+    def _at(self, point):
+        return jnp.asarray(self.given(Watched(point)))
+
+    def __call__(self, points: Points, size: int) -> tuple[np.ndarray, dict[int, str]]:
+        """At some points, one row for each; and where there is none that can be used, and why."""
+        if not callable(self.given):
+            return np.broadcast_to(np.asarray(self.given), (size, *np.shape(self.given))), {}
+        if self._evaluate is not None:
+            (rows,) = in_lots(self._evaluate, {name: points[name] for name in self._parameters}, size)
+            return rows, {}
+        found: list[Any] = []
+        reasons: dict[int, str] = {}
+        for i in range(size):
+            try:
+                found.append(np.asarray(self.given(Watched(plain({n: v[i] for n, v in points.items()})))))
+            except Exception as error:  # the function may be anyone's, and this is the status of one point
+                reasons[i] = f"{self._what} raised {type(error).__name__}: {error}"
+                found.append(None)
+        good = next((row for row in found if row is not None), np.zeros(0))
+        for i, row in enumerate(found):
+            if row is not None and row.shape != good.shape:
+                reasons[i] = f"{self._what} has shape {row.shape}, and {good.shape} at other points"
+        filled = [good if i in reasons else row for i, row in enumerate(found)]
+        return np.array(filled, dtype=np.float64), reasons

@@ -1,0 +1,305 @@
+"""The points of a study solved: what is kept of each, whatever happens to it and in whatever company it is."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..engines.codes import Code
+from ..errors import InputError
+from ..integrators import OneStepMethod
+from ..results.audit import Tolerances
+from ..results.ensemble import Ensemble
+from ..results.evidence import laws_functions, sizes
+from ..results.many import laws_of_many
+from ..results.status import Laws
+from ..runs.ensemble import ensemble
+from ..systems import System
+from ..tracing.interpret import at_points
+from ..tracing.remembered import Latest
+from .measures import Measure
+from .members import Given, Members, Points
+
+LAW_BROKEN, MEASURE_FAILED, MISSING = 64, 65, -1
+
+STATUSES = {code.text: int(code) for code in Code if code != Code.INTERRUPTED} | {
+    "law_broken": LAW_BROKEN,
+    "measure_failed": MEASURE_FAILED,
+    "missing": MISSING,
+}
+"""How a point ended, and its number in a store."""
+
+GOOD = (Code.COMPLETED, Code.EVENT)
+
+SUMMARY = (
+    "steps iterations residual first_energy energy_drift largest_energy_increment energy_sensitivity energy_terms "
+    "least_entropy_increment entropy_change entropy_scale entropy_sensitivity entropy_terms"
+).split()
+"""What is kept of every point about its laws: enough to judge them again with other tolerances."""
+
+BATCH, BATCH_NUMBERS = 1024, 2**15
+"""Trajectories that the array engine takes at once, always as many; fewer where their states are large."""
+
+PATH_BYTES = 2**27
+"""Of the trajectories that are held at once."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is done at every point; it is sent to the workers.
+
+    Attributes
+    ----------
+    build : function from the dict of a point to a System
+    parameters : tuple of str
+    x0, attitude : array or function from the dict of a point; None where the points bring states, or there is no group
+    t_span, step, method, until, engine
+        As for :func:`liethermo.ensemble`.
+    measures : dict of Measure
+    example : dict
+        The point whose system is looked at for all.
+    saves : int
+        States along a run that are held at once.
+    """
+
+    build: Callable[[dict], System]
+    parameters: tuple[str, ...]
+    x0: Any
+    attitude: Any
+    t_span: tuple[float, float]
+    step: Any
+    method: OneStepMethod
+    until: Any
+    engine: str
+    measures: Mapping[str, Measure]
+    example: Mapping[str, Any]
+    save_at: tuple[float, ...] | None
+    saves: int
+
+
+@dataclass
+class Columns:
+    """What is kept of some points.
+
+    Attributes
+    ----------
+    status : ndarray of int8, shape (B,)
+    message : ndarray of str, shape (B,)
+    laws : ndarray, shape (B, len(SUMMARY))
+    measures : dict of ndarray, shape (B, ...)
+    """
+
+    status: np.ndarray
+    message: np.ndarray
+    laws: np.ndarray
+    measures: dict[str, np.ndarray]
+
+    def arrays(self) -> dict[str, Any]:
+        return {"status": self.status, "message": self.message, "laws": self.laws, **self.measures}
+
+
+class Summary:
+    """The laws of some points as :func:`.many.laws_of_many` takes them, from what a store has of them."""
+
+    def __init__(self, status: np.ndarray, laws: np.ndarray):
+        self.ok = np.isin(status, (*GOOD, LAW_BROKEN, MEASURE_FAILED))
+        self._columns = dict(zip(SUMMARY, np.moveaxis(laws, -1, 0), strict=True))
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        try:
+            return self.__dict__["_columns"][name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+
+class Solver:
+    """A task with what has been found for it once: the family of its systems, and the engine that they run on."""
+
+    def __init__(self, task: Task):
+        self.task = task
+        self.members = Members(task.build, task.parameters, task.example)
+        self._x0 = None if task.x0 is None else Given(task.x0, task.parameters, "x0")
+        self._attitude = None if task.attitude is None else Given(task.attitude, task.parameters, "attitude")
+        path = any(measure.path for measure in task.measures.values())
+        final = any(measure.final for measure in task.measures.values())
+        self._outputs: Any = "trajectory" if path else "final" if final else "summary"
+        self.laws: Laws | None = None
+        self.engine: Any = task.engine
+
+    def columns(self, points: Points, states: np.ndarray | None, size: int) -> Columns:
+        """What is kept of some points, with their initial states where they bring some."""
+        reasons: dict[int, str] = {} if self.members.family is None else self.members.refused(points, size)
+        x0s, attitudes = states, None
+        if self._x0 is not None:
+            x0s, found = self._x0(points, size)
+            reasons = found | reasons
+        if self._attitude is not None:
+            attitudes, found = self._attitude(points, size)
+            reasons = found | reasons
+        assert x0s is not None
+        for i in map(int, np.flatnonzero(~np.isfinite(x0s.reshape(size, -1)).all(axis=1))):
+            reasons.setdefault(i, f"the initial state is not finite: {x0s[i].tolist()}")
+        chosen = np.setdiff1d(np.arange(size), list(reasons))
+        parts = self._solved(points, x0s, attitudes, chosen, reasons)
+        return self._collected(parts, reasons, size)
+
+    # -- ensembles ------------------------------------------------------------------------------------------------
+
+    def _solved(self, points, x0s, attitudes, chosen: np.ndarray, reasons: dict[int, str]) -> list:
+        """Ensembles of the points, with their places; those that cannot be started get a reason."""
+        parts = []
+        for start in range(0, len(chosen), most := self._together()):
+            parts += self._halved(points, x0s, attitudes, chosen[start : start + most], reasons)
+        return parts
+
+    def _together(self) -> int:
+        """Points solved at once: one without a family; for XLA always as many."""
+        if self.members.family is None:
+            return 1
+        dim = self.members.example.dim
+        bytes_each = 8 * self.task.saves * (dim + 2)
+        held = max(2, PATH_BYTES // bytes_each) if bytes_each else 2**30
+        return max(1, min(BATCH, BATCH_NUMBERS // dim, held)) if self.engine == "array" else held
+
+    def _halved(self, points, x0s, attitudes, chosen: np.ndarray, reasons: dict[int, str]) -> list:
+        """As :meth:`_solved`; where together they cannot be started, each half by itself."""
+        if not len(chosen):
+            return []
+        try:
+            part = self._ensemble(points, x0s, attitudes, chosen)
+        except Exception as error:  # of one point, it is its status
+            if len(chosen) == 1:
+                reasons[int(chosen[0])] = told(error)
+                return []
+        else:
+            refused = part[-1].reasons  # of those, as of others, nothing may depend on who else is there
+            if not refused:
+                return [(chosen, part)]
+            reasons |= {int(chosen[i]): reason for i, reason in refused.items() if i < len(chosen)}
+            return self._halved(points, x0s, attitudes, np.setdiff1d(chosen, list(reasons)), reasons)
+        middle = len(chosen) // 2
+        halves = chosen[:middle], chosen[middle:]
+        return [part for half in halves for part in self._halved(points, x0s, attitudes, half, reasons)]
+
+    def _ensemble(self, points, x0s, attitudes, chosen: np.ndarray) -> tuple[Any, np.ndarray, Ensemble]:
+        """Of some points; filled up with the last, as what is compiled must not depend on how many there are."""
+        task = self.task
+        if self.members.family is None:
+            rows = chosen
+            family: Any = self.members.member({name: values[rows[0]] for name, values in points.items()})
+        else:
+            number = self._together() if self.engine == "array" else max(2, len(chosen))
+            rows = chosen[np.minimum(np.arange(number), len(chosen) - 1)]
+            family = self.members.at(points, rows)
+        attitude = None if attitudes is None else attitudes[rows]
+        options: dict[str, Any] = {"until": task.until, "save_at": task.save_at, "attitude": attitude}
+        found = ensemble(
+            family, x0s[rows], task.t_span, task.step, task.method, progress=False,
+            outputs=self._outputs, engine=self.engine, **{k: v for k, v in options.items() if v is not None},
+        )  # fmt: skip
+        if (found.status == Code.INTERRUPTED).any():
+            raise KeyboardInterrupt
+        return family, x0s[rows], found
+
+    # -- what is kept -----------------------------------------------------------------------------------------------
+
+    def _collected(self, parts: list, reasons: dict[int, str], size: int) -> Columns:
+        status = np.full(size, Code.INADMISSIBLE, dtype=np.int8)
+        message = np.full(size, "", dtype=object)
+        message[list(reasons)] = list(reasons.values())
+        laws = np.full((size, len(SUMMARY)), np.nan)
+        measures: dict[str, np.ndarray] = {}
+        for chosen, (family, x0s, found) in parts:
+            number = len(chosen)
+            self.laws, self.engine = found.laws, found.engine
+            summary, codes, texts = self._judged(family, x0s, found)
+            for name, measure in self.task.measures.items():
+                values, failed = measure(found)
+                values = np.where(_like(np.isin(codes, (*GOOD, LAW_BROKEN)), values), values, np.nan)
+                for i, reason in failed.items():
+                    if codes[i] in GOOD:
+                        codes[i], texts[i] = MEASURE_FAILED, f"{name}: {reason}"
+                if name not in measures:
+                    measures[name] = np.full((size, *values.shape[1:]), np.nan, dtype=values.dtype)
+                if measures[name].shape[1:] != values.shape[1:]:
+                    raise InputError(
+                        f"the measure {name} has shape {values.shape[1:]} at some points and others elsewhere"
+                    )
+                measures[name][chosen] = values[:number]
+            status[chosen], laws[chosen] = codes[:number], summary[:number]
+            for i, text in texts.items():
+                if i < number:
+                    message[chosen[i]] = text
+        return Columns(status, message, laws, measures)
+
+    def _judged(self, family: Any, x0s: np.ndarray, found: Ensemble) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
+        """The summary of each trajectory, its status, and its message."""
+        names = [name for name in SUMMARY if not name.endswith("_terms")]
+        columns = {name: np.asarray(getattr(found, name), dtype=np.float64) for name in names}
+        columns |= {"energy_terms": np.zeros(len(found)), "entropy_terms": np.zeros(len(found))}
+        codes = found.status.astype(np.int8)
+        texts = {int(i): found.message(int(i)).partition(": ")[2] for i in np.flatnonzero(~found.ok)}
+        suspects = self._broken(found, columns)
+        if len(suspects):  # what cancels in a function allows it to change by more: looked at where it matters
+            for name, terms in self._terms(family, x0s, suspects).items():
+                columns[f"{name}_terms"][list(suspects)] = terms
+            for i, text in self._broken(found, columns).items():
+                codes[i], texts[i] = LAW_BROKEN, text
+        return np.stack([columns[name] for name in SUMMARY], axis=-1), codes, texts
+
+    def _broken(self, found: Ensemble, columns: Mapping[str, np.ndarray]) -> dict[int, str]:
+        """The trajectories that came to their end and broke a law, and by how much."""
+        terms = columns["energy_terms"], columns["entropy_terms"]
+        broken: dict[int, str] = {}
+        for law in laws_of_many(found, found.laws, Tolerances(), *terms):
+            for i in map(int, np.flatnonzero(law.broken & found.ok)):
+                broken.setdefault(i, f"{law.law} {law.values[i]:.3g}, allowed {law.allowed[i]:.2g}")
+        return broken
+
+    def _terms(self, family: Any, x0s: np.ndarray, suspects: Mapping[int, str]) -> dict[str, np.ndarray]:
+        """The sizes at which energy and entropy are rounded at the start of some trajectories."""
+        chosen = np.array(list(suspects))
+        x = np.asarray(self.members.example.state(x0s[chosen], batch=True))
+        if self.members.example.energy.depends_on_time:
+            return {}
+        if isinstance(family, System):
+            largest = at_points(_terms_of, family, x)
+        else:
+            p = family.flat(slice(None), len(x0s))[chosen]
+            largest = at_points(_terms_of_form, (family.form, p.shape[1]), np.concatenate([p, x], axis=1))
+        return {name: np.nan_to_num(largest[:, k]) for k, name in enumerate(("energy", "entropy")[: largest.shape[1]])}
+
+
+def _like(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return rows.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _terms_of(system: System, x):
+    return sizes(laws_functions(system), x)[1]
+
+
+def _terms_of_form(model, at):
+    form, p = model
+    return sizes(laws_functions(form.build(at[:p])), at[p:])[1]
+
+
+def told(error: Exception) -> str:
+    """What was raised: the library's own messages as they are, others with their kind."""
+    own = type(error).__module__.partition(".")[0] in ("liethermo", "manifolds")
+    return str(error) if own else f"{type(error).__name__}: {error}"
+
+
+# -- on workers -------------------------------------------------------------------------------------------------------
+
+_solvers: Latest[Solver] = Latest(4)
+
+
+def solver_of(packed: bytes) -> Solver:
+    """The solver of a task as it was sent, made once in a process."""
+    import cloudpickle
+
+    return _solvers.find(hashlib.sha256(packed).digest(), lambda: Solver(cloudpickle.loads(packed)))

@@ -1,0 +1,394 @@
+"""The store of a study: a group of Zarr v3 that can be read at any time.
+
+Of each chunk of points there is a file in each array. That of ``status`` is written last and is the mark that the
+chunk is done.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FileError, InputError
+from . import files
+from .axes import Axes, Axis
+from .files import Array
+from .solve import GOOD, MISSING, STATUSES, SUMMARY
+
+FORMAT = "liethermo-study-1"
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a store has.
+
+    Attributes
+    ----------
+    todo : list of (int, bool)
+        The chunks that are not done, and whether a part of them is.
+    done : int
+        Points.
+    damaged : tuple of str
+        Files that are missing or damaged, and so done again.
+    """
+
+    todo: list[tuple[int, bool]]
+    done: int
+    damaged: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Store:
+    """A store.
+
+    Attributes
+    ----------
+    root : Path
+    arrays : dict of Array
+    attributes : dict
+        Of the group; ``attributes["study"]`` describes the study.
+    """
+
+    root: Path
+    arrays: Mapping[str, Array]
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    # -- making and opening ---------------------------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls,
+        root: Path,
+        axes: Axes,
+        chunk: int,
+        measures: Mapping[str, tuple],
+        about: Mapping[str, Mapping[str, Any]],
+        attributes: dict[str, Any],
+    ) -> Store:
+        """Make a store; it appears whole or not at all.
+
+        Parameters
+        ----------
+        axes : Axes
+        chunk : int
+            Points of a chunk, about.
+        measures : dict from str to (shape, dtype)
+            Of what is kept of a point.
+        about : dict from str to dict
+            Attributes of the arrays.
+        attributes : dict
+            Of the group.
+        """
+        chunks = _block(axes.shape, chunk)
+
+        def array(name: str, more: Sequence[tuple[str, int]], dtype: str) -> Array:
+            dims, sizes = (tuple(part) for part in zip(*more, strict=True)) if more else ((), ())
+            shape = axes.shape + sizes
+            return Array(name, axes.names + dims, shape, chunks + sizes, dtype, dict(about.get(name, {})))
+
+        arrays = [array("status", [], "int8"), array("message", [], "string")]
+        arrays.append(array("laws", [("quantity", len(SUMMARY))], "float64"))
+        for name, (shape, dtype) in measures.items():
+            arrays.append(array(name, [(_dim(name, k, shape), m) for k, m in enumerate(shape)], dtype))
+        arrays.append(Array("quantity", ("quantity",), (len(SUMMARY),), (len(SUMMARY),), "string"))
+        coordinates = [array for array, _ in _coordinates(axes, about)]
+        store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
+        part = root.with_name(f".{root.name}.{uuid.uuid4().hex}{files.PART}")
+        try:
+            part.mkdir(parents=True)
+            made = replace(store, root=part)
+            made._write_chunk("quantity", (0,), np.array(SUMMARY, dtype=object))
+            made._describe(axes)
+            os.rename(part, root)
+        except OSError as error:
+            shutil.rmtree(part, ignore_errors=True)
+            if isinstance(error, FileError):
+                raise
+            raise FileError(f"cannot make the store {root}: {error.strerror}") from error
+        return store
+
+    @classmethod
+    def open(cls, root: Path) -> Store:
+        """Open a store.
+
+        Raises
+        ------
+        FileError
+            If there is none, or the folder is another thing.
+        """
+        if not root.exists():
+            raise FileError(f"there is no store {root}")
+        try:
+            content = json.loads((root / "zarr.json").read_bytes())
+            assert content["attributes"]["format"] == FORMAT
+            listed = content["consolidated_metadata"]["metadata"]
+            arrays = {name: Array.of(name, metadata) for name, metadata in listed.items()}
+        except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
+            what = "folder" if root.is_dir() else "file"
+            raise FileError(f"{root} is a {what}, but not the store of a study; take another name") from error
+        return cls(root, arrays, content["attributes"])
+
+    @property
+    def study(self) -> dict[str, Any]:
+        """What describes the study."""
+        return self.attributes["study"]
+
+    @property
+    def measures(self) -> list[str]:
+        return list(self.attributes["measures"])
+
+    def extended(self, axes: Axes) -> Store:
+        """The store with longer axes, whose values begin with those that it has."""
+        shape = axes.shape
+        arrays = {
+            name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked else array
+            for name, array in self.arrays.items()
+        }
+        about = {name: array.attributes for name, array in arrays.items()}
+        for array, _ in _coordinates(axes, about):
+            arrays[array.name] = replace(array, chunks=self.arrays[array.name].chunks)
+        store = replace(self, arrays=arrays)
+        store._describe(axes)
+        return store
+
+    def _describe(self, axes: Axes) -> None:
+        """Write the coordinates, then the metadata; those of the group last, which readers look at first."""
+        for array, values in _coordinates(axes, {}):
+            whole = self.arrays[array.name]
+            for index in np.ndindex(*_grid(whole)):
+                part = values[tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, whole.chunks, strict=True))]
+                block = whole.empty()
+                block[tuple(map(slice, part.shape))] = part
+                self._write_chunk(array.name, index, block)
+        metadata = {name: array.metadata() for name, array in self.arrays.items()}
+        for name, content in metadata.items():
+            files.write_json(self.root / name / "zarr.json", content)
+        every = {"kind": "inline", "must_understand": False, "metadata": metadata}
+        group = {"zarr_format": 3, "node_type": "group", "attributes": self.attributes, "consolidated_metadata": every}
+        files.write_json(self.root / "zarr.json", group)
+
+    def axes(self) -> Axes:
+        """The axes, with the values that they have."""
+        found = []
+        for name, columns in self.attributes["axes"].items():
+            states = f"{name}_state"
+            given = {column: self._whole(column) for column in columns}
+            found.append(Axis(name, self._whole(name), given, self._whole(states) if states in self.arrays else None))
+        return Axes(tuple(found))
+
+    def _whole(self, name: str) -> np.ndarray:
+        array = self.arrays[name]
+        values = np.empty(array.shape, dtype=array.numpy)
+        for index in np.ndindex(*_grid(array)):
+            here = tuple(
+                slice(i * c, min((i + 1) * c, m)) for i, c, m in zip(index, array.chunks, array.shape, strict=True)
+            )
+            block = self._chunk(name, index)
+            values[here] = block[tuple(slice(0, s.stop - s.start) for s in here)]
+        return values.astype(str) if array.dtype == "string" else values
+
+    # -- chunks of points -------------------------------------------------------------------------------------------
+
+    @property
+    def chunked(self) -> list[str]:
+        """The arrays with a chunk of each chunk of points, the mark last."""
+        return [*self.measures, "laws", "message", "status"]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.arrays["status"].shape
+
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """How many chunks there are along each axis."""
+        return _grid(self.arrays["status"])
+
+    @property
+    def points(self) -> int:
+        return math.prod(self.shape)
+
+    def index(self, number: int) -> tuple[int, ...]:
+        return tuple(map(int, np.unravel_index(number, self.grid)))
+
+    def block(self, index: Sequence[int]) -> tuple[tuple[int, int], ...]:
+        """Where a chunk begins and ends along each axis."""
+        status = self.arrays["status"]
+        return tuple((i * c, min((i + 1) * c, m)) for i, c, m in zip(index, status.chunks, status.shape, strict=True))
+
+    def places(self, index: Sequence[int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+        """The places of the points of a chunk along the axes; of those wanted, where that is given."""
+        block = self.block(index)
+        inside = np.indices([stop - start for start, stop in block]).reshape(len(block), -1)
+        if wanted is not None:
+            inside = inside[:, wanted[tuple(slice(0, stop - start) for start, stop in block)].ravel()]
+        return tuple(place + start for place, (start, _) in zip(inside, block, strict=True))
+
+    def put(self, index: Sequence[int], places: tuple[np.ndarray, ...], arrays: Mapping[str, Any], keep: bool) -> None:
+        """Write a chunk: values at some of its points, the others as they were where they are to be kept."""
+        inside = tuple(place - start for place, (start, _) in zip(places, self.block(index), strict=True))
+        for name in self.chunked:
+            block = self._chunk(name, index) if keep and self._has(name, index) else self.arrays[name].empty()
+            if name in arrays:  # a measure has no values where no point could be run
+                block[inside] = arrays[name]
+            if name != "message" or (block != "").any():
+                self._write_chunk(name, index, block)
+            elif self._has(name, index):  # a chunk without messages has no file of them
+                (self.root / self.arrays[name].path(index)).unlink()
+
+    def chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
+        """The values of an array at the points of a chunk, fill values where there are none."""
+        block = self._chunk(name, index) if self._has(name, index) else self.arrays[name].empty()
+        inside = tuple(slice(0, stop - start) for start, stop in self.block(index))
+        return block[inside]
+
+    def _has(self, name: str, index: Sequence[int]) -> bool:
+        return (self.root / self.arrays[name].path(self._index_of(name, index))).exists()
+
+    def _index_of(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
+        """The index of the chunk of an array that has more dimensions than the axes."""
+        return (*index, *(0 for _ in range(len(self.arrays[name].dims) - len(index))))
+
+    def _chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
+        path = self.root / self.arrays[name].path(self._index_of(name, index))
+        try:
+            return self.arrays[name].decoded(files.read(path))
+        except ValueError as error:
+            raise FileError(
+                f"{path} is damaged: {error}. Run the study again: what is damaged is done again"
+            ) from error
+
+    def _write_chunk(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
+        files.write(self.root / self.arrays[name].path(self._index_of(name, index)), self.arrays[name].encoded(block))
+
+    # -- what there is ------------------------------------------------------------------------------------------------
+
+    def marks(self) -> Iterator[tuple[int, np.ndarray | None]]:
+        """Of each chunk its number and the status of its points; None where it has no mark, or a damaged one."""
+        for number in range(math.prod(self.grid)):
+            index = self.index(number)
+            try:
+                yield number, self.chunk("status", index) if self._has("status", index) else None
+            except FileError:
+                yield number, None
+
+    def survey(self) -> Survey:
+        """Look at every file: what is done, what is not, what is damaged."""
+        todo: list[tuple[int, bool]] = []
+        damaged: list[str] = []
+        done = 0
+        for number, status in self.marks():
+            index = self.index(number)
+            faults = [] if status is None else self._faults(index, status)
+            if status is None and self._has("status", index):
+                faults = [f"{self.arrays['status'].path(index)} is damaged"]
+            damaged += faults
+            if status is None or faults:
+                todo.append((number, False))
+                continue
+            missing = int((status == MISSING).sum())
+            done += status.size - missing
+            if missing:
+                todo.append((number, True))
+        return Survey(todo, done, tuple(damaged))
+
+    def _faults(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
+        """The files of a chunk that should be there and are not, or are damaged."""
+        silent = np.isin(status, (*GOOD, MISSING)).all()
+        found = []
+        for name in self.chunked[:-1]:
+            path = self.arrays[name].path(self._index_of(name, index))
+            if not (self.root / path).exists():
+                found += [] if name == "message" and silent else [f"{path} is missing"]
+                continue
+            try:
+                self._chunk(name, index)
+            except FileError:
+                found.append(f"{path} is damaged")
+        return found
+
+    def counts(self) -> dict[str, int]:
+        """How many points ended how; those that are not done are "missing"."""
+        names = {number: name for name, number in STATUSES.items()}
+        found: dict[str, int] = {}
+        for number, status in self.marks():
+            if status is None:
+                size = math.prod(stop - start for start, stop in self.block(self.index(number)))
+                found["missing"] = found.get("missing", 0) + size
+                continue
+            for code, count in zip(*np.unique(status, return_counts=True), strict=True):
+                found[names[int(code)]] = found.get(names[int(code)], 0) + int(count)
+        return found
+
+
+def _dim(name: str, k: int, shape: tuple[int, ...]) -> str:
+    """The name of a dimension of a measure that is no axis."""
+    return f"{name}_component" if len(shape) == 1 else f"{name}_component_{k}"
+
+
+def _block(shape: tuple[int, ...], points: int) -> tuple[int, ...]:
+    """The shape of a chunk of about so many points, whole along the last axes."""
+    found: list[int] = []
+    for length in reversed(shape):
+        found.append(max(1, min(length, points)))
+        points //= found[-1]
+    return tuple(reversed(found))
+
+
+def _grid(array: Array) -> tuple[int, ...]:
+    return tuple(-(-m // c) for m, c in zip(array.shape, array.chunks, strict=True))
+
+
+def _coordinates(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Array, np.ndarray]]:
+    """The coordinates of axes, with their values."""
+    for axis in axes.axes:
+        named = {axis.name: axis.labels, **axis.columns}
+        if axis.states is not None:
+            named[f"{axis.name}_state"] = axis.states
+        for name, values in named.items():
+            dims = (axis.name, "component")[: values.ndim]
+            dtype = {"U": "string", "b": "bool", "i": "int64", "u": "int64"}.get(values.dtype.kind, "float64")
+            chunks = (max(64, 1 << (len(values) - 1).bit_length()), *values.shape[1:])
+            yield Array(name, dims, values.shape, chunks, dtype, dict(about.get(name, {}))), values
+
+
+def matched(mine: Axes, theirs: Axes) -> Axes:
+    """My axes with their values in the order of a store: first those that it has, then the new ones.
+
+    Raises
+    ------
+    InputError
+        If the axes are others, or mine lack values that the store has.
+    """
+    if mine.names != theirs.names or [tuple(a.columns) for a in mine.axes] != [tuple(a.columns) for a in theirs.axes]:
+        told = [", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (mine, theirs)]
+        raise InputError(f"the axes are {told[0]}, and those of the store {told[1]}")
+    found = []
+    for axis, other in zip(mine.axes, theirs.axes, strict=True):
+        free: dict[Any, list[int]] = {}
+        for i, row in enumerate(axis.rows()):
+            free.setdefault(row, []).append(i)
+        for i, row in enumerate(other.rows()):
+            if not free.get(row):
+                raise InputError(
+                    f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "
+                    "store; an axis can be made longer, and keeps the values that it has"
+                )
+            free[row].pop(0)
+        new = sorted(itertools.chain.from_iterable(free.values()))
+        columns = {name: np.append(kept, axis.columns[name][new]) for name, kept in other.columns.items()}
+        labels = columns.get(axis.name, np.arange(len(other) + len(new)))
+        states = None
+        if axis.states is not None and other.states is not None:
+            states = np.concatenate([other.states, axis.states[new]])
+        found.append(Axis(axis.name, labels, columns, states))
+    return Axes(tuple(found))

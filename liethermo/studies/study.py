@@ -1,0 +1,464 @@
+"""``Study``: what a user describes, and what comes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from manifolds.errors import warn
+
+from ..engines.codes import Code
+from ..errors import FileError, InputError
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..results.audit import Audit, AuditRow, Tolerances
+from ..results.many import laws_of_many
+from ..results.status import Laws
+from ..runs.adaptive import Adaptive
+from ..runs.preparation import check_choice
+from ..runs.timetable import Timetable
+from ..systems import System
+from . import files, identity
+from .axes import Axes
+from .measures import AtTimes, measures_of
+from .members import ASKED, Watched, builder, plain
+from .progress import Bar, StudyStatus, seconds_left
+from .running import here, spread
+from .solve import GOOD, LAW_BROKEN, MEASURE_FAILED, MISSING, STATUSES, Columns, Solver, Summary, Task, told
+from .store import FORMAT, Store, Survey, matched
+
+if TYPE_CHECKING:
+    import xarray
+
+WORK = 20_000_000
+"""Steps of all points of a chunk, about: some seconds."""
+
+CHUNK = 16_384
+"""Points of a chunk at most, unless asked for."""
+
+ALONE = 64
+"""Points of a chunk at most where each is built by itself."""
+
+TRIED = 12
+"""Points that are tried until one can be run, spread over all."""
+
+HOPELESS = 2
+"""Systems that are built and cannot be run, after which no more are tried."""
+
+SLOW = 1_000
+"""Points from which one is told that each has to be built by itself."""
+
+
+class Study:
+    """Runs over grids and samples of parameters, in chunks that are kept as they are done.
+
+    A point that cannot be run, that fails or that breaks a law has a status and a message of its own and stops nothing.
+    The results of a point do not depend on how the study was cut into chunks, nor on who did them.
+
+    Parameters
+    ----------
+    build : System, or function from a dict with one entry for each parameter to a System
+        Of a system the axes are its parameters, such as ``"dissipation.rate"``. One program builds the systems of all
+        points where the function accepts traced JAX arrays; otherwise each point is built by itself, which takes some
+        30 ms.
+    axes : dict from str to values
+        Lists of numbers or texts, or :func:`zipped`, :func:`latin_hypercube`, :func:`sobol`, :func:`replicas`.
+    x0 : array, shape (n,), or function from the dict of a point to one
+        Initial states; left out where replicas bring some.
+    t_span, step, method, until, engine
+        As for :func:`integrate` and :func:`ensemble`.
+    measure : dict from str to measure
+        What is kept of each point: a name ("final", "relaxation_time", "end_time", …), ``lt.Relaxed(tol)`` for the time
+        at which the entropy production falls below it, where the run ends too, ``lt.At(times)``, or any function of a
+        :class:`Solution` to a number or an array.
+    store : path, optional
+        Folder of the results. Without one they are kept until this object is gone.
+    attitude : array, shape (m, m), or function from the dict of a point to one, optional
+        As for :func:`integrate`.
+    chunk : int, optional
+        Points of a chunk, about: what is in memory at once, and what is lost at most where a run is killed.
+    units, names : dict from str to str, optional
+        Of axes, parameters and measures, for tables and pictures: ``units={"rate": "1/s"}``.
+    spec : dict, optional
+        JSON data that is kept beside the results.
+
+    Raises
+    ------
+    InputError
+        If an argument cannot be used.
+    """
+
+    def __init__(
+        self,
+        build: System | Callable[[dict], System],
+        axes: Mapping[str, Any],
+        *,
+        x0: Any = None,
+        t_span: tuple[float, float],
+        step: float | Adaptive,
+        method: OneStepMethod | None = None,
+        measure: Mapping[str, Any],
+        store: Any = None,
+        until: Any = None,
+        engine: Literal["auto", "array", "compiled"] = "auto",
+        attitude: Any = None,
+        chunk: int | None = None,
+        units: Mapping[str, str] | None = None,
+        names: Mapping[str, str] | None = None,
+        spec: Mapping[str, Any] | None = None,
+    ):
+        self._axes = Axes.of(axes)
+        self._measures, until = measures_of(measure, until)
+        taken = {*self._axes.names, *self._axes.parameters}
+        if both := taken & {*self._measures}:
+            raise InputError(f"{both.pop()!r} is a measure and an axis")
+        method = DEFAULT_METHOD if method is None else method
+        if not isinstance(method, OneStepMethod):
+            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
+        check_choice("engine", engine, ("auto", "array", "compiled"))
+        if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
+            raise InputError(f"chunk must be a positive integer, not {chunk!r}")
+        sources = [*(["x0"] if x0 is not None else []), *(a.name for a in self._axes.axes if a.states is not None)]
+        if not sources:
+            raise InputError("x0 is missing: a state, or a function from the dict of a point to one")
+        if len(sources) > 1:
+            raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
+        times = sorted({t for m in self._measures.values() if isinstance(m, AtTimes) for t in m.at.times})
+        path = any(measure.path for measure in self._measures.values())
+        start, end = (float(t) for t in t_span)
+        table = Timetable((start, end), end - start if isinstance(step, Adaptive) else step, 1)
+        if times and not (table.start <= times[0] and times[-1] <= table.end):
+            raise InputError(
+                f"the times of measures lie within t_span = {(start, end)}, and {times[0]:g} to {times[-1]:g} do not"
+            )
+        every = any(m.path and not isinstance(m, AtTimes) for m in self._measures.values())
+        save_at = tuple(times) if times and not every else None
+        saves = (len(times) if save_at else table.steps + 1) if path else 0
+        self._chunk, self._steps, self._saves = chunk, table.steps, saves
+        self._about = {
+            name: {k: v for k, v in (("units", (units or {}).get(name)), ("long_name", (names or {}).get(name))) if v}
+            for name in (*taken, *self._measures)
+        }
+        for name, what in self._measures.items():
+            self._about[name].setdefault("long_name", what.told())
+        unknown = [name for name in (*(units or {}), *(names or {})) if name not in self._about]
+        if unknown:
+            raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
+        self._spec = None if spec is None else dict(spec)
+        if store is None:
+            folder = tempfile.mkdtemp(prefix="liethermo-study-")
+            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+            store = Path(folder) / "study.zarr"
+        self.store = Path(store)
+        parameters = self._axes.parameters
+        self._task = Task(
+            builder(build, parameters), parameters, x0, attitude, (start, end), step, method, until, engine,
+            self._measures, {}, save_at, saves,
+        )  # fmt: skip
+        self._solved: tuple[Solver, Columns, np.ndarray] | None = None
+
+    # -- running --------------------------------------------------------------------------------------------------
+
+    def run(self, client: Any = None, *, progress: bool | None = None) -> StudyStatus:
+        """Do what is not done, and keep it: nothing is done twice.
+
+        Parameters
+        ----------
+        client : dask.distributed.Client, optional
+            A cluster whose machines share the folder of the store. By default this machine, with all its cores.
+        progress : bool, optional
+            Show a bar with the time left; by default on a terminal and in a notebook.
+
+        Returns
+        -------
+        StudyStatus
+            After Ctrl-C too: running again goes on from there.
+
+        Raises
+        ------
+        InputError
+            If no point can be run, or the store is that of another study.
+        FileError
+            If the store cannot be read or written, or another run works on it.
+        """
+        store, axes = self._opened()
+        interrupted = False
+        with files.locked(store.root) as tell:
+            store, axes = self._opened()  # as another run may have left it
+            files.sweep(store.root)
+            if store.shape != axes.shape:
+                store = store.extended(axes)
+            survey = store.survey()
+            tell(survey.done)
+            try:
+                with Bar(store.points, survey.done, progress) as bar:
+                    self._work(store, axes, survey, bar, client)
+            except KeyboardInterrupt:
+                interrupted = True
+        return dataclasses.replace(_status_of(store), damaged=survey.damaged, interrupted=interrupted)
+
+    def _work(self, store: Store, axes: Axes, survey: Survey, bar: Bar, client: Any) -> None:
+        if not survey.todo:
+            return
+        solver = self._prepared(store.study["example"])[0]
+        if client is None:
+            here(solver, store, axes, survey, bar)
+        else:
+            spread(solver.task, store, axes, survey, bar, client)
+
+    def status(self) -> StudyStatus:
+        """How far the study is, from its store: any process may ask, also while another runs it.
+
+        Raises
+        ------
+        FileError
+            If there is no store.
+        """
+        return status(self.store)
+
+    # -- results ----------------------------------------------------------------------------------------------------
+
+    @property
+    def results(self) -> xarray.Dataset:
+        """The results so far: the axes are coordinates, ``status`` and ``message`` say how each point ended.
+
+        Values are read from the files when they are looked at.
+
+        Raises
+        ------
+        FileError
+            If there is no store.
+        """
+        found = load_study(self.store)
+        store = Store.open(self.store)
+        mine, theirs = self._axes, store.axes()
+        order = {}
+        for axis, kept in zip(mine.axes, theirs.axes, strict=True):
+            if axis.name in axis.columns and len(axis) == len(kept):  # in the order of this study, not of the store
+                place = {row: i for i, row in enumerate(kept.rows())}
+                order[axis.name] = [place[row] for row in axis.rows()]
+        return found.isel(order) if order else found
+
+    def audit(self, **tolerances: float) -> Audit:
+        """The laws over all points that are done, each by the one that kept it worst; printing it gives a table.
+
+        Parameters
+        ----------
+        energy, entropy, casimirs, residual : float
+            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
+
+        Raises
+        ------
+        FileError
+            If there is no store.
+        InputError
+            If there is no tolerance of a name, or it is negative.
+        """
+        return audit(self.store, **tolerances)
+
+    # -- what it is -------------------------------------------------------------------------------------------------
+
+    def _opened(self) -> tuple[Store, Axes]:
+        """The store, made where there is none, and the axes in its order; refused where it is of another study."""
+        if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
+            solver, columns, x0 = self._prepared()
+            described = identity.description(solver, columns, x0)
+            about: dict[str, dict[str, Any]] = {
+                **self._about,
+                "status": {
+                    "long_name": "how the point ended",
+                    "flag_values": list(STATUSES.values()),
+                    "flag_meanings": " ".join(STATUSES),
+                },
+                "message": {"long_name": "what happened at the point"},
+                "laws": {"long_name": "what is known of the laws along the run"},
+            }
+            laws = solver.laws
+            assert laws is not None
+            attributes = {
+                "format": FORMAT,
+                "title": f"study of {', '.join(self._axes.parameters)}: {described['system']}",
+                **identity.provenance(described, solver.engine),
+                "study": described,
+                "laws": dataclasses.asdict(laws),
+                "measures": list(self._measures),
+                "axes": {axis.name: list(axis.columns) for axis in self._axes.axes},
+                "spec": self._spec,
+            }
+            shapes = {
+                name: (values.shape[1:], "complex128" if values.dtype.kind == "c" else "float64")
+                for name, values in columns.measures.items()
+            }
+            return Store.create(self.store, self._axes, self._points(solver), shapes, about, attributes), self._axes
+        store = Store.open(self.store)
+        try:
+            axes = matched(self._axes, store.axes())
+            solver, columns, x0 = self._prepared(store.study["example"])
+            lines = identity.differences(identity.description(solver, columns, x0), store.study)
+        except InputError as error:
+            lines = [str(error)]
+        if lines:
+            head = f"{self.store} is the store of another study; take another name for this one:"
+            raise InputError("\n  ".join([head, *lines]))
+        return store, axes
+
+    def _points(self, solver: Solver) -> int:
+        """Points of a chunk."""
+        if self._chunk is not None:
+            return self._chunk
+        most = ALONE if solver.members.family is None else CHUNK
+        return max(1, min(most, max(64, WORK // max(self._steps, 100))))
+
+    def _prepared(self, example: Mapping[str, Any] | None = None) -> tuple[Solver, Columns, np.ndarray]:
+        """The solver, and its example solved: a point given, or the first that can be run."""
+        if self._solved is not None and (example is None or plain(dict(self._solved[0].task.example)) == example):
+            return self._solved
+        size, first, failed = self._axes.size, "", 0
+        numbers: Sequence[int] = range(size)
+        if example is None:
+            numbers = list(dict.fromkeys(int(size * _spread(k)) for k in range(TRIED)))
+        for number in numbers:
+            place = tuple(np.array([i]) for i in np.unravel_index(number, self._axes.shape))
+            points = {name: values[0] for name, values in self._axes.points(place).items()}
+            if example is not None and plain(points) != dict(example):
+                continue
+            why, built = self._tried(points, self._axes.states(place))
+            if self._solved is not None and not why:
+                return self._solved
+            failed += built
+            first = first or f"{self._axes.told(tuple(int(p[0]) for p in place))}: {why}"
+            if failed == HOPELESS:
+                break
+        raise InputError(f"no point of the study can be run; the first: {first}")
+
+    def _tried(self, point: dict[str, Any], states: np.ndarray | None) -> tuple[str, bool]:
+        """Solve a point by itself; why it cannot be, or nothing, and whether its system was built."""
+        self._check_axes(point)
+        try:
+            solver = Solver(dataclasses.replace(self._task, example=point))
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except Exception as error:  # the builder may be anyone's, and may raise at some points
+            return told(error), False
+        columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1)
+        if columns.status[0] in (Code.INADMISSIBLE, MEASURE_FAILED):
+            return columns.message[0], True
+        if solver.members.family is not None:  # and not another engine for some of the chunks
+            solver.task = dataclasses.replace(solver.task, engine=solver.engine)
+        elif self._axes.size > SLOW:
+            warn(
+                f"the builder cannot be traced ({solver.members.reason}), so that each of {self._axes.size} points is "
+                "built by itself; written with jax.numpy and without Python's if, one program builds all"
+            )
+        self._solved = solver, columns, self._initial(solver, point, states)
+        return "", True
+
+    def _initial(self, solver: Solver, point: dict[str, Any], states: np.ndarray | None) -> np.ndarray:
+        given = self._task.x0
+        x0 = states[0] if states is not None else given(Watched(point)) if callable(given) else given
+        return np.asarray(solver.members.example.state(x0), dtype=np.float64)
+
+    def _check_axes(self, point: dict[str, Any]) -> None:
+        """Refuse axes that nobody reads."""
+        watched = Watched(plain(point))
+        for function in filter(callable, (self._task.build, self._task.x0, self._task.attitude)):
+            try:
+                function(watched)
+            except InputError as error:
+                if ASKED in str(error):
+                    raise
+                return
+            except Exception:  # told as the reason of this point
+                return
+        unread = [name for name in self._axes.parameters if name not in watched.seen]
+        if unread:
+            raise InputError(
+                f"{unread[0]!r} is looked at neither by the builder nor by x0; an axis of replicas is lt.replicas"
+            )
+
+
+def _spread(k: int) -> float:
+    """The k-th number of van der Corput's sequence: 0, 1/2, 1/4, 3/4, ..."""
+    return sum((k >> bit & 1) / 2 ** (bit + 1) for bit in range(k.bit_length()))
+
+
+# -- from the store alone ---------------------------------------------------------------------------------------------
+
+
+def status(path: Any) -> StudyStatus:
+    """How far the study in a store is."""
+    return _status_of(Store.open(Path(path)))
+
+
+def _status_of(store: Store) -> StudyStatus:
+    counts, running = store.counts(), files.running(store.root)
+    done = store.points - counts.get("missing", 0)
+    left = None if running is None or "started" not in running else seconds_left(store.points, done, running)
+    return StudyStatus(store.points, done, counts, running, left)
+
+
+def load_study(path: Any) -> xarray.Dataset:
+    """The results in the store of a :class:`Study`, whoever runs it, read when they are looked at.
+
+    Raises
+    ------
+    FileError
+        If there is no store.
+    """
+    store = Store.open(Path(path))
+    import xarray
+
+    try:
+        found = xarray.open_zarr(store.root, consolidated=True, chunks=None)
+    except Exception as error:  # of a dozen kinds
+        raise FileError(f"{path} cannot be read: {error}") from error
+    coordinates = [name for name, array in store.arrays.items() if name not in store.chunked]
+    found = found.set_coords(coordinates)
+    return found.drop_vars([name for name in found.coords if name in store.attributes["axes"] and not len(found[name])])
+
+
+def audit(path: Any, **tolerances: float) -> Audit:
+    """The laws over the points of a store."""
+    accepted = Tolerances.of(**tolerances)
+    store = Store.open(Path(path))
+    axes, laws = store.axes(), Laws.of(store.attributes["laws"])
+    worst: dict[str, AuditRow] = {}
+    least, drift, residual = math.inf, 0.0, 0.0
+    counts: dict[int, int] = {}
+    for number, status in store.marks():
+        if status is None:
+            continue
+        for code, count in zip(*np.unique(status, return_counts=True), strict=True):
+            counts[int(code)] = counts.get(int(code), 0) + int(count)
+        index = store.index(number)
+        ended = np.isin(status, (*GOOD, LAW_BROKEN, MEASURE_FAILED)).ravel()
+        if not ended.any():
+            continue
+        summary = Summary(status.ravel()[ended], store.chunk("laws", index).reshape(status.size, -1)[ended])
+        drift, residual = max(drift, summary.energy_drift.max()), max(residual, summary.residual.max())
+        least = min(least, float(np.nanmin(summary.least_entropy_increment, initial=math.inf)))
+        for law in laws_of_many(summary, laws, accepted, summary.energy_terms, summary.entropy_terms):
+            i = law.worst
+            row = law.as_row(i)
+            if law.law not in worst or _beyond(row) > _beyond(worst[law.law]):
+                place = tuple(int(p[np.flatnonzero(ended)[i]]) for p in store.places(index))
+                worst[law.law] = dataclasses.replace(row, note=f"worst at {axes.told(place)}")
+    rows = list(worst.values())
+    for name, code in STATUSES.items():
+        if code not in (*GOOD, MISSING) and counts.get(code):
+            rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
+    failed = sum(count for code, count in counts.items() if code not in (*GOOD, MISSING))
+    if not failed:
+        rows.append(AuditRow("points that failed", 0.0, 0.0, True))
+    return Audit(drift, least if math.isfinite(least) else math.nan, math.nan, residual, tuple(rows))
+
+
+def _beyond(row: AuditRow) -> float:
+    return row.value - (row.tolerance or 0.0)

@@ -1,0 +1,89 @@
+"""Axes: grids, zipped parameters, samples, replicas; and what is none."""
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+import liethermo as lt
+from liethermo.studies.axes import Axes
+from liethermo.studies.store import matched
+
+
+def test_a_grid_has_every_combination_and_zipped_parameters_vary_together():
+    axes = Axes.of({"a": [1.0, 2.0], "pair": lt.zipped(b=[3, 4, 5], c=["x", "y", "z"])})
+    assert axes.shape == (2, 3)
+    assert axes.parameters == ("a", "b", "c")
+    points = axes.points(tuple(np.indices(axes.shape).reshape(2, -1)))
+    assert points["a"].tolist() == [1, 1, 1, 2, 2, 2]
+    assert points["b"].tolist() == [3, 4, 5] * 2
+    assert points["c"].tolist() == ["x", "y", "z"] * 2
+    assert axes.told((1, 2)) == "a = 2, b = 5, c = z"
+
+
+def test_samples_lie_in_their_ranges_as_their_construction_says():
+    cube = lt.latin_hypercube(40, seed=3, rate=(1e-3, 10.0, "log"), ratio=(-1.0, 2.0))
+    u = np.log(cube.columns["rate"] / 1e-3) / np.log(1e4)
+    for unit in (u, (cube.columns["ratio"] + 1.0) / 3.0):  # one point in each of 40 strips
+        assert sorted(np.floor(40 * unit).astype(int)) == list(range(40))
+    sequence = lt.sobol(64, seed=1, a=(0.0, 1.0), b=(0.0, 1.0))
+    ours = qmc.discrepancy(np.stack(list(sequence.columns.values()), axis=1))
+    random = np.random.default_rng(0).random((64, 2))
+    assert ours < 0.3 * qmc.discrepancy(random)
+    assert np.array_equal(lt.sobol(200, seed=1, a=(0.0, 1.0), b=(0.0, 1.0)).columns["a"][:64], sequence.columns["a"])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "axes are a dict"),
+        ({"a": []}, "of shape"),
+        ({"a": [[1.0, 2.0]]}, "several numbers at once"),
+        ({"a": [1.0, np.nan]}, "value 1 of 'a' is nan"),
+        ({"a": [1.0, 2.0, 1.0]}, "the axis 'a' has 1.0 more than once"),
+        ({"status": [1.0]}, "cannot be called 'status'"),
+        ({"a/b": [1.0]}, "cannot be called"),
+        ({"a": [1.0], "s": lt.zipped(a=[1.0])}, "'a' stands for more than one thing"),
+        ({"a": [None]}, "not object"),
+    ],
+)
+def test_what_is_no_axis_is_refused(given, message):
+    with pytest.raises(lt.InputError, match=message):
+        Axes.of(given)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: lt.zipped(a=[1.0, 2.0], b=[1.0]), "a has 2, b has 1"),
+        (lambda: lt.zipped(), "needs parameters"),
+        (lambda: lt.sobol(4, seed=0, a=(1.0, 0.0)), "the range of a must be finite and increasing"),
+        (lambda: lt.latin_hypercube(4, seed=0, a=(0.0, 1.0, "log")), "positive with 'log'"),
+        (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"is \(low, high\)"),
+        (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive number of points"),
+        (lambda: lt.latin_hypercube(4, seed=0), "needs the ranges"),
+        (lambda: lt.replicas([0.0, 1.0]), r"shape \(replicas, n\)"),
+        (lambda: lt.replicas([[0.0, 1.0], [np.inf, 1.0]]), "replica 1 is not finite"),
+    ],
+)
+def test_what_is_no_sample_is_refused(make, message):
+    with pytest.raises(lt.InputError, match=message):
+        make()
+
+
+def test_longer_axes_match_the_order_of_a_store_and_its_rounding():
+    kept, longer = Axes.of({"a": np.linspace(0.1, 0.7, 7)}), Axes.of({"a": np.linspace(0.1, 0.8, 8)[::-1]})
+    assert kept.axes[0].labels[2] != longer.axes[0].labels[5]  # 0.3 and its neighbour
+    found = matched(longer, kept).axes[0]
+    assert found.labels.tolist() == [*kept.axes[0].labels, 0.8]
+    with pytest.raises(lt.InputError, match=r"the axis 'a' lacks 0\.1, which is value 0"):
+        matched(Axes.of({"a": [0.2, 0.3]}), kept)
+    with pytest.raises(lt.InputError, match=r"the axes are b \(b\)"):
+        matched(Axes.of({"b": [0.2]}), kept)
+
+
+def test_replicas_are_told_apart_by_their_states_and_may_be_alike():
+    states = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    found = matched(Axes.of({"r": lt.replicas(states)}), Axes.of({"r": lt.replicas(states[1:])})).axes[0]
+    assert np.array_equal(found.states, states[[1, 2, 0]])
+    with pytest.raises(lt.InputError, match="lacks"):
+        matched(Axes.of({"r": lt.replicas(states[1:])}), Axes.of({"r": lt.replicas(states[:2])}))
