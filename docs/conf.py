@@ -11,8 +11,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import liethermo
+import manifolds
 
-sys.modules["liethermo.plot"] = liethermo.plot  # imported on demand as an attribute; autodoc asks for a module
+for package, names in ((liethermo, ("plot", "scipy", "sympy", "diffrax")), (manifolds, ("sympy",))):
+    for name in names:  # imported on demand as attributes; autodoc asks for modules
+        sys.modules[f"{package.__name__}.{name}"] = getattr(package, name)
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE / "_ext")]

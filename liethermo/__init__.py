@@ -184,10 +184,14 @@ __all__ = [
     "zipped",
 ]
 
+_INTEROP = ("diffrax", "scipy", "sympy")
+
 
 def __getattr__(name: str):
     if name == "plot":  # matplotlib is imported only when a picture is wanted
         return importlib.import_module(".results.plot", __name__)
+    if name in _INTEROP:  # each imports the package that it is named after
+        return importlib.import_module(f".interop.{name}", __name__)
     if name == "__version__":
         return importlib.metadata.version("liethermo")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

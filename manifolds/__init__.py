@@ -4,6 +4,8 @@ Importing this package switches JAX to 64-bit floating point: the laws are kept 
 round them away.
 """
 
+import importlib
+
 from . import _precision, testing  # noqa: F401
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
@@ -152,3 +154,9 @@ __all__ = [
     "su",
     "testing",
 ]
+
+
+def __getattr__(name: str):
+    if name == "sympy":  # an optional package
+        return importlib.import_module(".sympy", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -68,27 +68,34 @@ def flow(
 @program
 def _path(system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[int, int], ...]) -> jax.Array:
     """The states kept, the first among them: a program of its own, in which all numbers are arguments."""
-    k = method.start(system, x)
-    carry, states = (x, jnp.zeros_like(x), k, k), [x[None]]
+    carry, states = first_carry(system, method, x), [x[None]]
     for i, (saves, every) in enumerate(counts):
         carry, kept = _steps(system, method, carry, sizes[i], saves, every)
         states.append(kept)
     return jnp.concatenate(states)
 
 
-def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
-    def one_step(carry, _):
-        x, low, k, before = carry
-        if method.explicit:
-            solved = array.explicit(system, method, x, low, h, k)
-            new = jnp.where(solved.converged, solved.k, jnp.nan)
-        else:
-            new = _stages(system, method, x, low, h, method.predict(k, before))
-        after, after_low, *_ = array.finish(system, method, x, low, h, new, system.energy.value(x))
-        return (after, after_low, new, k), None
+def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:
+    """What steps hand on, at the start: the state, what rounding keeps from it, the slopes of the last two steps."""
+    k = method.start(system, x)
+    return x, jnp.zeros_like(x), k, k
 
+
+def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h) -> tuple[jax.Array, ...]:
+    """A step that JAX differentiates, from what :func:`first_carry` says; NaN where it could not be solved."""
+    x, low, k, before = carry
+    if method.explicit:
+        solved = array.explicit(system, method, x, low, h, k)
+        new = jnp.where(solved.converged, solved.k, jnp.nan)
+    else:
+        new = _stages(system, method, x, low, h, method.predict(k, before))
+    after, after_low, *_ = array.finish(system, method, x, low, h, new, system.energy.value(x))
+    return after, after_low, new, k
+
+
+def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
     def one_save(carry, _):
-        carry, _ = jax.lax.scan(one_step, carry, length=every)
+        carry, _ = jax.lax.scan(lambda c, _: (one_step(system, method, c, h), None), carry, length=every)
         return carry, carry[0]
 
     return jax.lax.scan(one_save, carry, length=saves)

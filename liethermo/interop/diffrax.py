@@ -1,0 +1,111 @@
+"""Systems and steps for diffrax: ``diffrax.diffeqsolve(lt.diffrax.Term(system), lt.diffrax.Solver(method), ...)``.
+
+diffrax is an optional package; this module imports it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+
+from ..errors import InputError
+from ..functions.checks import traced_energies
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..runs.flow import first_carry, one_step
+from ..systems import System
+
+
+class Term(diffrax.ODETerm):
+    """The vector field of a system as a term of diffrax, for its solvers and for :class:`Solver`.
+
+    Parameters
+    ----------
+    system : System
+        Its parameters are leaves of the term: ``jax.grad`` and ``jax.vmap`` reach them.
+    """
+
+    system: System
+
+    def __init__(self, system: System):
+        self.system = system
+        self.vector_field = _field
+
+    def vf(self, t, y, args):
+        """The vector field at a state, shape (n,)."""
+        del args
+        return self.system.vector_field(y, t if self.system.is_driven else None)
+
+
+def _field(t, y, args):
+    raise NotImplementedError("Term.vf knows the system")
+
+
+class Solver(diffrax.AbstractAdaptiveSolver):
+    """A method of this library as a solver of diffrax: the laws hold at every step that diffrax accepts.
+
+    Implicit steps are differentiated by the implicit function theorem, so reverse mode works with diffrax's default
+    adjoint. Interpolation between steps is by cubic Hermite polynomials, outside of the laws.
+
+    Parameters
+    ----------
+    method : OneStepMethod, optional
+        ``MetriplecticGauss(1)`` by default.
+    """
+
+    method: OneStepMethod
+
+    term_structure: ClassVar = Term
+    interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def __init__(self, method: OneStepMethod | None = None):
+        self.method = DEFAULT_METHOD if method is None else method
+
+    def order(self, terms) -> int:
+        """That of the method."""
+        del terms
+        return self.method.order
+
+    def error_order(self, terms) -> int:
+        """The power of h that the estimate of the local error falls with."""
+        return self.order(terms) + 1
+
+    def init(self, terms, t0, t1, y0, args) -> Any:
+        """What a run carries besides its state: the lost digits, and the slopes of the last two steps."""
+        del t0, t1, args
+        system, method = self._on(terms)
+        return first_carry(system, method, y0)[1:]
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step; a step whose equations are not solved is rejected, or ends the run, by diffrax's own rules."""
+        del args, made_jump
+        system, method = self._on(terms)
+        h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to turn time around
+        low, k, before = solver_state
+        y1, *state = one_step(system, method, (y0, low, k, before), h)
+        solved = jnp.isfinite(jnp.sum(y1))
+        slopes = state[1]
+        error = jax.lax.stop_gradient(method.error(system, y0, low, h, slopes)) if _has_error(method) else jnp.zeros(())
+        estimate = jnp.full_like(y0, jnp.where(solved, error, jnp.inf))
+        field = system.vector_field
+        dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}
+        result = diffrax.RESULTS.where(solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
+        return y1, estimate, dense, tuple(state), result
+
+    def func(self, terms, t0, y0, args):
+        """The vector field."""
+        return terms.vf(t0, y0, args)
+
+    def _on(self, terms) -> tuple[System, OneStepMethod]:
+        system = getattr(terms, "term", terms).system
+        if system.is_driven:
+            raise InputError(
+                "an energy that depends on time needs a clock and a ledger in the state: use lt.integrate or lt.flow"
+            )
+        return system, traced_energies(self.method.pulled(system).on(system), system.dim)
+
+
+def _has_error(method: OneStepMethod) -> bool:
+    return type(method).error is not OneStepMethod.error

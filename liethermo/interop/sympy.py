@@ -1,0 +1,257 @@
+"""Systems as SymPy expressions, energies from SymPy, and problems written down for other solvers. SymPy is optional.
+
+The expressions are not typed twice: they are what the tracer of the compiled engine unrolls the system's own functions
+into.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import sympy
+
+import manifolds as mf
+
+from ..errors import InputError
+from ..integrators import MetriplecticGauss, Reference
+from ..runs.integrate import integrate
+from ..systems import LiePoissonSystem, System
+from ..tracing.scalarize import Program, scalarize
+
+FORMAT = "liethermo-problem-1"
+
+LARGEST_DENOMINATOR = 1000
+"""A number that is the double nearest to a fraction of such a denominator is written as the fraction."""
+
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "neg": lambda a: -a,
+    "pow": lambda a, b: a**b,
+    "sqrt": sympy.sqrt,
+    "cbrt": sympy.cbrt,
+    "exp2": lambda a: 2**a,
+    "expm1": lambda a: sympy.exp(a) - 1,
+    "log1p": lambda a: sympy.log(1 + a),
+    "abs": sympy.Abs,
+    "max": sympy.Max,
+    "min": sympy.Min,
+    "ceil": sympy.ceiling,
+    "atan2": sympy.atan2,
+    "select": lambda condition, a, b: sympy.Piecewise((a, condition), (b, True)),
+    "and": sympy.And,
+    "or": sympy.Or,
+    "xor": sympy.Xor,
+    "not": sympy.Not,
+    **{name: getattr(sympy, name) for name in "exp log sin cos tan sinh cosh tanh asin acos atan".split()},
+    **{name: getattr(sympy, name) for name in "asinh acosh atanh erf erfc sign floor".split()},
+    **{name: getattr(sympy, name.capitalize()) for name in "eq ne lt le gt ge".split()},
+}
+"""What the scalar operations of a traced program are in SymPy."""
+
+
+@dataclass(frozen=True)
+class Expressions:
+    """A system in symbols.
+
+    Attributes
+    ----------
+    variables : tuple of Symbol
+    energy : Expr
+    entropy : Expr or None
+    field : tuple of Expr
+        The right-hand side of ``x' = ...``.
+    casimirs : dict of Expr, by name
+    """
+
+    variables: tuple[sympy.Symbol, ...]
+    energy: sympy.Expr
+    entropy: sympy.Expr | None
+    field: tuple[sympy.Expr, ...]
+    casimirs: dict[str, sympy.Expr]
+
+
+def expressions(system: System, names: Sequence[str] | None = None) -> Expressions:
+    """Energy, entropy, vector field and Casimirs of a system as SymPy expressions of its state.
+
+    Numbers that are fractions to the last digit become fractions. The laws can then be proved:
+    ``sympy.simplify(sum(dH * f))`` is zero.
+
+    Parameters
+    ----------
+    system : System
+        Whose functions can be unrolled; of an energy that depends on time take ``system.at_time(t)``.
+    names : sequence of str, optional
+        Of the components; by default ``x1``, ``x2``, …, or the basis names of the algebra.
+
+    Raises
+    ------
+    InputError
+        If the energy depends on time, or a function uses what has no expression.
+    """
+    if system.is_driven:
+        raise InputError("the energy depends on time: take system.at_time(t), a system at one time")
+    algebra = getattr(system, "algebra", None)
+    names = names or getattr(algebra, "basis_names", None) or [f"x{i + 1}" for i in range(system.dim)]
+    variables = mf.sympy.symbols(system.dim, names)
+
+    def of(function: Callable) -> list[sympy.Expr]:
+        closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+        return _interpreted(scalarize(closed), variables)
+
+    return Expressions(
+        variables=variables,
+        energy=of(system.energy.value)[0],
+        entropy=None if system.entropy is None else of(system.entropy.value)[0],
+        field=tuple(of(system.vector_field)),
+        casimirs={name: of(casimir.value)[0] for name, casimir in system.casimirs().items()},
+    )
+
+
+def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
+    """A SymPy expression as a function of the state, to be the energy or the entropy of a system.
+
+    Parameters
+    ----------
+    expression : Expr
+    variables : sequence of symbols
+        The components of the state, in order.
+
+    Returns
+    -------
+    manifolds.Polynomial where it is one, else a function of one JAX array, shape (n,)
+
+    Raises
+    ------
+    InputError
+        If the expression has other symbols.
+    """
+    expression = sympy.sympify(expression)
+    if others := expression.free_symbols - set(variables):
+        raise InputError(f"{', '.join(sorted(map(str, others)))} in {expression} is no component of the state")
+    if expression.is_polynomial(*variables):
+        return mf.sympy.polynomial(expression, variables)
+    compiled = sympy.lambdify(tuple(variables), expression, modules="jax")
+    return lambda x: compiled(*x)
+
+
+def describe(system: System, x0, t_span: tuple[float, float], name: str = "problem") -> dict[str, Any]:
+    """A problem as JSON data that any solver can be tested against: expressions, constants and the state at the end.
+
+    The state at the end is computed twice, by SciPy's DOP853 and by collocation of order 12; as many digits are given
+    as they agree in. Expressions are written for SymPy and for Julia; indices count from 1.
+
+    Parameters
+    ----------
+    system : System
+        See :func:`expressions`.
+    x0 : array, shape (n,)
+    t_span : (float, float)
+    name : str
+
+    Returns
+    -------
+    dict
+        ``format``, ``name``, ``variables``, ``energy``, ``entropy``, ``casimirs``, ``field``, ``lie_algebra`` where
+        there is one, ``initial_state``, ``t_span`` and ``reference``.
+
+    Raises
+    ------
+    InputError
+        If the system has no expressions, or an argument cannot be used.
+    """
+    found = expressions(system)
+    problem = {
+        "format": FORMAT,
+        "name": name,
+        "variables": [str(x) for x in found.variables],
+        "energy": _written(found.energy),
+        "entropy": None if found.entropy is None else _written(found.entropy),
+        "casimirs": {key: _written(value) for key, value in found.casimirs.items()},
+        "field": [_written(component) for component in found.field],
+        "initial_state": [float(value) for value in np.asarray(x0, dtype=np.float64)],
+        "t_span": [float(t) for t in t_span],
+        "reference": _reference(system, x0, t_span),
+    }
+    if isinstance(system, LiePoissonSystem):
+        constants = mf.sympy.structure_constants(system.algebra)
+        problem["lie_algebra"] = {
+            "name": system.algebra.name,
+            "dimension": system.algebra.dim,
+            "structure_constants": [
+                [a + 1, b + 1, c + 1, str(constants[a, b, c])]
+                for a, b, c in np.argwhere(system.algebra.structure_constants).tolist()
+            ],
+        }
+    return problem
+
+
+def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
+    """Write what :func:`describe` returns as a JSON file."""
+    path = Path(path)
+    path.write_text(json.dumps(problem, indent=2, ensure_ascii=False) + "\n")
+    return path
+
+
+def _written(expression: sympy.Expr) -> dict[str, str]:
+    return {"sympy": str(expression), "julia": sympy.julia_code(expression)}
+
+
+def _reference(system: System, x0, t_span: tuple[float, float]) -> dict[str, Any]:
+    length = t_span[1] - t_span[0]
+    by_scipy = integrate(system, x0, t_span, length, Reference(rtol=1e-13), progress=False).x[-1]
+    by_gauss = integrate(system, x0, t_span, _short(system, x0, length), MetriplecticGauss(6), progress=False).x[-1]
+    apart = float(np.abs(by_scipy - by_gauss).max())
+    digits = int(np.clip(-np.log10(max(apart, 1e-16)), 1, 15))
+    return {"time": float(t_span[1]), "state": [round(float(x), digits) for x in by_gauss], "apart": apart}
+
+
+def _short(system: System, x0, length: float) -> float:
+    """A step for collocation of order 12: a fifth of the time in which the state changes by its size."""
+    x = np.asarray(x0, dtype=np.float64)
+    speed = float(np.abs(system.vector_field(system.state(x))).max())
+    return float(min(0.05 * length, 0.2 * max(np.abs(x).max(), 1e-3) / max(speed, 1e-300), 0.1))
+
+
+def _interpreted(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
+    """The outputs of a program, its single input standing for the variables."""
+    values: dict[Any, Any] = dict(zip(program.inputs[0], variables, strict=True))
+
+    def value(a: Any) -> Any:
+        return values[a] if isinstance(a, str) else _number(a)
+
+    for target, op, args in program.instructions:
+        if op == "float":
+            values[target] = value(args[0])
+        elif op in OPERATIONS:
+            values[target] = OPERATIONS[op](*map(value, args))
+        else:
+            raise InputError(f"the operation {op!r} has no SymPy expression")
+    return [sympy.expand(value(a)) if _small(value(a)) else value(a) for entries in program.outputs for a in entries]
+
+
+def _small(expression: Any) -> bool:
+    """Whether writing out the products of an expression keeps it short."""
+    return sympy.count_ops(expression) < 400
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_):
+        return sympy.true if value else sympy.false
+    number = float(value)
+    if not np.isfinite(number):
+        return sympy.nan if number != number else sympy.oo * int(np.sign(number))
+    fraction = Fraction(number).limit_denominator(LARGEST_DENOMINATOR)
+    exact = float(fraction) == number
+    return sympy.Rational(fraction.numerator, fraction.denominator) if exact else sympy.Float(number, 17)

@@ -1,0 +1,118 @@
+"""To and from SymPy: polynomials, Casimirs and Lie algebras, exactly. SymPy is an optional package.
+
+``mf.sympy.expression(casimir)``, ``mf.sympy.polynomial(expression, symbols)``, ``mf.sympy.structure_constants(g)`` and
+``mf.sympy.algebra(constants)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import sympy
+
+from ._names import component_names
+from .algebras.lie_algebra import LieAlgebra
+from .algebras.polynomial import Polynomial
+from .errors import ComponentError, ShapeError
+
+
+def symbols(dim: int, names: Sequence[str] | None = None) -> tuple[sympy.Symbol, ...]:
+    """Real symbols for the components of ``mu``, by default ``mu1``, ``mu2``, …"""
+    return tuple(
+        sympy.Symbol(name, real=True) for name in component_names(None if names is None else tuple(names), dim)
+    )
+
+
+def expression(polynomial: Polynomial, variables: Sequence[sympy.Symbol] | None = None) -> sympy.Expr:
+    """A polynomial as a SymPy expression; fractions stay fractions.
+
+    Parameters
+    ----------
+    polynomial : Polynomial
+        Such as a Casimir; write out a ``TracePolynomial`` by its ``expanded()`` first.
+    variables : sequence of dim symbols, optional
+        By default those of :func:`symbols`, with the names of the polynomial.
+
+    Raises
+    ------
+    ShapeError
+        If the number of symbols is another.
+    """
+    own = symbols(polynomial.dim, polynomial.names) if variables is None else tuple(variables)
+    if len(own) != polynomial.dim:
+        raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, not {len(own)}")
+    return sympy.Add(
+        *(
+            _number(coefficient) * sympy.Mul(*(x**e for x, e in zip(own, power, strict=True)))
+            for power, coefficient in polynomial.terms
+        )
+    )
+
+
+def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial:
+    """A SymPy expression as a polynomial in the given symbols, whose names it prints with.
+
+    Raises
+    ------
+    ComponentError
+        If it is no polynomial in them with real numbers as coefficients.
+    """
+    terms: dict[tuple[int, ...], Any] = {}
+    for term in sympy.Add.make_args(sympy.expand(sympy.sympify(expression))):
+        number, rest = term.as_independent(*variables, as_Add=False)  # numbers stay what each of them is
+        powers_of = rest.as_powers_dict()
+        if not set(powers_of) <= {*variables, sympy.S.One} or not all(
+            e.is_Integer and e >= 0 for e in powers_of.values()
+        ):
+            raise ComponentError(f"{expression} is no polynomial in {', '.join(map(str, variables))}: see {term}")
+        power = tuple(int(powers_of.get(x, 0)) for x in variables)
+        terms[power] = terms.get(power, 0) + number
+    powers = np.array(list(terms), dtype=np.int64).reshape(-1, len(variables))
+    made = Polynomial(powers, [_coefficient(value) for value in terms.values()])
+    return made.with_names(*map(str, variables))
+
+
+def structure_constants(g: LieAlgebra) -> sympy.ImmutableDenseNDimArray:
+    """``C[a, b, c]`` of an algebra: fractions where they are known as such, else floats."""
+    exact = g.rational_constants
+    if exact is None:
+        entries = [sympy.Float(float(value), 17) for value in g.structure_constants.ravel()]
+    else:
+        entries = [sympy.Rational(int(n), int(exact.denominator)) for n in np.asarray(exact.numerator).ravel()]
+    return sympy.ImmutableDenseNDimArray(entries, g.structure_constants.shape)
+
+
+def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None = None) -> LieAlgebra:
+    """The Lie algebra of structure constants in SymPy, shape (dim, dim, dim); fractions are taken exactly.
+
+    Raises
+    ------
+    ComponentError
+        If an entry is no real number.
+    LieAlgebraError
+        If an axiom fails: see :meth:`LieAlgebra.from_structure_constants`.
+    """
+    entries = sympy.ImmutableDenseNDimArray(constants)
+    if len(entries.shape) != 3:
+        raise ShapeError(f"structure constants have three indices, not {len(entries.shape)}")
+    flat = [_coefficient(entries[i]) for i in np.ndindex(*entries.shape)]
+    table = np.empty(len(flat), dtype=object)
+    table[:] = flat
+    return LieAlgebra.from_structure_constants(table.reshape(entries.shape), name, basis_names)
+
+
+def _number(value: Fraction | float) -> sympy.Expr:
+    if isinstance(value, Fraction):
+        return sympy.Rational(value.numerator, value.denominator)
+    return sympy.Float(value, 17)
+
+
+def _coefficient(value: Any) -> Fraction | float:
+    if value.is_Rational:
+        return Fraction(int(value.p), int(value.q))
+    if value.is_number and value.is_real:
+        return float(value)
+    raise ComponentError(f"{value} is no real number; substitute numbers for the parameters first")

@@ -1,0 +1,69 @@
+"""diffrax runs our systems with its solvers and with ours."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+
+diffrax = pytest.importorskip("diffrax")
+
+X0 = jnp.array([0.1, 0.2, 1.0])
+
+
+def body(rate=0.3):
+    return lt.models.rigid_body((3.0, 2.0, 1.0), rate=rate)
+
+
+def solve(system, solver, h=0.1, end=2.0, **options):
+    options.setdefault("stepsize_controller", diffrax.ConstantStepSize())
+    return diffrax.diffeqsolve(
+        lt.diffrax.Term(system), solver, 0.0, end, h, X0, saveat=diffrax.SaveAt(steps=True), **options
+    )
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=str)
+def test_a_run_by_diffrax_is_ours(method):
+    system = body()
+    theirs = solve(system, lt.diffrax.Solver(method))
+    ours = lt.integrate(system, X0, (0.0, 2.0), 0.1, method)
+    states = np.asarray(theirs.ys)[np.isfinite(np.asarray(theirs.ts))]
+    assert np.abs(states - ours.x[1:]).max() < 1e-14
+    energies = np.array([float(system.energy.value(x)) for x in states])
+    assert np.ptp(energies) < 1e-15
+
+
+def test_adaptive_steps_and_diffrax_own_solvers_agree():
+    controller = diffrax.PIDController(rtol=1e-8, atol=1e-10)
+    ours = solve(body(), lt.diffrax.Solver(lt.MetriplecticRungeKutta(6)), stepsize_controller=controller)
+    theirs = solve(body(), diffrax.Dopri8(), stepsize_controller=controller)
+    ends = [np.asarray(run.ys)[np.isfinite(np.asarray(run.ts))][-1] for run in (ours, theirs)]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-6
+    assert int(ours.stats["num_accepted_steps"]) > 3
+
+
+def test_reverse_mode_through_diffrax_is_the_derivative_of_the_flow():
+    def end(rate):
+        run = diffrax.diffeqsolve(
+            lt.diffrax.Term(body(rate)), lt.diffrax.Solver(lt.MetriplecticGauss(1)), 0.0, 0.5, 0.1, X0
+        )
+        return run.ys[-1, 0]
+
+    by_flow = jax.grad(lambda rate: lt.flow(body(rate), X0, (0.0, 0.5), 0.1, lt.MetriplecticGauss(1))[0])(0.3)
+    assert jax.grad(end)(0.3) == pytest.approx(float(by_flow), rel=1e-10)
+
+
+def test_a_step_that_cannot_be_solved_is_reported():
+    run = solve(body(), lt.diffrax.Solver(lt.MetriplecticRungeKutta(4)), h=1e4, end=2e4, throw=False)
+    assert run.result != diffrax.RESULTS.successful
+
+
+def test_what_depends_on_time_is_sent_elsewhere():
+    driven = lt.LiePoissonSystem(
+        lt.models.rigid_body().algebra, lt.TimeDependent(lambda x, t: (1.0 + 0.1 * jnp.sin(t)) * x @ x)
+    )
+    with pytest.raises(lt.InputError, match="depends on time"):
+        solve(driven, lt.diffrax.Solver())
