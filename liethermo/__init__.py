@@ -62,6 +62,7 @@ from .runs.adaptive import Adaptive
 from .runs.ensemble import ensemble
 from .runs.events import Relaxed
 from .runs.flow import flow
+from .runs.fluctuations import Fluctuations
 from .runs.integrate import integrate
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
@@ -119,6 +120,7 @@ __all__ = [
     "Factor",
     "FileError",
     "FiniteDifference",
+    "Fluctuations",
     "FourBracket",
     "Friction",
     "FrictionOperator",

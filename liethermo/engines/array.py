@@ -342,24 +342,41 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 
-def advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules = RULES):
+def advance(
+    system: System,
+    method: OneStepMethod,
+    state: State,
+    h,
+    saves,
+    every,
+    capacity: int,
+    rules: Rules = RULES,
+    noise=None,
+):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
     Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
+    ``noise`` has the increments of each step, shape (steps, increments); steps without any where it is None.
     """
     h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
-    return _advance(system, method, state, h, saves, every, capacity, rules)
+    return _advance(system, method, state, h, saves, every, capacity, rules, noise)
 
 
 @program
-def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules):
+def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules, noise):
+    first = state.step
+
+    def step(s: State) -> State:
+        own = method if noise is None else method.driven_by(noise[s.step - first])
+        return take_step(system, own, s, h, rules)
+
     def one_save(state: State, index):
         target = state.step + every
 
         def goes_on(s: State):
             return (s.status == Code.COMPLETED) & (s.step < target) & (index < saves)
 
-        state = jax.lax.while_loop(goes_on, lambda s: take_step(system, method, s, h, rules), state)
+        state = jax.lax.while_loop(goes_on, step, state)
         reached = (state.status == Code.COMPLETED) & (index < saves)
         return state, (state.x, state.energy, state.entropy, reached)
 
@@ -377,11 +394,20 @@ class ArrayEngine:
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
 
-    def advance(self, state: State, h, saves, every, capacity: int):
-        return advance(self.system, self.method, state, h, saves, every, capacity, self.rules)
+    def advance(self, state: State, h, saves, every, capacity: int, noise=None):
+        return advance(self.system, self.method, state, h, saves, every, capacity, self.rules, rows(noise))
 
-    def step(self, state: State, h) -> State:
-        return _one_step(self.system, self.method, state, jnp.asarray(h), self.rules)
+    def step(self, state: State, h, noise=None) -> State:
+        method = self.method if noise is None else self.method.driven_by(jnp.asarray(noise[0]))
+        return _one_step(self.system, method, state, jnp.asarray(h), self.rules)
+
+
+def rows(noise) -> jax.Array | None:
+    """Increments, shape (..., steps, increments), with as many steps as a power of two: few shapes, few programs."""
+    if noise is None:
+        return None
+    missing = (1 << max(0, noise.shape[-2] - 1).bit_length()) - noise.shape[-2]
+    return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, missing), (0, 0)]))
 
 
 @program

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from manifolds.errors import warn
 
@@ -43,15 +44,24 @@ class Engine(Protocol):
         """The state of a run about to start at x."""
         ...
 
-    def advance(self, state: State, h, saves: int, every: int, capacity: int) -> tuple[State, tuple]:
+    def advance(self, state: State, h, saves: int, every: int, capacity: int, noise=None) -> tuple[State, tuple]:
         """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
         Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
+        ``noise`` has the increments that drive each step, an array of shape (steps, increments), where there are any.
         """
         ...
 
-    def step(self, state: State, h) -> State:
+    def step(self, state: State, h, noise=None) -> State:
         """The state after one step, or as it was with the status of a failure."""
+        ...
+
+
+class Noise(Protocol):
+    """Where the increments of a trajectory come from."""
+
+    def rows(self, first: int, steps: int, h) -> np.ndarray:
+        """Those of so many steps of size h from a step on, shape (steps, increments)."""
         ...
 
 
@@ -70,10 +80,12 @@ class Chosen:
     asked : one of ENGINES
     steps : int
         How many are to be taken.
+    noise : Noise, optional
+        What drives the steps: those with the same number are driven by the same.
     """
 
-    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int):
-        self.system, self.method, self.asked, self.steps = system, method, asked, steps
+    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int, noise: Noise | None = None):
+        self.system, self.method, self.asked, self.steps, self.noise = system, method, asked, steps, noise
         self._engine: Engine = ArrayEngine(system, method)
         self._begun = False
 
@@ -91,18 +103,25 @@ class Chosen:
             return self._engine.begin(x)
 
     def advance(self, state: State, h, saves: int, every: int, capacity: int) -> tuple[State, tuple]:
-        return self._attempt(lambda engine, state: engine.advance(state, h, saves, every, capacity), state)
+        noise = self._noise(state, int(saves) * int(every), h)
+        return self._attempt(lambda engine, state: engine.advance(state, h, saves, every, capacity, noise), state)
 
     def step(self, state: State, h) -> State:
-        return self._attempt(lambda engine, state: engine.step(state, h), state)
+        noise = self._noise(state, 1, h)
+        return self._attempt(lambda engine, state: engine.step(state, h, noise), state)
+
+    def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
+        return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
 
     def _choose(self) -> Engine:
         system, method, auto = self.system, self.method, self.asked == "auto"
+        if self.asked == "sparse" and self.noise is not None:
+            raise InputError("the sparse engine takes no steps with noise: leave out engine")
         if self.asked == "sparse" and method.explicit:
             raise InputError(
                 f"{method} has no equations to solve, so the sparse engine is not for it: leave out engine"
             )
-        if self.asked == "sparse" or (auto and system.dim >= SPARSE_DIM and not method.explicit):
+        if self.asked == "sparse" or (auto and system.dim >= SPARSE_DIM and not method.explicit and self.noise is None):
             if system.sparsity() is not None:
                 return SparseEngine(system, method)
             if not auto:

@@ -68,6 +68,16 @@ class OneStepMethod(eqx.Module):
         """Of the vector field, in one iteration."""
         return self.stages
 
+    @property
+    def increments(self) -> int:
+        """Random numbers that a step is driven by: none of a method for equations without noise."""
+        return 0
+
+    def driven_by(self, dW) -> OneStepMethod:
+        """The method for one step, with its :attr:`increments`, shape (increments,)."""
+        del dW
+        return self
+
     @abstractmethod
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""

@@ -59,12 +59,16 @@ class MetriplecticMidpoint(OneStepMethod):
         return frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        return system.field(*self.at_midpoint(system, x, low, h, k))[None]
+
+    def at_midpoint(self, system: System, x, low, h, k) -> tuple:
+        """The midpoint z, and what the step takes for the gradients dH, dS and dL: the arguments of the field."""
         d = h * k[0]
         z = x + (low + 0.5 * d)
         dH = self.gradient(system.energy, x, d, low)
         dS = None if system.entropy is None else system.entropy.gradient(z)
         dL = tuple(self.gradient(L, x, d, low) for L in system.preserved)
-        return system.field(z, dH, dS, dL)[None]
+        return z, dH, dS, dL
 
     def velocities(self, system: System, x, low, h, k) -> jax.Array:
         return self.gradient(system.energy, x, h * k[0], low)[None]

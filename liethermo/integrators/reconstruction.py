@@ -66,6 +66,13 @@ class WithAttitude(OneStepMethod):
     def preserves(self) -> frozenset[str]:
         return self.method.preserves
 
+    @property
+    def increments(self) -> int:
+        return self.method.increments
+
+    def driven_by(self, dW) -> OneStepMethod:
+        return WithAttitude(self.method.driven_by(dW), self.kind)
+
     def keeps(self, system, name: str) -> bool:
         return self.method.keeps(system.body, name)
 

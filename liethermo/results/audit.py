@@ -221,7 +221,7 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
     if laws.energy == "conserved":
         rows.append(_verdict(f"{name} drift", drift, allowed, _note(laws, "energy")))
     elif laws.energy is None:
-        rows.append(AuditRow(f"{name} drift", drift, None, None, "no law promised"))
+        rows.append(AuditRow(f"{name} drift", drift, None, None, _without_law(laws, "energy")))
     else:
         increments = [*np.diff(energy), _or(stats.largest_energy_increment, -np.inf)]
         risen = float(max(increments)) / rounding.size
@@ -278,7 +278,7 @@ def _entropy_row(solution: Record, tolerances: Tolerances) -> tuple[float, Audit
         change = float(np.abs(S - S[0]).max() / rounding.size)
         return least, _verdict("entropy drift", change, float(rounding.allowed(tolerances.casimirs)), note)
     if law is None:
-        return least, AuditRow("least entropy increment", least, None, None, "no law promised")
+        return least, AuditRow("least entropy increment", least, None, None, _without_law(solution.laws, "entropy"))
     rounding = replace(rounding, value=float(np.abs(S).max()))
     one, all_ = (float(rounding.allowed(t) * rounding.size) for t in (tolerances.entropy, tolerances.casimirs))
     fall = float((np.maximum.accumulate(S) - S).max())
@@ -322,6 +322,10 @@ def _verdict(law: str, value: float, tolerance: float, note: str = "") -> AuditR
 
 def _note(laws: Laws, law: str) -> str:
     return INEXACT if law in laws.inexact else ""
+
+
+def _without_law(laws: Laws, law: str) -> str:
+    return "a law of the mean: it fluctuates on paths" if law in laws.mean else "no law promised"
 
 
 def _or(value: float | None, otherwise: float) -> float:

@@ -110,7 +110,7 @@ class Witness:
         own = dict(zip(names, _largest(sensitivities), strict=True))
         energy, entropy = own.pop("energy"), own.pop("entropy", None)
         found = Evidence(energy, entropy, own, dict(zip(names, _largest(terms), strict=True)))
-        if not isinstance(self.method, OneStepMethod):
+        if not isinstance(self.method, OneStepMethod) or self.method.increments:  # noise is what a short step shows
             return found
         number = min(STEPS_AGAIN, max(4, STATE_NUMBERS // self.x.shape[1]))
         tried = (self._step(i, self.h[i]) for i in spread(len(self.h), number))

@@ -95,7 +95,8 @@ class Laws:
     audit shows how far these drift, without a verdict. ``ledger`` names those of the recorded functions that say what
     comes from outside, ``balance`` those of them that the energy of a solution contains and its law is stated without
     (``dH = work``), and ``inexact`` which of the two laws ("energy", "entropy") the method makes no claim to keep: an
-    audit judges them all the same, and says so.
+    audit judges them all the same, and says so. ``mean`` names those of the two laws that fluctuations leave for the
+    mean alone: on paths both may rise and fall.
     """
 
     energy: str | None = "conserved"
@@ -105,6 +106,7 @@ class Laws:
     inexact: tuple[str, ...] = ()
     balance: tuple[str, ...] = ()
     unpromised: tuple[str, ...] = ()
+    mean: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Laws:

@@ -19,6 +19,7 @@ from ..engines.compiled.form import numbers_of
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
+from .fluctuations import Paths
 from .record import Record
 from .timetable import CHUNK_STEPS, Course
 
@@ -93,7 +94,9 @@ class Lanes:
         return np.hstack([self.family.flat(chosen, number), np.broadcast_to(self.own, (number, len(self.own)))])
 
 
-def run_compiled(family: Family, method: OneStepMethod, record: Record, tally: Tally) -> None:
+def run_compiled(
+    family: Family, method: OneStepMethod, record: Record, tally: Tally, noise: Paths | None = None
+) -> None:
     """Blocks of lanes; the loop does not hold the interpreter's lock."""
     lanes = Lanes(family, method)
     stepper, course = lanes.stepper, record.course
@@ -105,10 +108,15 @@ def run_compiled(family: Family, method: OneStepMethod, record: Record, tally: T
         blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
         before = {name: value[:number].copy() for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
         record.begin(chosen, before["x"], before["energy"], before["entropy"])
+        taken = 0
         for h, saves, every, place in calls(course, CHUNK_STEPS * 16 // max(number, LANES)):
             if stop.is_set():
                 break
-            states = stepper.run(lanes.first, blocks, h, saves, every)[:number]
+            increments = None if noise is None else noise.rows(chosen, taken, saves * every, h)
+            states, taken = (
+                stepper.run(lanes.first, blocks, h, saves, every, increments)[:number],
+                taken + saves * every,
+            )
             if place is not None:
                 record.keep(chosen, place, states)
             tally.add(number * saves * every / course.steps)
@@ -141,20 +149,24 @@ def calls(course: Course, limit: int):
 # -- the array engine -------------------------------------------------------------------------------------------------
 
 
-def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tally) -> None:
+def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tally, noise: Paths | None = None) -> None:
     """All trajectories of a batch in one program, by ``vmap``."""
     size, course, interrupted = len(record.x0), record.course, False
     portion = min(ARRAY_BATCH, size)
+    limit = CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // portion)  # bounded memory for the increments
     for start in range(0, size, portion):
         chosen = slice(start, min(start + portion, size))
         parameters, axes = family.batched(chosen)
         state = before = begin_all(family.form, parameters, axes, method, jnp.asarray(record.x0[chosen]))
         first = {name: np.asarray(value) for name, value in before._asdict().items()}
         record.begin(chosen, first["x"], first["energy"], first["entropy"])
+        taken = 0
         try:
-            for h, saves, every, place in calls(course, CHUNK_STEPS):
+            for h, saves, every, place in calls(course, limit):
                 numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
-                state, kept = advance_all(family.form, parameters, axes, method, state, *numbers)
+                increments = None if noise is None else array.rows(noise.rows(chosen, taken, saves * every, h))
+                state, kept = advance_all(family.form, parameters, axes, method, state, *numbers, increments)
+                taken += saves * every
                 if place is not None:
                     columns = [kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])]
                     record.keep(chosen, place, np.concatenate(columns, axis=-1))
@@ -180,8 +192,8 @@ def begin_all(form, parameters, axes, method, x):
 
 
 @program
-def advance_all(form, parameters, axes, method, state, h, saves: int, every):
-    def one(p, state):
-        return array.advance(form.rebuild(p), method, state, h, saves, every, saves)
+def advance_all(form, parameters, axes, method, state, h, saves: int, every, noise=None):
+    def one(p, state, noise):
+        return array.advance(form.rebuild(p), method, state, h, saves, every, saves, noise=noise)
 
-    return jax.vmap(one, in_axes=(axes, 0))(parameters, state)
+    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, noise)

@@ -17,6 +17,7 @@ from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .batches import THREADS, Tally, first_array, first_compiled, run_array, run_compiled
 from .family import Family, common_size, why_not
+from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .preparation import NO_GROUP, as_run, check_choice, laws_of
 from .presented import provenance_of
 from .progress import Progress
@@ -41,6 +42,7 @@ def ensemble(
     engine: Literal["auto", "array", "compiled"] = "auto",
     attitude=None,
     progress: bool | None = None,
+    noise: Fluctuations | None = None,
 ) -> Ensemble:
     """Integrate many trajectories of one system, or of a family of systems.
 
@@ -69,6 +71,8 @@ def ensemble(
         As for :func:`integrate`; one for all, or one each.
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
+    noise : Fluctuations, optional
+        As for :func:`integrate`; every trajectory has its own, which depends on its number alone.
 
     Returns
     -------
@@ -82,7 +86,7 @@ def ensemble(
         values are tried one by one, and the next where these are inadmissible.
     """
     started = time.perf_counter()
-    method = DEFAULT_METHOD if method is None else method
+    method = (DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE) if method is None else method
     if not isinstance(method, OneStepMethod):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
     outputs = outputs or ("final" if save_at is None else "trajectory")
@@ -98,10 +102,12 @@ def ensemble(
     if np.ndim(x0s) > 2 and getattr(system, "space", None) is None:
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
     states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
+    check_noise(noise, len(states))
     run = np.setdiff1d(np.arange(len(states)), list(reasons))
     family, states = family.select(run), states[run]
     told = member = family.representative
-    member, method = as_run(member, method)
+    member, method = as_run(member, method, noise)
+    paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
     if isinstance(member, AttitudeSystem):
         attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
         family, states = family.through(AttitudeSystem), np.asarray(member.begin(states, attitude, batch=True))
@@ -117,14 +123,14 @@ def ensemble(
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
         if chosen == "compiled":
             try:
-                run_compiled(family, method, record, Tally(bar.update))
+                run_compiled(family, method, record, Tally(bar.update), paths)
             except UnsupportedPrimitive as error:
                 if engine == "compiled":
                     raise
                 warn_of_fallback(error)
                 chosen = "array"
         if chosen == "array":
-            run_array(family, method, record, Tally(bar.update))
+            run_array(family, method, record, Tally(bar.update), paths)
     h = course.parts[0].h if course.parts[0].full else course.parts[0].last
     first = FirstSteps(record, method, first_compiled if chosen == "compiled" else first_array, h)
     return record.result(
@@ -137,6 +143,7 @@ def ensemble(
         provenance={
             **provenance_of(told, method, course.h, (course.start, course.end), course.every),
             "engine": chosen,
+            "noise": None if noise is None else noise.listed(),
         },
         witness=first if has_estimate(method) else None,
         alone=Alone(record, method, run),

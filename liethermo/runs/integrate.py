@@ -13,6 +13,7 @@ from ..results.solution import Solution
 from ..systems import AttitudeSystem, DrivenSystem, System
 from .adaptive import Adaptive
 from .events import Relaxed
+from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from .preparation import NO_GROUP, as_run, check_choice, prepared
 from .progress import Progress
 from .run import Run
@@ -37,6 +38,7 @@ def integrate(
     progress: bool | None = None,
     save_to: str | os.PathLike | None = None,
     attitude=None,
+    noise: Fluctuations | None = None,
 ) -> Solution:
     """Integrate a system from a state over a span of time.
 
@@ -77,6 +79,9 @@ def integrate(
         Write the solution here, also on failure and at most once a minute on the way.
     attitude : array, shape (m, m), optional
         Where the system has a group: its element at the start, the identity by default.
+    noise : Fluctuations, optional
+        ``lt.Fluctuations(boltzmann, seed)``: the noise that belongs to the dissipation. Steps are then of one size, by
+        ``MetriplecticMidpoint``, which is the default.
 
     Returns
     -------
@@ -90,7 +95,9 @@ def integrate(
     ConvergenceError, NonFiniteError
         If a step fails and ``on_failure`` is "raise".
     """
-    method = DEFAULT_METHOD if method is None else method
+    check_noise(noise)
+    default = DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE
+    method = default if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
     if not isinstance(system, System):
@@ -99,7 +106,7 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    system, method = as_run(system, method)
+    system, method = as_run(system, method, noise)
     prepared(system, method)  # refuses what the method cannot run
     if attitude is not None and not isinstance(system, AttitudeSystem):
         raise InputError(NO_GROUP)
@@ -108,6 +115,11 @@ def integrate(
     if looks and isinstance(method, Reference):
         raise InputError(
             "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
+        )
+    if noise is not None and (adaptive or dense or until is not None):
+        raise InputError(
+            "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
+            "are for runs without"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
     if isinstance(system, AttitudeSystem):
@@ -118,7 +130,7 @@ def integrate(
         x = system.state(x0)
     if reason := system.outside(x):
         raise InputError(f"the run cannot start at this x0: {reason}")
-    run = Run(system, method, x, table, save_to, engine)
+    run = Run(system, method, x, table, save_to, engine, noise)
     with Progress((table.start, table.end), progress) as bar:
         if looks:
             run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)

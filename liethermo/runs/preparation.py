@@ -10,6 +10,7 @@ from ..integrators import OneStepMethod, WithAttitude
 from ..results.status import Laws
 from ..systems import AttitudeSystem, LiePoissonSystem, System, driven
 from ..tracing.remembered import remembered
+from .fluctuations import Fluctuations
 
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
 
@@ -21,15 +22,18 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
 
 
 @remembered
-def as_run(system: System, method) -> tuple[System, Any]:
+def as_run(system: System, method, noise: Fluctuations | None = None) -> tuple[System, Any]:
     """The system and the method as they are run.
 
-    With clock and work where the energy depends on time, with attitudes where there is a group, in charts on a
-    manifold.
+    With clock and work where the energy depends on time, with noise, with attitudes where there is a group, in charts
+    on a manifold.
     """
     if not isinstance(method, OneStepMethod):
+        if noise is not None:
+            raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
         return driven(system, unit=1.0), method  # its errors are measured component by component
     system = driven(system)
+    method = method if noise is None else noise.on(system, method)
     method = traced_energies(method.pulled(system).on(system), system.dim)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
@@ -51,6 +55,10 @@ def laws_of(system: System, method, invariants) -> Laws:
     constants = [name for name, (_, kept) in invariants.items() if kept]
     conserved = tuple(name for name in constants if keeps(system, name))
     unpromised = tuple(name for name in constants if name not in conserved)
+    if isinstance(method, OneStepMethod) and method.increments:  # what holds on paths, and what in the mean
+        energy = "conserved" if system.energy_law == "conserved" else None
+        mean = ("energy", "entropy") if energy is None else ("entropy",)
+        return Laws(energy, None, conserved, tuple(system.ledger), (), system.balance, unpromised, mean)
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)

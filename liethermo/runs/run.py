@@ -22,6 +22,7 @@ from ..tracing.programs import program
 from .adaptive import Adaptive
 from .ending import given_up, stats_of, status_of
 from .events import Event
+from .fluctuations import Fluctuations, Path
 from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, stops_of
 from .stepwise import run as run_stepwise
@@ -37,7 +38,7 @@ CHECKPOINT_SECONDS = 60.0
 class Run:
     """A run under way: what has been saved, and how it stands."""
 
-    def __init__(self, system, method, x0, table: Timetable, save_to, engine):
+    def __init__(self, system, method, x0, table: Timetable, save_to, engine, noise: Fluctuations | None = None):
         self.system, self.method, self.table = system, method, table
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
@@ -51,7 +52,9 @@ class Run:
         self.dense: Dense | None = None
         self.longest: list[float] = []  # steps after each state that is kept
         self.capacity: int | None = None
-        self.engine = Chosen(system, method, engine, table.steps)
+        self.noise = noise
+        path = None if noise is None or not method.increments else Path(noise, method.increments)
+        self.engine = Chosen(system, method, engine, table.steps, path)
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -228,6 +231,7 @@ class Run:
         return {
             **provenance_of(self.system, self.method, self.step, (self.table.start, self.table.end), self.table.every),
             "engine": None if isinstance(self.method, Reference) else self.engine.name,
+            "noise": None if self.noise is None else self.noise.listed(),
             "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,
         }
 

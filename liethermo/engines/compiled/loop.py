@@ -70,7 +70,7 @@ def step_loop(
         Of a method that has nothing to solve: what its one iteration does not do, Newton's method cannot.
     """
     module = ir.Module("steps")
-    kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, POINTER]
+    kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, NUMBERS, POINTER]
     function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
     function.args[0].add_attribute("noalias")
     _Steps(function, pieces, layout, state, varies, lanes, explicit).write_loops()
@@ -80,17 +80,18 @@ def step_loop(
 
 
 class _Steps(Writer):
-    """Writes ``advance(p, blocks, done, count, saves, every, out, most, newton)``.
+    """Writes ``advance(p, blocks, done, count, saves, every, out, most, noise, newton)``.
 
     Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept in ``out``, with its energy
-    and entropy. No further than ``most`` steps, or to where a block needs Newton's method and ``newton`` is null: the
-    number of that block is returned, and another call goes on there; otherwise the number of blocks.
+    and entropy; the increments that drive the steps are read from ``noise``, block by block. No further than ``most``
+    steps, or to where a block needs Newton's method and ``newton`` is null: the number of that block is returned, and
+    another call goes on there; otherwise the number of blocks.
     """
 
     def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool):
         super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
         self.pieces, self.layout, self.state, self.explicit = pieces, layout, state, explicit
-        names = "p blocks done count saves every out most newton" if len(function.args) > 3 else "p blocks count"
+        names = "p blocks done count saves every out most noise newton" if len(function.args) > 3 else "p blocks count"
         self.argument = dict(zip(names.split(), function.args, strict=True))
         own = np.cumsum(varies) - 1
         self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
@@ -122,6 +123,7 @@ class _Steps(Writer):
                 return build.and_(running, build.icmp_signed("<", build.load(done), end))
 
             with self.repeated(goes_on):
+                self.drive(build.add(build.mul(i, total), build.load(done)))
                 self.step(i)
                 build.store(build.add(build.load(done), self.whole_number(1)), done)
                 with build.if_then(
@@ -163,10 +165,18 @@ class _Steps(Writer):
                 self.newton(i, hard)
         self.run("conclude", build.load(truth["running"]))
 
+    def drive(self, number: ir.Value) -> None:
+        """The increments of a step, from the so-manieth row of ``noise``."""
+        build, slots = self.builder, self.slots["dW"]
+        row = build.mul(number, self.whole_number(len(slots) * self.lanes))
+        for j, slot in enumerate(slots):
+            start = build.gep(self.argument["noise"], [build.add(row, self.whole_number(j * self.lanes))])
+            build.store(build.load(build.bitcast(start, self.number.as_pointer()), align=8), slot)
+
     def newton(self, i: ir.Value, hard: ir.Value) -> None:
         """Newton's method for the lanes that need it; the loop is left where there is none."""
         build, argument = self.builder, self.argument
-        self.save(self.state)
+        self.save((*self.state, "dW"))
         with build.if_then(build.icmp_unsigned("==", argument["newton"], ir.Constant(POINTER, None))):
             build.ret(i)
         solve = ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE])

@@ -18,16 +18,17 @@ from ..rules import Rules
 from .loop import NUMBERS, SOLVED, Layout, Piece
 from .machine_code import NUMBER, WHOLE, MachineCode, Writer
 
-GIVEN = ("x", "low", "h", "k", "before")
+GIVEN = ("dW", "x", "low", "h", "k", "before")
 """What is taken from a block, beside the trajectory's own parameters."""
 
 
-def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> dict[str, Piece]:
+def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece], rules: Rules) -> dict[str, Piece]:
     """The programs of Newton's method: see :func:`solver`.
 
     Parameters
     ----------
     both : function from parameters to a system and a method
+    driven : function from parameters and the increments of a step to a system and the method of that step
     piece : function from a function, the names of its arguments and of its results
     """
 
@@ -41,13 +42,13 @@ def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> 
     def rest(k):
         return fresh(jnp.zeros_like(k))
 
-    def misfit(p, x, low, h, k):
-        system, method = both(p)
+    def misfit(p, dW, x, low, h, k):
+        system, method = driven(p, dW)
         new = method.slopes(system, x, low, h, k)
         return new, jnp.max(jnp.abs(new - k)), jnp.linalg.norm(new - k)
 
-    def along(p, x, low, h, k, direction):
-        system, method = both(p)
+    def along(p, dW, x, low, h, k, direction):
+        system, method = driven(p, dW)
         return method.change(system, x, low, h, k, direction)
 
     def direct(k, new, used, renew):
@@ -94,12 +95,12 @@ def newton_pieces(both: Callable, piece: Callable[..., Piece], rules: Rules) -> 
     start = (*iteration.split(), "used", "renew", "goes_on", "noise")
     judged = (*iteration.split()[1:], "used", "goes_on", "renew", "converged", "defined", "uncertain", "noise")
     # of a derivative, what is the same in every direction is computed once a Jacobian
-    whole = piece(along, "p x low h guess direction", ("changes",))
-    first, rest_of_it = whole.program.split([5])
+    whole = piece(along, "p dW x low h guess direction", ("changes",))
+    first, rest_of_it = whole.program.split([6])
     return {
         "begin": piece(begin, "p k before", start),
         "rest": piece(rest, "k", start),
-        "misfit": piece(misfit, "p x low h guess", ("new", "missed", "found")),
+        "misfit": piece(misfit, "p dW x low h guess", ("new", "missed", "found")),
         "linearise": Piece(first, whole.arguments, ("linear",)),
         "along": Piece(rest_of_it, (*whole.arguments, "linear"), ("changes",)),
         "direct": piece(direct, "guess new used renew", ("direction", "used")),

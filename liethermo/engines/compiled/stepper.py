@@ -55,18 +55,18 @@ class CompiledEngine:
     def begin(self, x) -> State:
         return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None]))
 
-    def advance(self, state: State, h, saves: int, every: int, capacity: int):
+    def advance(self, state: State, h, saves: int, every: int, capacity: int, noise=None):
         del capacity  # nothing is compiled for a number of saves
-        new, out = self._run(state, h, saves, every)
+        new, out = self._run(state, h, saves, every, noise)
         reached = np.arange(saves) < (int(new.step) - int(state.step)) // every
         return new, (out[:, :-2], out[:, -2], out[:, -1], reached)
 
-    def step(self, state: State, h) -> State:
-        return self._run(state, h, 1, 1)[0]
+    def step(self, state: State, h, noise=None) -> State:
+        return self._run(state, h, 1, 1, noise)[0]
 
-    def _run(self, state: State, h, saves: int, every: int) -> tuple[State, np.ndarray]:
+    def _run(self, state: State, h, saves: int, every: int, noise) -> tuple[State, np.ndarray]:
         blocks = self._stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in FIELDS})
-        out = self._stepper.run(self._parameters, blocks, h, saves, every)[0]
+        out = self._stepper.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
         return self._state(blocks), out
 
     def _state(self, blocks: np.ndarray) -> State:
@@ -118,8 +118,12 @@ class Stepper:
             iteration = both(p)[1].predict(k, before), infinite, infinite, zero, zero, zero
             return *iteration, zero, zero + 1.0, zero  # of Newton's method: iterations, defined, noise
 
-        def iterate(p, x, low, h, *iteration):
+        def driven(p, dW) -> tuple[System, OneStepMethod]:
             system, method = both(p)
+            return system, method.driven_by(dW)
+
+        def iterate(p, dW, x, low, h, *iteration):
+            system, method = driven(p, dW)
             if method.explicit:
                 solved = array.explicit(system, method, x, low, h, iteration[0], rules)
                 _, _, best, stalled, rate, made = iteration
@@ -134,14 +138,15 @@ class Stepper:
             solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
             return array.conclude(*both(p), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
 
-        self._both, self._explicit = both, method.explicit
+        self._both, self._driven, self._explicit, self._increments = both, driven, method.explicit, method.increments
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
+        self._shapes["dW"] = (method.increments,)
         self._shapes |= dict.fromkeys(("k", "before", "guess", "old", "new", "direction", "changes"), (stages, n))
 
         after = ("converged", "going")
         pieces = {
             "prepare": self._piece(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
-            "iterate": self._piece(iterate, f"p x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
+            "iterate": self._piece(iterate, f"p dW x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
             "conclude": self._piece(
                 conclude, f"p h guess update converged defined made newtons noise {' '.join(FIELDS)}", FIELDS
             ),
@@ -150,7 +155,7 @@ class Stepper:
         self._start = self._piece(begin, "p x", FIELDS)
         own_size = int(varies.sum())
         working = (*ITERATION, *after, "defined", "newtons", "noise")
-        shapes = {name: self._shapes.get(name, ()) for name in (*FIELDS, "h")} | {"p": (own_size,)}
+        shapes = {name: self._shapes.get(name, ()) for name in (*FIELDS, "h", "dW")} | {"p": (own_size,)}
         shapes |= {name: self._shapes.get(name, ()) for name in working}
         # Newton's method is handed these in the block; without it they stay in registers
         self._layout = Layout(shapes, working if method.explicit else ())
@@ -218,8 +223,10 @@ class Stepper:
             found[name] = values.reshape(len(blocks) * self.lanes, *self._shapes.get(name, ()))
         return found
 
-    def run(self, parameters, blocks: np.ndarray, h: float, saves: int, every: int) -> np.ndarray:
+    def run(self, parameters, blocks: np.ndarray, h: float, saves: int, every: int, noise=None) -> np.ndarray:
         """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
+
+        ``noise`` has the increments, shape (trajectories, steps, increments), of a method that is driven by any.
 
         Returns, at each save, every trajectory's state, energy and entropy: shape (trajectories, saves, n + 2), with
         those of empty lanes, and undefined after a failure.
@@ -231,11 +238,20 @@ class Stepper:
         out, done = np.empty((count, saves, (n + 2) * lanes)), np.zeros(count, dtype=np.int64)
         saves, every = int(saves), int(every)
         arguments = [parameters.ctypes.data, blocks.ctypes.data, done.ctypes.data, count, saves, every]
-        arguments += [out.ctypes.data, saves * every]
+        increments = self._in_blocks(noise, count, saves * every)
+        arguments += [out.ctypes.data, saves * every, increments.ctypes.data]
         solve = 0 if self._newton is None else self._solver()
         while self._code()[1](*arguments, solve) < count:
             solve = self._solver()
         return out.reshape(count, saves, n + 2, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, n + 2)
+
+    def _in_blocks(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
+        """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
+        if noise is None or not self._increments:
+            return np.zeros((count, steps, self._increments, self.lanes))
+        padded = np.zeros((count * self.lanes, steps, self._increments))
+        padded[: len(noise)] = noise
+        return np.ascontiguousarray(padded.reshape(count, self.lanes, steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
@@ -253,7 +269,7 @@ class Stepper:
         """The address of Newton's method, which is compiled when a step first needs it."""
         with self._lock:
             if self._newton is None:
-                pieces = newton_pieces(self._both, self._piece, self._rules)
+                pieces = newton_pieces(self._both, self._driven, self._piece, self._rules)
                 linear = {"linear": pieces["linearise"].program.shapes[0]}
                 names = {name for piece in pieces.values() for name in (*piece.arguments, *piece.results)} - {"p"}
                 shapes = {name: self._shapes.get(name, ()) for name in sorted(names)} | linear
@@ -262,7 +278,7 @@ class Stepper:
 
 
 ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
-                           ctypes.c_int64, ctypes.c_void_p)  # fmt: skip
+                           ctypes.c_int64, *[ctypes.c_void_p] * 2)  # fmt: skip
 
 BEGIN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 

@@ -54,9 +54,9 @@ class SparseEngine:
     def begin(self, x) -> array.State:
         return array.begin(self.system, self.method, x)
 
-    def advance(self, state, h, saves, every, capacity: int):
+    def advance(self, state, h, saves, every, capacity: int, noise=None):
         """Keeps no more than it reaches."""
-        del capacity
+        del capacity, noise  # steps with noise are not for this engine
         kept: list[array.State] = []
         for _ in range(int(saves)):
             for _ in range(int(every)):
@@ -70,8 +70,9 @@ class SparseEngine:
         energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
 
-    def step(self, state: array.State, h) -> array.State:
+    def step(self, state: array.State, h, noise=None) -> array.State:
         """One step; where it fails the state is left as it was, with a status."""
+        del noise
         h = jnp.asarray(h, dtype=jnp.float64)
         solved = _fixed_point(self.system, self.method, state, h)
         if not bool(solved.converged):

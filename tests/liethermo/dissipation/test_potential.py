@@ -132,7 +132,7 @@ def test_a_potential_needs_a_factor_and_returns_a_number():
 POTENTIALS = {
     "coulomb": lambda rate: lt.DissipationPotential(lt.CoulombFriction(rate, 0.1)),
     "power": lambda rate: lt.DissipationPotential(lt.PowerLawFriction(2.5, rate)),
-    "activated": lambda rate: lt.DissipationPotential(lt.ActivatedFriction(rate, 2.0)),
+    "activated": lambda rate: lt.DissipationPotential(lt.ActivatedFriction(rate, 5.0)),
 }
 
 

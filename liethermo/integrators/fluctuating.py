@@ -1,0 +1,187 @@
+"""Steps with noise: the metriplectic midpoint scheme of the stochastic equation."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..dissipation.base import Dissipation
+from ..dissipation.factor import Factor, beside
+from ..dissipation.noise import divergence, factors
+from ..errors import InputError
+from ..functions.energy import Energy
+from ..systems import System
+from ..tracing.interpret import at_points
+from .base import OneStepMethod
+from .midpoint import MetriplecticMidpoint
+
+MISFIT = 1e-10
+"""Of ``B B^T`` and the friction matrix, relative to that."""
+
+
+class Fluctuating(OneStepMethod):
+    """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [EQUATIONS §4, "Fluctuations"].
+
+    As ``div K = sum_a (b_a . grad) b_a + b_a div b_a`` over the columns of B, the first of which is what turns
+    Stratonovich's integral into Itô's, a step is
+
+        (x' - x) / h = Pi(z) dgrad H + K_d(z) grad S(z) + B_d(z) (k div B(z) + sqrt(2 k) dW / h)
+
+    at the midpoint z, with K_d and B_d rebuilt from the discrete gradient of H: that is in the kernel of both, so the
+    energy is exact on every path, and what noise and friction keep by construction is too. A summand of the dissipation
+    that lowers the energy fluctuates with ``k T`` in the place of k, T the temperature of the bath that takes it.
+
+    Mean-square order 1/2 (1 where the noise commutes), weak order 1 or better. It keeps no entropy law on paths. Made
+    by :func:`liethermo.integrate` from the method that it is given and the ``noise``.
+
+    Attributes
+    ----------
+    method : MetriplecticMidpoint
+    boltzmann : array, shape ()
+    temperature : array, shape ()
+        Of the bath, where there is one.
+    density : Energy or None
+        Logarithm of the density of the measure that the motion keeps.
+    dW : array, shape (increments,)
+        Those of a step.
+    """
+
+    method: MetriplecticMidpoint
+    boltzmann: jax.Array
+    temperature: jax.Array
+    density: Energy | None
+    dW: jax.Array
+
+    @property
+    def stages(self) -> int:
+        return 1
+
+    @property
+    def order(self) -> int:
+        return 1
+
+    @property
+    def preserves(self) -> frozenset[str]:
+        return self.method.preserves - {"entropy_law_quadratic"}
+
+    @property
+    def increments(self) -> int:
+        return self.dW.shape[0]
+
+    def driven_by(self, dW) -> OneStepMethod:
+        return Fluctuating(self.method, self.boltzmann, self.temperature, self.density, dW)
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        z, dH, dS, dL = self.method.at_midpoint(system, x, low, h, k)
+        assert system.dissipation is not None
+        parts = factors(system.dissipation, system, z, dH, dL)
+        B, quanta = beside([B for _, B in parts]), self._quanta(parts)
+        push = quanta * divergence(system.dissipation, system, z)
+        if self.density is not None:
+            push = push + quanta * B.transposed(self.density.gradient(z))
+        return (system.field(z, dH, dS, dL) + B.times(push + jnp.sqrt(2.0 * quanta) * (self.dW / h)))[None]
+
+    def _quanta(self, parts: list[tuple[Dissipation, Factor]]) -> jax.Array:
+        """``k``, or ``k T`` where the energy is taken by a bath, for every column."""
+        factors_of_k = [jnp.ones(()) if part.energy_law == "conserved" else self.temperature for part, _ in parts]
+        return self.boltzmann * jnp.concatenate(
+            [jnp.full(B.size, T) for T, (_, B) in zip(factors_of_k, parts, strict=True)]
+        )
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        return self.method.velocities(system, x, low, h, k)
+
+    def increment(self, h, k) -> jax.Array:
+        return self.method.increment(h, k)
+
+    def predict(self, k, before) -> jax.Array:
+        """The noise of a step has nothing to do with that of those before."""
+        del before
+        return jnp.zeros_like(k)
+
+    def keeps(self, system: System, name: str) -> bool:
+        return self.method.keeps(system, name) and undisturbed(system, system.functions()[name])
+
+    def check(self, system: System) -> None:
+        """Raise InputError where there is no noise that belongs to the dissipation."""
+        self.method.check(system)
+        misfit = np.nanmax(_at_some(_misfit, system, system), initial=0.0)
+        if not misfit <= MISFIT:
+            raise InputError(
+                f"the factor B that a dissipation gives is none of its friction matrix K: B B^T dS misses K dS "
+                f"by {misfit:.3g} of its size (tolerance {MISFIT:.0g})"
+            )
+
+    def __str__(self) -> str:
+        return f"{self.method} with noise"
+
+
+def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, density: Energy | None) -> Fluctuating:
+    """The method for the system with its fluctuations.
+
+    Raises
+    ------
+    InputError
+        If there are none for this system, or this method.
+    """
+    if not isinstance(method, MetriplecticMidpoint):
+        raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
+    if system.space is not None:
+        raise InputError(
+            f"noise is for states in R^n, and this system is on {system.space.name}: a spin is a state of so(3)* too"
+        )
+    if system.dissipation is None:
+        raise InputError("noise belongs to a dissipation, and this system has none")
+    lowers = [part for part in system.dissipation.terms if part.energy_law != "conserved"]
+    if lowers and temperature is None:
+        raise InputError(
+            f"{type(lowers[0]).__name__} lowers the energy: give the temperature of the bath that takes it, "
+            "lt.Fluctuations(boltzmann, seed, temperature=...)"
+        )
+    if temperature is not None and not lowers:
+        raise InputError("the dissipation keeps the energy, so there is no bath that could have a temperature")
+    size = sum(B.size for _, B in _at(system, jnp.zeros(system.dim)))
+    T = 1.0 if temperature is None else temperature
+    return Fluctuating(method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(size))
+
+
+def undisturbed(system: System, function: Energy) -> bool:
+    """Whether no noise changes a function: ``B^T grad f = 0`` at random points."""
+    moved, size = _at_some(_moved, (system, function), system).T
+    inside = np.isfinite(moved)
+    return bool(inside.any() and (moved[inside] <= MISFIT * size[inside]).all())
+
+
+def _at_some(measure, model, system: System) -> np.ndarray:
+    return np.asarray(at_points(measure, model, system.samples(4)))
+
+
+def _at(system: System, x) -> list[tuple[Dissipation, Factor]]:
+    assert system.dissipation is not None
+    dL = [L.gradient(x) for L in system.preserved]
+    return factors(system.dissipation, system, x, system.energy.gradient(x), dL)
+
+
+def _misfit(system: System, x):
+    """What ``B B^T`` misses of K, on a vector, relative to its image."""
+    assert system.dissipation is not None
+    parts = _at(system, x)
+    dH, dL = system.energy.gradient(x), [L.gradient(x) for L in system.preserved]
+    away = jnp.asarray(np.random.default_rng(0).standard_normal(system.dim))
+    missed = [jnp.zeros(())]
+    start = 0
+    for part, B in parts:
+        own, start = tuple(dL[start : start + len(part.preserve)]), start + len(part.preserve)
+        sign, along = (1.0, away) if part.energy_law == "conserved" else (-1.0, dH)
+        force = part.force(system, x, dH, away, own)
+        size = jnp.max(jnp.abs(force))
+        missed.append(jnp.max(jnp.abs(sign * B.times(B.transposed(along)) - force)) / jnp.where(size > 0.0, size, 1.0))
+    return jnp.max(jnp.stack(missed))
+
+
+def _moved(model: tuple[System, Energy], x):
+    system, function = model
+    B, gradient = beside([B for _, B in _at(system, x)]), function.gradient(x)
+    columns = jax.vmap(B.times)(jnp.eye(B.size))
+    return jnp.stack([jnp.max(jnp.abs(columns @ gradient)), jnp.max(jnp.abs(columns)) * jnp.linalg.norm(gradient)])

@@ -1,0 +1,145 @@
+"""Noise of a run: how large it is, and the random numbers of every step, found by counting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..functions.energy import Energy, as_energy
+from ..integrators import MetriplecticMidpoint, OneStepMethod
+from ..integrators.fluctuating import with_noise
+from ..systems import System
+from .threefry import normal
+
+BOUND = 6.0
+"""Standard deviations that no random number exceeds, so that the equation of a step keeps a solution: one in 5e8 would,
+and to cut it off changes their variance by 1e-8."""
+
+
+@dataclass(frozen=True)
+class Fluctuations:
+    """Noise that belongs to the dissipation: ``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW``, ``B B^T = K``.
+
+    Of a dissipation that keeps the energy every path has the energy of its start, exactly, and the measure that the
+    states tend to is ``exp(S / k)`` on that level of the energy (and of whatever else motion and noise keep), where the
+    motion keeps volumes: on duals of unimodular algebras and in canonical coordinates it does. With a ``temperature``,
+    for dissipations that lower the energy (:class:`DoubleBracket`, :class:`Friction`), it is ``exp(-H / (k T))``: that
+    of a body in a bath, Langevin's equation.
+
+    The random numbers of a step are functions of the seed, the number of the trajectory and the number of the step
+    alone: they do not depend on the engine, nor on how a run or an ensemble is divided up. A normal number is cut off
+    at six standard deviations.
+
+    Parameters
+    ----------
+    boltzmann : float, >= 0
+        k, in the units of the entropy: how large fluctuations are. Zero is the run without noise, to the bit.
+    seed : int, >= 0; or one for every trajectory of an ensemble, no two alike
+    temperature : float, >= 0, optional
+        Of the bath, where there is one.
+    density : function from a state to a number, optional
+        The logarithm of the density of the measure that the motion keeps, where that is not volume; the states tend to
+        its product with the above.
+    first : int, >= 0
+        Number of the first trajectory: ``first=i`` of a single run is trajectory i of an ensemble.
+    """
+
+    boltzmann: float = 1.0
+    seed: int | Sequence[int] = 0
+    temperature: float | None = None
+    density: Callable | Energy | None = None
+    first: int = 0
+
+    def __post_init__(self):
+        _check("boltzmann", self.boltzmann)
+        if self.temperature is not None:
+            _check("the temperature", self.temperature)
+        seeds = self.seeds
+        for name, numbers, bits in (("seed", seeds, 63), ("first", [self.first], 31)):
+            whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in numbers)
+            if not (whole and all(0 <= n < 2**bits for n in numbers)):
+                raise InputError(f"{name} is an integer from 0 to 2^{bits} - 1, not {getattr(self, name)!r}")
+        if len(set(seeds)) < len(seeds):
+            again = next(seed for i, seed in enumerate(seeds) if seed in seeds[:i])
+            places = [i for i, seed in enumerate(seeds) if seed == again]
+            raise InputError(
+                f"the seed {again} is given to the trajectories {places[0]} and {places[1]}: they would have the same "
+                "noise. One seed for all is enough, the numbers of the trajectories set them apart"
+            )
+
+    @property
+    def seeds(self) -> list[int]:
+        """One, or one for each trajectory."""
+        return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
+
+    def of(self, i: int) -> Fluctuations:
+        """The noise of one trajectory of an ensemble."""
+        return replace(self, first=self.first + i) if len(self.seeds) == 1 else replace(self, seed=self.seeds[i])
+
+    def listed(self) -> dict[str, Any]:
+        """For the provenance of a run."""
+        density = None if self.density is None else getattr(self.density, "__name__", str(self.density))
+        return {**vars(self), "seed": self.seeds if len(self.seeds) > 1 else self.seeds[0], "density": density}
+
+    def on(self, system: System, method: OneStepMethod) -> OneStepMethod:
+        """The method for steps with this noise; itself where there is none."""
+        if not self.boltzmann:
+            return method
+        density = None if self.density is None else as_energy(self.density, "the density")
+        return with_noise(system, method, self.boltzmann, self.temperature, density)
+
+    def rows(self, increments: int, members: np.ndarray, first: int, steps: int, h: float) -> np.ndarray:
+        """Increments of consecutive steps of size h of some trajectories, shape (trajectories, steps, increments)."""
+        if len(self.seeds) == 1:
+            seeds, numbers = np.full(len(members), self.seeds[0]), members + self.first
+        else:
+            seeds, numbers = np.asarray(self.seeds)[members], np.full(len(members), self.first)
+        return np.sqrt(h) * np.clip(normal(seeds, numbers, first, steps, increments), -BOUND, BOUND)
+
+
+@dataclass(frozen=True)
+class Path:
+    """The noise of one trajectory: see :class:`liethermo.engines.choice.Noise`."""
+
+    noise: Fluctuations
+    increments: int
+
+    def rows(self, first: int, steps: int, h) -> np.ndarray:
+        return self.noise.rows(self.increments, np.zeros(1, dtype=int), first, steps, float(h))[0]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """That of the trajectories of an ensemble with the given numbers, shape (B,)."""
+
+    noise: Fluctuations
+    increments: int
+    numbers: np.ndarray
+
+    def rows(self, chosen: slice, first: int, steps: int, h) -> np.ndarray:
+        return self.noise.rows(self.increments, self.numbers[chosen], first, steps, float(h))
+
+
+def check_noise(noise, members: int = 1) -> None:
+    """Raise InputError unless this is noise for so many trajectories, or none."""
+    if noise is not None and not isinstance(noise, Fluctuations):
+        raise InputError(f"noise is lt.Fluctuations(boltzmann, seed), not {noise!r}")
+    if noise is not None and len(noise.seeds) not in (1, members):
+        raise InputError(f"{len(noise.seeds)} seeds for {members} trajectories: give one, or one for each")
+
+
+DEFAULT_WITH_NOISE = MetriplecticMidpoint()
+"""The method of runs with noise where none is named."""
+
+
+def _check(what: str, value) -> None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is one number, not {value!r}") from None
+    if not (0.0 <= number < np.inf):
+        raise InputError(f"{what} must be finite and >= 0, not {number:g}")

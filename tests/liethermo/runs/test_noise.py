@@ -1,0 +1,209 @@
+"""Runs with noise: exact energy on every path, one path whatever takes it, no noise to the bit, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.runs.threefry import threefry
+
+ENTROPY = lt.Quadratic(4.0 * np.ones(3))
+BODY = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), ENTROPY, lt.KillingDissipation(0.5))
+CURVED = lt.LiePoissonSystem(
+    mf.so(3),
+    lambda m: 0.5 * jnp.sum(m * m * jnp.array([1 / 3, 1 / 2, 1.0])) + 0.3 * jnp.cos(2.0 * m[0]),
+    ENTROPY,
+    lt.ProjectedMetric(normalized=True, rate=0.5),
+)
+FIELD = np.array([0.0, 0.0, -1.0])
+SPIN = lt.LiePoissonSystem(mf.so(3), lambda s: jnp.dot(FIELD, s), None, lt.DoubleBracket(0.5))
+START = np.array([1.0, 0.3, 0.2])
+NOISE = lt.Fluctuations(1.0, seed=3)
+BATH = lt.Fluctuations(1.0, seed=3, temperature=0.5)
+
+
+def run(system, noise, engine, **arguments):
+    return lt.integrate(system, START, (0.0, 5.02), 0.05, noise=noise, engine=engine, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("system", "noise"),
+    [
+        pytest.param(BODY, NOISE, id="body", marks=pytest.mark.slow),
+        pytest.param(CURVED, NOISE, id="curved", marks=pytest.mark.slow),
+        pytest.param(SPIN, BATH, id="spin"),
+    ],
+)
+def test_both_engines_take_the_same_path(system, noise):
+    """The energy is exact on it, and so is the length of a spin in a bath; a short last step has its own noise."""
+    array, compiled = (run(system, noise, engine) for engine in ("array", "compiled"))
+    assert np.abs(array.x - compiled.x).max() < 1e-13
+    assert np.abs(np.diff(array.x, axis=0)).max() > 0.1
+    for solution in (array, compiled):
+        audit = solution.audit()
+        assert audit.passed, str(audit)
+        assert audit.energy_drift < 1e-14 or noise is BATH
+    if noise is BATH:
+        assert np.abs(np.linalg.norm(array.x, axis=1) / np.linalg.norm(START) - 1.0).max() < 1e-14
+        assert np.ptp(array.energy) > 0.1
+    else:
+        assert np.diff(array.entropy).min() < -0.01  # the entropy law is one of the mean
+        assert "a law of the mean" in str(array.audit())
+
+
+def test_a_path_depends_on_seed_and_numbers_alone():
+    """Not on what is saved, on the size of the ensemble, its lanes and portions, or the engine."""
+    whole = lt.ensemble(BODY, np.tile(START, (19, 1)), (0.0, 2.0), 0.05, noise=NOISE, outputs="trajectory")
+    assert whole.engine == "compiled"
+    assert len({x.tobytes() for x in whole.x[:, -1]}) == 19
+    one = lt.integrate(BODY, START, (0.0, 2.0), 0.05, noise=NOISE.of(17), engine="compiled", save_every=7)
+    assert np.array_equal(one.x[:-1], whole.x[17, ::7])
+    part = lt.ensemble(BODY, np.tile(START, (3, 1)), (0.0, 2.0), 0.05, noise=NOISE.of(16))
+    assert np.array_equal(part.x, whole.x[16:, -1])
+    seeds = lt.Fluctuations(1.0, seed=(5, 3))
+    two = lt.ensemble(BODY, np.tile(START, (2, 1)), (0.0, 2.0), 0.05, noise=seeds)
+    assert np.array_equal(two.x[1], whole.x[0, -1])
+    assert not np.array_equal(two.x[0], two.x[1])
+    stops = lt.ensemble(BODY, np.tile(START, (2, 1)), (0.0, 2.0), 0.05, noise=NOISE, save_at=[0.5, 1.0, 2.0])
+    assert np.abs(stops.x[:, 1:] - whole.x[:2, [10, 20, 40]]).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_an_ensemble_of_the_array_engine():
+    """By ``vmap``, over several calls of the engine."""
+    arguments = np.tile(START, (3, 1)), (0.0, 2.02), 0.05
+    array, compiled = (lt.ensemble(BODY, *arguments, noise=NOISE, engine=e) for e in ("array", "compiled"))
+    assert np.abs(array.x - compiled.x).max() < 1e-13
+
+
+def test_random_numbers_are_those_of_the_paper():
+    """The known answers that come with Random123."""
+    for key, counter, words in (
+        ((0, 0), (0, 0), (0x6B200159, 0x99BA4EFE)),
+        ((0xFFFFFFFF,) * 2, (0xFFFFFFFF,) * 2, (0x1CB996FC, 0xBB002BE7)),
+        ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
+    ):
+        found = threefry(*(tuple(np.array([w], np.uint32) for w in pair) for pair in (key, counter)))
+        assert tuple(int(w[0]) for w in found) == words
+
+
+def test_random_numbers_in_portions():
+    """Normal, independent, bounded; the same however they are asked for."""
+    whole = NOISE.rows(3, np.arange(40), 0, 1000, 1.0)
+    assert np.array_equal(NOISE.rows(3, np.arange(10, 20), 100, 57, 1.0), whole[10:20, 100:157])
+    assert np.array_equal(2.0 * NOISE.rows(3, np.arange(40), 0, 10, 0.25), whole[:, :10])
+    sample = whole.ravel()
+    count = len(sample)
+    assert abs(sample.mean()) < 4 / np.sqrt(count)
+    assert abs(sample.var() - 1.0) < 4 * np.sqrt(2 / count)
+    assert abs((sample**4).mean() - 3.0) < 4 * np.sqrt(96 / count)
+    assert abs((whole[:, 1:] * whole[:, :-1]).mean()) < 4 / np.sqrt(count)
+    assert abs((whole[1:] * whole[:-1]).mean()) < 4 / np.sqrt(count)
+    assert np.abs(sample).max() < 6.0
+
+
+@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
+def test_no_noise_is_the_run_without_to_the_bit(engine):
+    quiet = run(BODY, lt.Fluctuations(0.0), engine)
+    assert np.array_equal(quiet.x, run(BODY, None, engine, method=lt.MetriplecticMidpoint()).x)
+    assert quiet.audit().passed
+
+
+def test_little_noise_is_nearly_the_run_without():
+    """Of the size of the square root of k."""
+    still = run(BODY, None, "compiled", method=lt.MetriplecticMidpoint()).x
+    away = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
+    assert np.allclose(np.array(away[:-1]) / away[1:], 10.0, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_newton_where_the_fixed_point_is_too_far():
+    """Noise so large that fixed-point iteration fails; both engines solve the same equation."""
+    noise = lt.Fluctuations(6.0, 0)
+    array, compiled = (
+        lt.integrate(BODY, START, (0.0, 20.0), 0.1, noise=noise, engine=e) for e in ("array", "compiled")
+    )
+    assert min(array.stats.newton_iterations, compiled.stats.newton_iterations) > 0
+    for solution in (array, compiled):
+        assert solution.audit().passed
+    assert np.abs(array.x[:20] - compiled.x[:20]).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_attitudes_with_noise():
+    """A body that fluctuates has an attitude, in its group, and moves its momentum as without one."""
+    body = lt.LiePoissonSystem(mf.so(3), BODY.energy, ENTROPY, lt.KillingDissipation(0.5), group=mf.SO(3))
+    solution = run(body, NOISE, "array")
+    assert solution.audit().passed
+    assert np.abs(solution.x - run(BODY, NOISE, "array").x).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"boltzmann": -1.0}, "boltzmann must be finite and >= 0"),
+        ({"boltzmann": "much"}, "one number"),
+        ({"seed": -1}, "seed is an integer"),
+        ({"seed": 0.5}, "seed is an integer"),
+        ({"seed": (1, 2, 1)}, "the seed 1 is given to the trajectories 0 and 2"),
+        ({"temperature": -2.0}, "temperature"),
+        ({"first": -1}, "first is an integer"),
+    ],
+)
+def test_unusable_noise(arguments, words):
+    with pytest.raises(lt.InputError, match=words):
+        lt.Fluctuations(**arguments)
+
+
+class Crooked(lt.KillingDissipation):
+    """Control: a factor that is 10 % too large."""
+
+    def factor(self, system, x, dH, dL):
+        return super().factor(system, x, dH, dL).scaled(jnp.asarray(1.21))
+
+    def prepared(self, system):
+        found = super().prepared(system)
+        return Crooked(found.rate, found.form)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"dissipation": None}, "has none"),
+        ({"dissipation": lt.EulerPoincareForce(jnp.sin)}, "EulerPoincareForce gives no factor"),
+        ({"dissipation": lt.DissipationPotential(lt.CoulombFriction())}, "DissipationPotential gives no factor"),
+        ({"dissipation": lt.DoubleBracket()}, "temperature of the bath"),
+        ({"dissipation": Crooked()}, "misses K dS by 0.2"),
+        ({"noise": lt.Fluctuations(temperature=1.0)}, "no bath"),
+        ({"noise": 1e-3}, "lt.Fluctuations"),
+        ({"noise": lt.Fluctuations(seed=(1, 2))}, "2 seeds for 1"),
+        ({"method": lt.MetriplecticGauss(2)}, "MetriplecticGauss"),
+        ({"method": lt.MetriplecticRungeKutta(4)}, "MetriplecticRungeKutta"),
+        ({"method": lt.Reference()}, "Reference"),
+        ({"step": lt.Adaptive()}, "one size"),
+        ({"until": lt.Relaxed(1e-3)}, "one size"),
+        ({"dense": True}, "one size"),
+    ],
+)
+def test_what_has_no_noise(change, words):
+    system = lt.LiePoissonSystem(
+        mf.so(3), BODY.energy, ENTROPY, change.pop("dissipation", lt.KillingDissipation()), validate=False
+    )
+    arguments = {"step": 0.1, "noise": NOISE} | change
+    with pytest.raises(lt.InputError, match=words):
+        lt.integrate(system, START, (0.0, 1.0), **arguments)
+
+
+def test_no_noise_on_manifolds():
+    space = mf.Sphere(2)
+    system = lt.MetriplecticSystem(None, lambda x: x[2], lambda x: x[0], lt.ProjectedMetric(), space=space)
+    with pytest.raises(lt.InputError, match=r"R\^n"):
+        lt.integrate(system, [0.0, 0.6, 0.8], (0.0, 1.0), 0.1, noise=NOISE)
+
+
+def test_noise_is_named_in_the_provenance():
+    solution = run(BODY, NOISE, "compiled")
+    assert solution.provenance["noise"]["seed"] == 3
+    assert jax.__version__ == solution.provenance["jax"]
