@@ -1,9 +1,9 @@
 """The array engine: any one-step method on any system, in JAX.
 
 A step solves ``k = slopes(k)`` by fixed-point iteration from extrapolated slopes and, where that converges slowly
-or not at all, by simplified Newton with the exact Jacobian. Both stop at the *rounding plateau*, where the update
-no longer shrinks, rather than at a tolerance that could lie below it. All loops are ``lax.while_loop``: unrolling
-them would make the compiler duplicate work exponentially.
+or not at all, by simplified Newton with the exact Jacobian: its matrix, or of large systems products with it. Both stop
+at the *rounding plateau*, where the update no longer shrinks, rather than at a tolerance that could lie below it. All
+loops are ``lax.while_loop``: unrolling them would make the compiler duplicate work exponentially.
 """
 
 from __future__ import annotations
@@ -22,11 +22,8 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
+from .krylov import krylov
 from .rules import EPS, RULES, Rules
-
-DENSE_LIMIT = 12_000
-"""Unknowns of a step up to which a full Jacobian matrix is formed (1.2 GB); larger ones have fixed-point iteration \
-alone, unless the system knows its sparsity."""
 
 
 class Solved(NamedTuple):
@@ -61,8 +58,10 @@ class Iteration(NamedTuple):
         return cls(k, infinite, infinite, none, zero, none)
 
     def after(self, k, rules: Rules) -> Iteration:
-        update = jnp.max(jnp.abs(k - self.k))
+        update = rules.size(k.shape[-1])(k - self.k)
         rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
+        if k.shape[-1] > rules.large:
+            rate = jnp.where(self.made > 1, jnp.sqrt(rate * self.rate), rate)
         stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
         return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
 
@@ -95,30 +94,29 @@ def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0, 
     return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), noise)
 
 
-def noise_of(system: System, x) -> jax.Array:
+def noise_of(system: System, x, rules: Rules = RULES) -> jax.Array:
     """The size at which the motion from a state is rounded, as a whole."""
-    return jnp.max(with_rounding(system.vector_field, x)[1])
+    return rules.size(x.size)(with_rounding(system.vector_field, x)[1])
 
 
 def solve_stages(
     slopes: Callable,
     guess: jax.Array,
     scale: Callable,
-    jacobian: Callable,
+    inverted: Callable,
     noise: Callable = lambda: jnp.zeros(()),
     rules: Rules = RULES,
 ) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``.
 
-    ``scale(k)`` is the size that the plateau is measured against, ``jacobian(k)`` the derivative of ``slopes - k``, and
-    ``noise()`` the size at which the slopes are rounded, asked for where fixed-point iteration fails.
+    ``scale(k)`` is the size that the plateau is measured against, ``inverted(k)`` a function from ``slopes - k`` to what
+    Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where fixed-point
+    iteration fails.
     """
+    measure = rules.size(guess.shape[-1])
     first = fixed_point(slopes, guess, scale, rules=rules)
     done = first.converged
     size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
-    if guess.size > DENSE_LIMIT:
-        again = jax.lax.cond(done, lambda: first, lambda: fixed_point(slopes, first.k, scale, size, rules))
-        return again._replace(fixed_point=first.fixed_point + jnp.where(done, 0, again.fixed_point))
 
     def misfit(k):
         return slopes(k) - k
@@ -127,14 +125,14 @@ def solve_stages(
         return (s.made >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
 
     def unsolved(s: Iteration, found):
-        return ~done & ~s.settled(scale(s.k), rules, jnp.max(jnp.abs(found)), size)
+        return ~done & ~s.settled(scale(s.k), rules, measure(found), size)
 
     def improved(k, step, size, plateau, damped):
         """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
 
         def worse(carry):
             factor, found = carry
-            halve = damped & (factor > 0.5**rules.halvings) & (factor * jnp.max(jnp.abs(step)) > plateau)
+            halve = damped & (factor > 0.5**rules.halvings) & (factor * measure(step) > plateau)
             return (factor > 1.0) | (~(jnp.linalg.norm(found) < size) & halve)
 
         def halved(carry):
@@ -149,12 +147,13 @@ def solve_stages(
         again = lost(s, damped)
         restart = Iteration.begin(start)._replace(made=s.made), start_misfit
         s, found = jax.tree_util.tree_map(lambda a, b: jnp.where(again, a, b), restart, (s, found))
-        damped, inverse, before = damped | again, _inverse(jacobian(s.k)), s.made
+        damped, step_from, before = damped | again, inverted(s.k), s.made
 
         def reuse(carry):
             inner, found, _ = carry
-            step = (inverse @ found.ravel()).reshape(guess.shape)
-            k, found, whole = improved(inner.k, step, jnp.linalg.norm(found), rules.plateau * scale(inner.k), damped)
+            k, found, whole = improved(
+                inner.k, step_from(found), jnp.linalg.norm(found), rules.plateau * scale(inner.k), damped
+            )
             inner = inner.after(k, rules)
             return inner, found, jnp.where(whole, inner.made - before, rules.reuse)
 
@@ -267,25 +266,37 @@ begin = program(first_state)
 def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES) -> State:
     """One step; where it fails the state is left as it was, with a status."""
 
-    def jacobian(k):
-        return method.jacobian(system, state.x, state.low, h, k)
-
     def noise():
-        return noise_of(system, state.x)
+        return noise_of(system, state.x, rules)
 
     if method.explicit:
         solved = explicit(system, method, state.x, state.low, h, state.k, rules)
     else:
-        solved = solve_stages(*equations(system, method, state, h, rules), jacobian, noise, rules)
-    return conclude(system, method, state, h, solved)
+        inverted = newton_steps(system, method, state.x, state.low, h, rules)
+        solved = solve_stages(*equations(system, method, state, h, rules), inverted, noise, rules)
+    return conclude(system, method, state, h, solved, rules)
 
 
 def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules = RULES) -> Solved:
     """The slopes of an explicit method, which there is nothing to solve for."""
     k = method.slopes(system, x, low, h, k)
     missed, none = method.missed(system, x, low, h, k), jnp.zeros((), dtype=jnp.int64)
+    missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(missed))  # it is the length of a vector
     converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
+
+
+def newton_steps(system: System, method: OneStepMethod, x, low, h, rules: Rules = RULES) -> Callable:
+    """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there."""
+
+    def linearised(k) -> Callable:
+        if k.shape[-1] > rules.large:
+            product = jax.linearize(lambda d: method.change(system, x, low, h, k, d), jnp.zeros_like(k))[1]
+            return lambda found: krylov(product, found, rules)
+        inverse = _inverse(method.jacobian(system, x, low, h, k))
+        return lambda found: (inverse @ found.ravel()).reshape(k.shape)
+
+    return linearised
 
 
 def equations(
@@ -301,16 +312,17 @@ def equations(
 
 def scale_of(x, h, k, rules: Rules = RULES):
     """What updates of slopes are measured against."""
-    return jnp.max(jnp.abs(x)) / h + jnp.max(jnp.abs(k)) + rules.vanished
+    measure = rules.size(x.size)
+    return measure(x) / h + measure(k) + rules.vanished
 
 
-def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
+def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved, rules: Rules = RULES) -> State:
     """The state after a step whose equations are solved, or as it was, with a status, where they are not."""
     x, low = state.x, state.low
     new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
-    size = jnp.maximum(jnp.max(jnp.abs(x)), h * solved.noise)
+    size = jnp.maximum(rules.size(x.size)(x), h * solved.noise)
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
     mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
 
 from ..functions.gradients import EPS
 
@@ -11,10 +16,15 @@ from ..functions.gradients import EPS
 class Rules:
     """The solver's rules.
 
-    Updates of the slopes k are measured against ``|x|/h + |k|``, their scale.
+    Updates of the slopes k are measured against ``|x|/h + |k|``, their scale. The size of a vector is its largest
+    component, or of large systems its root mean square: neither grows with their number, but of many components there
+    is always one whose updates shrink late, and the largest is the one where rounding is.
 
     Attributes
     ----------
+    large : int
+        Components of a state above which a system is large. Newton's equations are then solved by products with the
+        Jacobian matrix, which is not formed, and rates of contraction are means over several iterations.
     fixed_point, newton : int
         The most iterations of each kind.
     reuse : int
@@ -26,6 +36,11 @@ class Rules:
         Contraction rate above which fixed-point iteration is given up for Newton's.
     stale : float
         Contraction rate above which Newton's method takes the Jacobian afresh.
+    forcing : float
+        Share of the misfit that such a solution may leave: a smaller one takes more products for each Newton iteration
+        and no fewer in all.
+    kept, products : int
+        Directions that it is kept orthogonal to, two vectors each; and the most products for one solution.
     shrinking : float
         An update above this fraction of the smallest so far has not shrunk: rounding makes the iterates cycle, and the
         cycle itself may still converge, by parts in 1e9.
@@ -45,18 +60,34 @@ class Rules:
         Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself.
     """
 
+    large: int = 1_000
     fixed_point: int = 60
     newton: int = 60
     reuse: int = 4
     halvings: int = 8
     slow: float = 0.6
     stale: float = 0.3
+    forcing: float = 1e-2
+    kept: int = 8
+    products: int = 200
     shrinking: float = 0.8
     floor: float = 1e-5 * EPS
     plateau: float = 1e3 * EPS
     corrected: float = 64 * EPS
     vanished: float = 1e-280
     steered: float = 4 * EPS
+
+    def size(self, components: int) -> Callable[[jax.Array], jax.Array]:
+        """What the size of a vector, shape (n,) or (stages, n), is for so many components of a state."""
+        return _root_mean_square if components > self.large else _largest
+
+
+def _largest(v) -> jax.Array:
+    return jnp.max(jnp.abs(v))
+
+
+def _root_mean_square(v) -> jax.Array:
+    return jnp.linalg.norm(v) / math.sqrt(v.size)
 
 
 RULES = Rules()

@@ -115,7 +115,7 @@ def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Arra
             lambda k: slopes(dynamic, k),
             guess,
             lambda k: array.scale_of(x, h, k),
-            lambda k: method.jacobian(system, x, low, h, k),
+            array.newton_steps(system, method, x, low, h),
             lambda: array.noise_of(system, x),
         )
         return jnp.where(solved.converged, solved.k, jnp.nan)

@@ -8,6 +8,7 @@ Newton iteration runs on the host, where SciPy factorises; all else is the array
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -24,8 +25,9 @@ from ..codes import Code
 from ..rules import RULES
 from .linear import Compression, Inverse
 
-PATIENT = replace(RULES, newton=80, halvings=12, stale=0.1)
-"""Newton iterations are cheap here: most use factors that are there already, kept from step to step."""
+PATIENT = replace(RULES, newton=80, halvings=12, stale=0.1, large=sys.maxsize)
+"""Newton iterations are cheap here: most use factors that are there already, kept from step to step. Their matrix is
+formed whatever its size, and a few stiff components of many are not to be lost in a mean."""
 
 
 class SparseEngine:
@@ -157,12 +159,12 @@ class SparseEngine:
 
 @program
 def _fixed_point(system: System, method: OneStepMethod, state: array.State, h) -> array.Solved:
-    return array.fixed_point(*array.equations(system, method, state, h))
+    return array.fixed_point(*array.equations(system, method, state, h, PATIENT), rules=PATIENT)
 
 
 @program
 def _conclude(system: System, method: OneStepMethod, state: array.State, h, solved: array.Solved) -> array.State:
-    return array.conclude(system, method, state, h, solved)
+    return array.conclude(system, method, state, h, solved, PATIENT)
 
 
 def _equations(system: System, method: OneStepMethod, state: array.State, h):
@@ -170,7 +172,7 @@ def _equations(system: System, method: OneStepMethod, state: array.State, h):
 
     With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
     """
-    slopes, guess, scale = array.equations(system, method, state, h)
+    slopes, guess, scale = array.equations(system, method, state, h, PATIENT)
 
     def misfit(k):
         middle = state.x + (state.low + 0.5 * method.increment(h, k))

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.engines import array
 from liethermo.engines.sparse import linear
 from liethermo.functions.gradients import GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss
@@ -350,13 +349,6 @@ def test_a_large_system_is_checked_without_its_matrices():
     assert report.passed
     assert "K >= 0" not in str(report)
     assert "energy law" in str(report)
-
-
-def test_dense_newton_is_not_begun_where_the_matrix_is_too_large(monkeypatch):
-    monkeypatch.setattr(array, "DENSE_LIMIT", 10)
-    solved = array.solve_stages(lambda k: -3.0 * k + 1.0, jnp.ones((1, 11)), lambda k: jnp.max(jnp.abs(k)), None)
-    assert not bool(solved.converged)
-    assert int(solved.newton) == 0
 
 
 # -- graphs from files ------------------------------------------------------------------------------------------------
