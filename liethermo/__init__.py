@@ -19,8 +19,9 @@ from .dissipation.four_bracket import FourBracket
 from .dissipation.friction import Friction
 from .dissipation.friction_operator import FrictionOperator
 from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
-from .dissipation.projected_metric import ProjectedMetric
+from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
 from .errors import (
     AxiomError,
     CasimirError,
@@ -126,6 +127,7 @@ __all__ = [
     "FrictionOperator",
     "Function",
     "FunctionError",
+    "GlobalRateWarning",
     "Gonzalez",
     "Graph",
     "Herglotz",
@@ -139,6 +141,7 @@ __all__ = [
     "LiePoissonSystem",
     "LieVariational",
     "LiethermoError",
+    "LocalProjectedMetric",
     "MeanValue",
     "MethodSuggestion",
     "MetriplecticGauss",

@@ -7,6 +7,7 @@ round them away.
 import importlib
 
 from . import _precision, testing  # noqa: F401
+from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
 from .algebras.invariants import TracePolynomial
@@ -25,6 +26,7 @@ from .errors import (
     ParameterError,
     RepresentationError,
     ShapeError,
+    SizeError,
     SpaceError,
 )
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
@@ -87,6 +89,7 @@ __all__ = [
     "ContactStructure",
     "Coordinates",
     "Cosymplectic",
+    "DirectSum",
     "DomainError",
     "Euclidean",
     "EuclideanRetraction",
@@ -120,6 +123,7 @@ __all__ = [
     "Retraction",
     "RiemannianRetraction",
     "ShapeError",
+    "SizeError",
     "Sp",
     "Space",
     "SpaceError",
@@ -142,6 +146,7 @@ __all__ = [
     "galilei",
     "gl",
     "heisenberg",
+    "power",
     "registered",
     "registered_groups",
     "registered_spaces",

@@ -22,6 +22,10 @@ class ParameterError(ManifoldsError, ValueError):
     """A catalogue entry asked for with a parameter outside its range."""
 
 
+class SizeError(ParameterError):
+    """Something that would not fit into the memory of this machine, refused before it is tried."""
+
+
 class DomainError(ManifoldsError, ValueError):
     """A map evaluated outside its domain, such as the logarithm of -I in SU(2)."""
 

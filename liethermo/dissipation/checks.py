@@ -8,6 +8,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import real_array
+from manifolds.matrices.blocks import BlockDiagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.conditions import require
@@ -19,6 +20,13 @@ NEGATIVE = "has the negative eigenvalue {value:.3g}: it must be positive semidef
 def form_at(form, x):
     """A constant, or a function of the state evaluated at x."""
     return jnp.asarray(form(x)) if callable(form) else form
+
+
+def over_sites(form, system: Geometry):
+    """A form on the components of one site as that on those of all; another form as it is."""
+    if callable(form) or form is None or not system.sites or np.shape(form) != system.shape[-1:] * 2:
+        return form
+    return BlockDiagonal((form,), system.shape[-1:], (system.dim // system.shape[-1],))
 
 
 def zero_state(dim: int):
@@ -35,6 +43,15 @@ def checked_rate(rate) -> jax.Array:
         lambda rate: rate >= 0.0,
         "a dissipation rate must be >= 0, not {value}: a negative one would lower the entropy",
     )
+    return array
+
+
+def checked_rates(rates) -> jax.Array:
+    """A rate, or one for each site, as an array of non-negative numbers (or traced ones)."""
+    array = real_array(rates)
+    if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
+        least = float(np.asarray(array).min())
+        raise InputError(f"a dissipation rate must be >= 0, not {least}: a negative one would lower the entropy")
     return array
 
 
@@ -64,15 +81,20 @@ def semidefinite(form, what: str) -> jax.Array:
 
 
 def check_matrix(form, dim: int, what: str) -> None:
+    """Raise unless a form, or what a function of the state gives, acts on states of this dimension."""
+    if isinstance(form, BlockDiagonal):
+        return
     shape = jax.eval_shape(lambda x: jnp.asarray(form_at(form, x)), zero_state(dim)).shape
     if shape != (dim, dim):
         raise InputError(f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {shape}")
 
 
-def needed_algebra(system: Geometry, name: str, dim: int | None = None) -> mf.LieAlgebra:
+def needed_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:
+    """The algebra of a system; InputError where it has none, or where a form is not one of it."""
     algebra = getattr(system, "algebra", None)
     if algebra is None:
         raise InputError(f"{name} lives on a Lie algebra: use it in a LiePoissonSystem, or take ProjectedMetric()")
-    if dim is not None and dim != algebra.dim:
+    dim = algebra.dim if form is None or isinstance(form, BlockDiagonal) else form.shape[0]
+    if dim != algebra.dim:
         raise InputError(f"the form of {name} is ({dim}, {dim}), but {algebra.name} has dimension {algebra.dim}")
     return algebra

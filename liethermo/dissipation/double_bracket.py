@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax
 
-from manifolds.matrices.symmetric import semidefinite_factor
-
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, semidefinite
-from .factor import Factor
+from .checks import check_matrix, checked_rate, over_sites, semidefinite
+from .factor import Factor, root_of
 
 
 class DoubleBracket(Dissipation):
@@ -22,11 +23,12 @@ class DoubleBracket(Dissipation):
     ----------
     rate : float, >= 0
     metric : array, shape (n, n), optional
-        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space.
+        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space. On copies of
+        an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
     """
 
     rate: jax.Array
-    metric: jax.Array | None
+    metric: Any
 
     def __init__(self, rate=1.0, metric=None):
         self.rate = checked_rate(rate)
@@ -49,9 +51,11 @@ class DoubleBracket(Dissipation):
         return False
 
     def prepared(self, system):
-        if self.metric is not None:
-            check_matrix(self.metric, system.dim, "the metric")
-        return self
+        if self.metric is None:
+            return self
+        metric = over_sites(self.metric, system)
+        check_matrix(metric, system.dim, "the metric")
+        return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
     def force(self, system, x, dH, dS, dL):
         motion = system.poisson.sharp(x, dH)
@@ -61,5 +65,5 @@ class DoubleBracket(Dissipation):
     def factor(self, system, x, dH, dL):
         if self.metric is None and system.space is not None:
             return None
-        root = None if self.metric is None else semidefinite_factor(self.metric)
+        root = None if self.metric is None else root_of(self.metric)
         return Factor(system.dim, lambda w: system.poisson.sharp(x, w if root is None else root @ w)).scaled(self.rate)

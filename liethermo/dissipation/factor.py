@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+
+from manifolds.matrices.blocks import BlockDiagonal, Diagonal
+from manifolds.matrices.symmetric import semidefinite_factor
 
 
 class Factor(NamedTuple):
@@ -35,6 +39,17 @@ class Factor(NamedTuple):
         """Of ``rate * K``, the rate a number, which may depend on the state."""
         root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)  # zero has a derivative too
         return self._replace(times=lambda w: root * self.times(w))
+
+
+def root_of(form) -> Any:
+    """R with ``R R^T = form``, for a semidefinite matrix or what acts like one; None where it has no root that acts."""
+    if isinstance(form, BlockDiagonal):
+        roots = tuple(root_of(block) for block in form.blocks)
+        known = all(root is not None for root in roots)
+        return eqx.tree_at(lambda f: f.blocks, form, roots) if known else None
+    if isinstance(form, Diagonal):
+        return Diagonal(jnp.sqrt(form.entries))
+    return semidefinite_factor(form) if hasattr(form, "shape") else None
 
 
 def beside(factors: Sequence[Factor]) -> Factor:

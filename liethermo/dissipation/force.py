@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
 from .base import Dissipation
-from .checks import needed_algebra, zero_state
+from .checks import needed_algebra
 
 
 class EulerPoincareForce(Dissipation):
@@ -20,6 +21,7 @@ class EulerPoincareForce(Dissipation):
     Parameters
     ----------
     F : function from xi in g, shape (dim,), to a covector, shape (dim,)
+        On copies of an algebra both have the shape ``(*sites, d)``.
     """
 
     F: Callable
@@ -33,14 +35,25 @@ class EulerPoincareForce(Dissipation):
         return False
 
     def prepared(self, system):
-        g = needed_algebra(system, "EulerPoincareForce")
-        shape = jax.eval_shape(lambda xi: jnp.asarray(self.F(xi)), zero_state(g.dim)).shape
-        if shape != (g.dim,):
-            raise InputError(f"the force F must map shape ({g.dim},) to ({g.dim},), but it returns shape {shape}")
-        return self
+        needed_algebra(system, "EulerPoincareForce")
+        xi = jax.ShapeDtypeStruct(system.shape, jnp.float64)
+        shape = jax.eval_shape(lambda xi: jnp.asarray(self.F(xi)), xi).shape
+        if shape != system.shape:
+            raise InputError(f"the force F must map shape {system.shape} to the same, but it returns shape {shape}")
+        return EulerPoincareForce(_OnSites(self.F, system.shape)) if system.sites else self
 
     def momentum(self, dH, turned):
         return self.F(dH)
 
     def force(self, system, x, dH, dS, dL):
         return system.algebra.ad_star(dH, self.F(dH))
+
+
+class _OnSites(eqx.Module):
+    """A map of arrays of one shape, as one of flat arrays."""
+
+    function: Callable
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, xi):
+        return jnp.asarray(self.function(xi.reshape(self.shape))).ravel()

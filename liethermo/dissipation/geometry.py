@@ -26,6 +26,8 @@ class Geometry(Protocol):
         Its ``sharp(x, dH)`` is the conservative motion.
     space : manifolds.Space or None
         None on R^n.
+    sites, shape : tuple of int
+        Those of a system of many equal ones, and ``(*sites, d)``; () and (n,) otherwise.
     """
 
     @property
@@ -34,6 +36,10 @@ class Geometry(Protocol):
     def energy(self) -> Energy: ...
     @property
     def poisson(self) -> mf.PoissonStructure: ...
+    @property
+    def sites(self) -> tuple[int, ...]: ...
+    @property
+    def shape(self) -> tuple[int, ...]: ...
     @property
     def space(self) -> mf.Space | None: ...
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..errors import IndefiniteError, InputError
 from .base import Dissipation
-from .checks import checked_rate, needed_algebra, semidefinite
-from .factor import Factor
+from .checks import checked_rate, needed_algebra, over_sites, semidefinite
+from .factor import Factor, root_of
 
 
 class InnerProductDissipation(Dissipation):
@@ -24,7 +26,8 @@ class InnerProductDissipation(Dissipation):
     Parameters
     ----------
     K : array, shape (dim, dim)
-        The inner product 𝒦 on g, symmetric and positive semidefinite.
+        The inner product 𝒦 on g, symmetric and positive semidefinite. On copies of an algebra it may be one of a
+        single site, shape (d, d), and acts site by site.
 
     Raises
     ------
@@ -32,14 +35,15 @@ class InnerProductDissipation(Dissipation):
         If it is not.
     """
 
-    K: jax.Array
+    K: Any
 
     def __init__(self, K):
         self.K = semidefinite(K, "the inner product 𝒦")
 
     def prepared(self, system):
-        needed_algebra(system, "InnerProductDissipation", self.K.shape[0])
-        return self
+        K = over_sites(self.K, system)
+        needed_algebra(system, "InnerProductDissipation", K)
+        return self if K is self.K else eqx.tree_at(lambda d: d.K, self, K)
 
     def momentum(self, dH, turned):
         return self.K @ turned
@@ -57,7 +61,8 @@ class KillingDissipation(Dissipation):
 
     ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
     noncompact semisimple algebras, and ``-rate * kappa`` again wherever that is at least semidefinite (se(3)). On so(3)
-    ``-kappa = 2 I``, so rate 1/2 gives the projected metric (BFM 2.2).
+    ``-kappa = 2 I``, so rate 1/2 gives the projected metric (BFM 2.2). On a sum of algebras, and on copies of one on
+    sites, the form has a block for each, so the dissipation acts site by site, at the same rate however many there are.
 
     Parameters
     ----------
@@ -70,29 +75,26 @@ class KillingDissipation(Dissipation):
     """
 
     rate: jax.Array
-    form: jax.Array | None
+    form: Any
 
     def __init__(self, rate=1.0, form=None):
         self.rate = checked_rate(rate)
         self.form = form  # filled in by prepared(), once the algebra is known
 
     @staticmethod
-    def inner_product(g: mf.LieAlgebra) -> np.ndarray:
-        """The positive semidefinite form 𝒦 on g for rate 1, shape (dim, dim)."""
-        if g.is_semisimple():
-            form = -g.killing_form() @ g.cartan_involution()
-            return (form + form.T) / 2
-        form = -g.killing_form()
-        if g.killing_signature()[0]:
-            lowest = float(np.linalg.eigvalsh(form)[0])
+    def inner_product(g: mf.LieAlgebra) -> Any:
+        """The positive semidefinite form 𝒦 on g for rate 1: a matrix, shape (dim, dim), or what acts like one."""
+        if not g.is_semisimple() and (positive := g.killing_signature()[0]):
+            lowest = float(np.linalg.eigvalsh(-g.killing_form())[0])
             raise IndefiniteError(
-                f"{g.name} is not semisimple and minus its Killing form is indefinite (lowest eigenvalue "
-                f"{lowest:.3g}), so it cannot measure dissipation: entropy would fall along some motions. Give "
-                "an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which needs none",
+                f"{g.name} is not semisimple and minus its Killing form is indefinite ({positive} negative "
+                f"eigenvalues, the lowest {lowest:.3g}), so it cannot measure dissipation: entropy would fall along "
+                "some motions. Give an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which "
+                "needs none",
                 residual=lowest,
                 tolerance=0.0,
             )
-        return form
+        return g.killing_inner_product()
 
     def prepared(self, system):
         g = needed_algebra(system, "KillingDissipation")
@@ -102,7 +104,7 @@ class KillingDissipation(Dissipation):
                 f"{g.name} is solvable: its Killing form vanishes on brackets, so "
                 "KillingDissipation would do nothing; use ProjectedMetric() or InnerProductDissipation(K)"
             )
-        return KillingDissipation(self.rate, jnp.asarray(form))
+        return KillingDissipation(self.rate, jnp.asarray(form) if isinstance(form, np.ndarray) else form)
 
     def momentum(self, dH, turned):
         return self.rate * (self.form @ turned)
@@ -112,10 +114,11 @@ class KillingDissipation(Dissipation):
         return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
     def factor(self, system, x, dH, dL):
-        return _factor(system, dH, self.form).scaled(self.rate)
+        factor = _factor(system, dH, self.form)
+        return None if factor is None else factor.scaled(self.rate)
 
 
-def _factor(system, dH, form) -> Factor:
+def _factor(system, dH, form) -> Factor | None:
     """Of ``ad*_dH 𝒦 ad_dH``: ``div ad*_dH F = C[a, b, c] H_ab F_c = 0``, C being skew in a, b, the Hessian not."""
-    root, g = semidefinite_factor(form), system.algebra
-    return Factor(form.shape[0], lambda w: g.ad_star(dH, root @ w), solenoidal=True)
+    root, g = root_of(form), system.algebra
+    return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

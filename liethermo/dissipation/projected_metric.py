@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds.errors import warn
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.checks import recognised
@@ -19,6 +21,10 @@ from .checks import checked_rate, form_at, semidefinite
 from .factor import Factor
 
 
+class GlobalRateWarning(UserWarning):
+    """A dissipation that couples all sites of a system, and damps each the faster the more there are."""
+
+
 class ProjectedMetric(Dissipation):
     """Dissipation by a cometric G, projected off what it has to conserve [BFM 2.2, Remark 2.1].
 
@@ -26,6 +32,9 @@ class ProjectedMetric(Dissipation):
     gradients dL_a of ``preserve``, and ``C_ab = G(dL_a, dL_b)`` with L_1 = H. For the energy alone
     ``det(C) = G(dH, dH)`` and this is BFM (2.2), ``G(dH, dH) G(alpha, beta) - G(dH, alpha) G(dH, beta)``. With
     ``normalized=True`` the factor det(C) is left out (Remark 2.1).
+
+    It couples all components: on many sites the factor ``G(dH, dH)`` grows with their number, and with it the damping
+    of each. For damping site by site take :class:`LocalProjectedMetric`.
 
     Parameters
     ----------
@@ -55,6 +64,13 @@ class ProjectedMetric(Dissipation):
         return self.functions
 
     def prepared(self, system):
+        if system.sites and not self.normalized:
+            warn(
+                f"ProjectedMetric damps each of the {math.prod(system.sites)} sites at a rate that grows with their "
+                "number, since G(dH, dH) is a sum over all of them: LocalProjectedMetric acts site by site, and "
+                "normalized=True leaves the factor out",
+                GlobalRateWarning,
+            )
         if system.space is not None:
             return self
         return eqx.tree_at(lambda d: d.functions, self, tuple(recognised(L, system.dim) for L in self.functions))

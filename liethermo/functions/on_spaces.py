@@ -1,7 +1,8 @@
-"""Energies of points of a space, and of coordinates around a point."""
+"""Energies of points of a space, and of states on sites, as energies of flat states."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax
 
 import manifolds as mf
 
-from .energy import Energy, Quadratic, Sum, TimeDependent
+from .energy import Energy, Function, Negative, Quadratic, Sum, TimeDependent
 
 
 class OfPoint(Energy):
@@ -42,3 +43,40 @@ class _OfPointAndTime(eqx.Module):
 
     def __call__(self, x, t):
         return self.function(self.space.from_vector(x), t)
+
+
+def on_sites(tree, shape: tuple[int, ...]):
+    """A pytree whose plain functions of states of this shape have become functions of flat ones, shape (n,).
+
+    Energies that say themselves what they do with components, and Casimirs of algebras, are of flat states already.
+    """
+    if len(shape) == 1:
+        return tree
+    return jax.tree_util.tree_map(
+        lambda part: _on_sites(part, shape) if isinstance(part, Energy) else part,
+        tree,
+        is_leaf=lambda part: isinstance(part, Energy),
+    )
+
+
+def _on_sites(energy: Energy, shape: tuple[int, ...]) -> Energy:
+    if isinstance(energy, Sum):
+        return Sum(tuple(_on_sites(term, shape) for term in energy.summands))
+    if isinstance(energy, Negative):
+        return Negative(_on_sites(energy.term, shape))
+    if isinstance(energy, Function | TimeDependent):
+        flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
+        return energy if flat else type(energy)(_OfSites(energy.function, shape))
+    return energy
+
+
+class _OfSites(eqx.Module):
+    function: Callable
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+    def __call__(self, x, *time):
+        return self.function(x.reshape(self.shape), *time)

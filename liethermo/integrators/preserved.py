@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
-from ..functions.on_spaces import on_points
 from ..systems import System
 
 
@@ -19,7 +18,7 @@ def preserved_functions(preserve) -> tuple[Energy, ...]:
 
 def seen_on(system: System, C: Energy) -> Energy:
     """A preserved function as one of the state vectors of a system."""
-    C = check_scalar(on_points(C, system.space), system.dim, "a preserved function")
+    C = check_scalar(system.on_states(C), system.dim, "a preserved function")
     return recognised(C, system.dim) if system.space is None else C
 
 

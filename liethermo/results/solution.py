@@ -34,7 +34,7 @@ class Solution:
     Attributes
     ----------
     t : ndarray, shape (times,)
-    x : ndarray, shape (times, n)
+    x : ndarray, shape (times, n), or ``(times, *sites, d)`` of a system on sites
     energy : ndarray, shape (times,)
     entropy : ndarray, shape (times,), or None
     casimirs : dict of ndarray, shape (times,)
@@ -85,7 +85,8 @@ class Solution:
         """
         if self.dense is None:
             raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
-        return self.dense(t)
+        found = self.dense(t)
+        return found.reshape(*found.shape[:-1], *self.x.shape[1:])
 
     @property
     def energy_balance(self) -> np.ndarray:
@@ -133,7 +134,8 @@ class Solution:
         series = {"energy": ("time", self.energy)}
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
-        variables: dict[str, Any] = {"x": (("time", "component"), self.x), **series}
+        sites = ["site"] if self.x.ndim == 3 else [f"site_{i + 1}" for i in range(self.x.ndim - 2)]
+        variables: dict[str, Any] = {"x": (("time", *sites, "component"), self.x), **series}
         if self.attitude is not None:
             variables["attitude"] = (("time", "row", "column", "part"), as_parts(self.attitude))
         variables["invariant"] = (
@@ -183,10 +185,10 @@ class Solution:
             ("system", str(self.provenance.get("system", "-"))),
             ("method", str(self.provenance.get("method", "-"))),
             ("status", str(self.status)),
-            ("kept", f"{len(self.t)} times of {self.stats.steps} steps, states of {self.x.shape[1]} components"),
+            ("kept", f"{len(self.t)} times of {self.stats.steps} steps, states of {self.x[0].size} components"),
             ("energy", f"{self.energy[0]:.10g} to {self.energy[-1]:.10g}"),
         ]
-        pictures = [sketch(self.t, self.x, "the components of the state along time")]
+        pictures = [sketch(self.t, self.x.reshape(len(self.t), -1), "the components of the state along time")]
         if self.entropy is not None:
             facts.append(("entropy", f"{self.entropy[0]:.10g} to {self.entropy[-1]:.10g}"))
             pictures.append(sketch(self.t, self.entropy[:, None], "the entropy along time"))

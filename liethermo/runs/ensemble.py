@@ -54,7 +54,8 @@ def ensemble(
     ----------
     system : System, or function from one set of parameters to a System
     x0s : array, shape (n,) or (B, n)
-        Initial states; one for all, or one each.
+        Initial states; one for all, or one each. Of a system on sites ``(*sites, d)`` may stand in the place of n; the
+        states of an ensemble are flat, and ``system.points`` shows them on the sites.
     t_span, step, method, save_every, save_at
         As for :func:`integrate`.
     parameters : optional
@@ -99,7 +100,7 @@ def ensemble(
         course = Course(t_span, step, None, stops_of(save_at, course.start, course.end))
 
     family = Family.of(system, parameters)
-    if np.ndim(x0s) > 2 and getattr(system, "space", None) is None:
+    if np.ndim(x0s) > 2 and getattr(system, "space", None) is None and not getattr(system, "sites", ()):
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
     states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))

@@ -46,7 +46,7 @@ def flow(
 
     Returns
     -------
-    array, shape (n,), or (times, n)
+    array, shape (n,), or (times, n); ``(*sites, d)`` in the place of n, of a system on sites
         NaN from where a step could not be solved: inside a compiled function nothing can be raised.
 
     Raises
@@ -55,13 +55,14 @@ def flow(
         If an argument cannot be used.
     """
     x, table = system.state(x0), Timetable(t_span, step, save_every)
-    n, system = system.dim, driven(system)
+    n, shown, system = system.dim, system, driven(system)
     x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
     method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
     method = traced_energies(method, system.dim)
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])
-    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))[:, :n]
+    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))
+    path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
     return path[-1] if save_every is None else path
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -18,7 +20,7 @@ from ..dissipation.base import Dissipation, Law
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
 from ..functions.energy import Energy, as_energy, is_traced
-from ..functions.on_spaces import on_points
+from ..functions.on_spaces import on_points, on_sites
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
@@ -63,19 +65,29 @@ class System(eqx.Module):
     domain: ClassVar[str] = ""
     """What a state of the system has to have beyond finite components, in words."""
 
+    @property
+    def sites(self) -> tuple[int, ...]:
+        """The sites of a system of many equal ones, whose states are shown as arrays of shape ``(*sites, d)``."""
+        return ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
+        return (*self.sites, self.dim // math.prod(self.sites))
+
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
         self.dim, self.space = dim, space
         self.poisson = settled(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
-        self.energy = check_scalar(on_points(as_energy(energy, "the energy"), space), dim, "the energy", timed=True)
+        self.energy = check_scalar(self.on_states(as_energy(energy, "the energy")), dim, "the energy", timed=True)
         self.entropy = None
         if entropy is not None:
-            self.entropy = check_scalar(on_points(as_energy(entropy, "the entropy"), space), dim, "the entropy")
+            self.entropy = check_scalar(self.on_states(as_energy(entropy, "the entropy")), dim, "the entropy")
         if not isinstance(momentum_maps, Mapping):
             momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: check_scalar(on_points(as_energy(J, roles[name]), space), dim, roles[name])
+            name: check_scalar(self.on_states(as_energy(J, roles[name])), dim, roles[name])
             for name, J in momentum_maps.items()
         }
         if space is None:  # in a chart no function is quadratic
@@ -90,10 +102,15 @@ class System(eqx.Module):
             raise InputError(f"{type(dissipation).__name__} drives the entropy up, so the system needs an entropy")
         self.dissipation = None
         if dissipation is not None:
+            dissipation = on_sites(dissipation, self.shape)
             dissipation = traced_energies(dissipation, dim, "a preserved function")
             self.dissipation = self._traced_dissipation(dissipation.prepared(self))
         if validate and not is_traced(self):
             self._validate()
+
+    def on_states(self, energy: Energy) -> Energy:
+        """An energy of states as they are shown, as one of their vectors."""
+        return on_points(on_sites(energy, self.shape), self.space)
 
     def _traced_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """The dissipation with its plain functions traced for the arguments that its force gives them."""
@@ -203,8 +220,11 @@ class System(eqx.Module):
     # -- the manifold ---------------------------------------------------------------------------------------------
 
     def points(self, x) -> jax.Array:
-        """State vectors, shape (..., n), as points of the space, shape ``(..., *space.shape)``."""
-        return jnp.asarray(x) if self.space is None else self.space.from_vector(x)
+        """State vectors, shape (..., n), as they are shown: of shape ``(*sites, d)``, or as points of the space."""
+        if self.space is not None:
+            return self.space.from_vector(x)
+        x = jnp.asarray(x)
+        return x.reshape(*x.shape[:-1], *self.shape) if self.sites else x
 
     def raised(self, x, alpha) -> jax.Array:
         """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
@@ -239,7 +259,13 @@ class System(eqx.Module):
 
     def presented(self, solution: Any) -> Any:
         """A solution of this system, as its user is to see it."""
-        return solution
+        return self.on_sites(solution)
+
+    def on_sites(self, found: Any) -> Any:
+        """A solution, or an ensemble, with its states x, shape (..., n), as they are shown on sites."""
+        if not self.sites or found.x is None:
+            return found
+        return dataclasses.replace(found, x=found.x.reshape(*found.x.shape[:-1], *self.shape))
 
     def seen(self, x) -> jax.Array:
         """The part of a state that is the user's, as points: what the functions of an event are functions of."""
@@ -338,7 +364,8 @@ class System(eqx.Module):
     def state(self, x, batch: bool = False) -> jax.Array:
         """``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
-        On a manifold it may have the shape of points too, and has to be one.
+        Of a system on sites it may have the shape ``(*sites, d)`` too; on a manifold the shape of points, and has to be
+        one.
 
         Raises
         ------
@@ -353,10 +380,15 @@ class System(eqx.Module):
                 raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
         if self.space is not None and x.shape[-len(self.space.shape) :] == self.space.shape:
             x = self.space.to_vector(x)
+        if self.sites and x.shape[-len(self.shape) :] == self.shape:
+            x = x.reshape(*x.shape[: -len(self.shape)], self.dim)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
             expected = f"(..., {self.dim})" if batch else f"({self.dim},)"
+            if self.sites:
+                shown = ", ".join([*(["..."] if batch else []), *map(str, self.shape)])
+                expected = f"({shown}), or flat {expected}"
             raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
         if isinstance(x, jax.core.Tracer):
             return x.astype(jnp.float64)
@@ -438,7 +470,7 @@ def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
     others = np.random.default_rng(0).standard_normal((2, system.dim)) / np.sqrt(system.dim)
     motion = system.poisson.sharp(x, dH)
     parts = [motion]
-    speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.tensor(x) @ jnp.abs(dH))]
+    speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.sharp(x, jnp.abs(dH)))]
     for part in () if system.dissipation is None else system.dissipation.terms:
         dL = tuple(_seen(system, x, L.gradient(x)) for L in part.preserve)
         a, b = (_seen(system, x, other * jnp.linalg.norm(d)) for other, d in zip(others, (dH, dS), strict=True))

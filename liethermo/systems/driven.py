@@ -15,7 +15,6 @@ from ..dissipation.base import Carried, Several
 from ..errors import InputError
 from ..functions.checks import recognised
 from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime
-from ..functions.on_spaces import on_points
 from .base import System
 
 UNIT = 2.0**-100
@@ -122,7 +121,7 @@ class DrivenSystem(System):
     # -- functions ----------------------------------------------------------------------------------------------------
 
     def pulled(self, energy: Energy) -> Energy:
-        return self._of_body(on_points(energy, self.body.space))
+        return self._of_body(self.body.on_states(energy))
 
     def _of_body(self, energy: Energy) -> Energy:
         return energy.on(range(self.body.dim))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
-import warnings
 
 import equinox as eqx
 import jax
@@ -15,21 +13,22 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_scalar
+from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
 from .base import System
-
-RECORDED_MONOMIALS = 400
-"""Casimirs are looked for and recorded up to the degree whose monomials number at most this many (a second's work)."""
 
 
 class LiePoissonSystem(System):
     """``mu' = ad*_{grad H} mu + K grad S`` on g* [BFM 3.1, §3].
 
+    On copies of an algebra, ``g ** sites``, a state is an array of shape ``(*sites, g.dim)``: so functions are handed
+    it, and so solutions have it. What is written for components in one row stays so: ``lt.Quadratic``, terms on
+    components (``lt.Each``, ``.on(...)``), Casimirs of the algebra and matrices of dissipations.
+
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
-    energy : function from mu, shape (dim,), to a scalar, or an Energy
+    energy : function from mu, shape ``algebra.shape``, to a scalar, or an Energy
         Or of mu and the time t: see :class:`liethermo.TimeDependent`.
     entropy : likewise, optional
         A Casimir function of the algebra (checked).
@@ -78,12 +77,16 @@ class LiePoissonSystem(System):
         if group is not None and self.is_driven:
             raise InputError("attitudes are reconstructed for energies that do not depend on time: leave out the group")
 
+    @property
+    def sites(self) -> tuple[int, ...]:
+        return self.algebra.shape[:-1]
+
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
         if self.dissipation is None or self.dissipation.momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
-        ad = self.algebra.ad(dH)
-        return ad.T @ (x + self.dissipation.momentum(dH, ad @ dS))
+        action = self.algebra.action(dH)
+        return action.ad_star(x + self.dissipation.momentum(dH, action.bracket(dS)))
 
     def casimirs(self) -> dict[str, Energy]:
         return _recorded_casimirs(self.algebra, self.algebra.basis_names)
@@ -101,8 +104,10 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
         return None
     if not isinstance(group, mf.MatrixGroup):
         raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), not {type(group).__name__}")
-    ours, theirs = algebra.structure_constants, group.algebra.structure_constants
-    if ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0.0, atol=1e-12):
+    fits = algebra.dim == group.algebra.dim and algebra.shape == group.algebra.shape
+    if not fits or not np.allclose(
+        algebra.structure_constants, group.algebra.structure_constants, rtol=0.0, atol=1e-12
+    ):
         raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
     if reconstruction is None:
         reconstruction = _best_reconstruction(group)
@@ -127,18 +132,10 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
 def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
     del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
     found: dict[str, Energy] = {}
-    count = algebra.casimir_count()
-    for degree in range(1, algebra.dim + 1):
-        if len(found) >= count or math.comb(algebra.dim + degree - 1, degree) > RECORDED_MONOMIALS:
-            break
-        with warnings.catch_warnings():  # an algebra without polynomial Casimirs has simply none to record
-            warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
-            casimirs = algebra.casimirs(degree)
-        with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
-            for i, casimir in enumerate(casimirs):
-                text = str(casimir)
-                name = text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}"
-                found[name] = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
+    with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
+        for name, casimir in algebra.leading_casimirs():
+            function = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
+            found[name] = recognised(function, algebra.dim)
     return found
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from ..errors import (
     AntisymmetryError,
+    ClosureError,
     ComponentError,
     JacobiError,
     ShapeError,
@@ -30,6 +32,55 @@ def checked_constants(values) -> np.ndarray:
         a, b, c = np.argwhere(~np.isfinite(numeric))[0]
         raise ComponentError(f"the structure constant C[{a}, {b}, {c}] is {numeric[a, b, c]}")
     return array
+
+
+def constants_of_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
+    """The structure constants of the algebra that matrices span over the reals, and the matrices as an array.
+
+    Raises what :meth:`manifolds.LieAlgebra.from_matrices` does.
+    """
+    try:
+        matrices = np.asarray(basis)
+        matrices = matrices.astype(np.complex128 if np.iscomplexobj(matrices) else np.float64)
+    except (TypeError, ValueError) as error:
+        raise ComponentError(f"the basis is not a rectangular array of numbers: {error}") from None
+    if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or 0 in matrices.shape:
+        raise ShapeError(f"a matrix basis has shape (dim, m, m), not {matrices.shape}")
+    if not np.isfinite(matrices).all():
+        raise ComponentError("the matrix basis has entries that are not finite")
+    dim = len(matrices)
+    sizes = np.linalg.norm(matrices, axis=(1, 2))
+    if not sizes.all():
+        raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
+    matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
+    columns = real_columns(matrices)
+    singular = scipy.linalg.svdvals(columns)
+    if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
+        raise ClosureError(
+            f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
+            f"{singular[-1] / singular[0]:.1e}); remove the superfluous ones",
+            residual=float(singular[-1]),
+            tolerance=float(1e-10 * singular[0]),
+        )
+    products = np.einsum("aij,bjk->abik", matrices, matrices)
+    commutators = real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
+    commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
+    coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
+    residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
+    tolerance = 1e-10
+    if residuals.max() > tolerance:
+        a, b = divmod(int(residuals.argmax()), dim)
+        raise ClosureError(
+            f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g} "
+            f"for matrices of norm 1, tolerance {tolerance:.1g}); add the missing commutators to the basis",
+            residual=float(residuals.max()),
+            tolerance=tolerance,
+            indices=(a, b),
+        )
+    constants = coordinates.T.reshape(dim, dim, dim)
+    constants = (constants - constants.swapaxes(0, 1)) / 2
+    scales = sizes[:, None, None] * sizes[:, None] / sizes
+    return without_rounding(constants, scales, columns, commutators), given
 
 
 def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:

@@ -8,6 +8,11 @@ polynomials found are exact and proved to be all there are.
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections.abc import Callable
+from typing import Protocol
+
 import numpy as np
 
 from ..errors import ParameterError, warn
@@ -15,6 +20,9 @@ from .invariants import TracePolynomial, fundamental_invariants
 from .polynomial import Polynomial
 from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
 from .structure import Structure
+
+LEADING_MONOMIALS = 400
+"""Casimirs are looked for up to the degree whose monomials number at most this many (a second's work)."""
 
 
 class NoPolynomialCasimirWarning(UserWarning):
@@ -76,4 +84,29 @@ def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
             "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
             NoPolynomialCasimirWarning,
         )
+    return found
+
+
+class Counted(Protocol):
+    """An algebra that says how many Casimirs it has, and which."""
+
+    @property
+    def dim(self) -> int: ...
+    def casimir_count(self) -> int: ...
+    def casimirs(self, degree: int) -> list: ...
+
+
+def leading_casimirs(g: Counted) -> list[tuple[str, Callable]]:
+    """The polynomial Casimirs of low degree with names, as many as there are; see the method of the algebra."""
+    found: list[tuple[str, Callable]] = []
+    count = g.casimir_count()
+    for degree in range(1, g.dim + 1):
+        if len(found) >= count or math.comb(g.dim + degree - 1, degree) > LEADING_MONOMIALS:
+            break
+        with warnings.catch_warnings():  # an algebra without polynomial Casimirs has simply none to follow
+            warnings.simplefilter("ignore", NoPolynomialCasimirWarning)
+            polynomials = g.casimirs(degree)
+        for i, casimir in enumerate(polynomials):
+            text = str(casimir)
+            found.append((text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}", casimir))
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from .._tables import html_grid
@@ -10,14 +12,15 @@ MOST_DIM, MOST_BRACKETS = 12, 12
 """More brackets than these are not listed."""
 
 
-def algebra_html(name: str, structure_constants: np.ndarray, basis_names: tuple[str, ...] | None) -> str:
+def algebra_html(
+    name: str, dim: int, structure_constants: Callable[[], np.ndarray], basis_names: tuple[str, ...] | None
+) -> str:
     """Name, dimension and, of a small algebra, the brackets of its basis elements that do not vanish."""
-    dim = len(structure_constants)
     names = basis_names or tuple(f"e{a + 1}" for a in range(dim))
     rows = [("dimension", str(dim))]
     if dim <= MOST_DIM:
         a, b = np.triu_indices(dim, 1)
-        brackets = structure_constants[a, b]
+        brackets = structure_constants()[a, b]
         found = np.flatnonzero(brackets.any(axis=-1))
         rows += [(f"[{names[a[i]]}, {names[b[i]]}]", _combination(brackets[i], names)) for i in found[:MOST_BRACKETS]]
         if len(found) > MOST_BRACKETS:

@@ -10,24 +10,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from .._arrays import is_traced, real_components, square_matrices
 from .._names import checked_names
-from ..errors import (
-    ClosureError,
-    ComponentError,
-    LieAlgebraError,
-    ShapeError,
-)
+from ..errors import LieAlgebraError
 from ._balance import STRUCTURE_TOLERANCE, balanced
 from ._exact import RationalArray, rational_array
-from .axioms import AXIOM_TOLERANCE, check_axioms, checked_constants, real_columns, without_rounding
-from .casimirs import casimirs
+from .actions import Action, ByMatrix, Operator, written_out, written_terms
+from .axioms import check_axioms, checked_constants, constants_of_matrices, real_columns
+from .casimirs import casimirs, leading_casimirs
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space
 from .polynomial_casimirs import casimir_count
@@ -57,19 +53,44 @@ class LieAlgebra:
     basis_names : tuple of str, or None
         What the basis elements are called, and the components of mu in Casimirs and pictures with them; see
         :meth:`with_basis_names`.
+
+    Notes
+    -----
+    Large algebras, and copies of one (``g ** n``), are algebras of this class too: they know what they do and not how
+    it is written, and make the constants, the matrices and the forms only when these are asked for. What systems and
+    dissipations ask of an algebra is ``dim``, ``shape``, :meth:`bracket`, :meth:`ad_star`, :meth:`action`,
+    :meth:`killing_inner_product`, :meth:`killing_signature`, :meth:`is_semisimple`, :meth:`is_solvable`,
+    :meth:`casimir_count` and :meth:`leading_casimirs`; none of it takes a dim by dim matrix from these.
     """
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = checked_constants(structure_constants)
         exact = rational_array(constants)
         machine_size = exact is not None and exact.numerator.dtype != object
-        self.rational_constants: RationalArray | None = exact if machine_size else None
-        self.structure_constants = _frozen(np.asarray(constants if exact is None else exact, dtype=np.float64))
-        self.dim: int = self.structure_constants.shape[0]
+        self._rational: RationalArray | None = exact if machine_size else None
+        self._constants = _frozen(np.asarray(constants if exact is None else exact, dtype=np.float64))
+        self.dim: int = self._constants.shape[0]
         self.name = name
-        self.basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
+        self._basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
         self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
-        check_axioms(self.structure_constants if exact is None else exact.numerator, name, exact)
+        check_axioms(self._constants if exact is None else exact.numerator, name, exact)
+
+    @property
+    def structure_constants(self) -> np.ndarray:
+        return self._constants
+
+    @property
+    def rational_constants(self) -> RationalArray | None:
+        return self._rational
+
+    @property
+    def basis(self) -> np.ndarray | None:
+        return self._basis
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape in which elements are shown: ``(dim,)``; of copies on sites ``(*sites, dim of one)``."""
+        return (self.dim,)
 
     # -- construction -------------------------------------------------------------------------------------------
 
@@ -108,48 +129,7 @@ class LieAlgebra:
         ClosureError
             If the matrices are linearly dependent over the reals or a commutator leaves their span.
         """
-        try:
-            matrices = np.asarray(basis)
-            matrices = matrices.astype(np.complex128 if np.iscomplexobj(matrices) else np.float64)
-        except (TypeError, ValueError) as error:
-            raise ComponentError(f"the basis is not a rectangular array of numbers: {error}") from None
-        if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or 0 in matrices.shape:
-            raise ShapeError(f"a matrix basis has shape (dim, m, m), not {matrices.shape}")
-        if not np.isfinite(matrices).all():
-            raise ComponentError("the matrix basis has entries that are not finite")
-        dim = len(matrices)
-        sizes = np.linalg.norm(matrices, axis=(1, 2))
-        if not sizes.all():
-            raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
-        matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
-        columns = real_columns(matrices)
-        singular = scipy.linalg.svdvals(columns)
-        if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
-            raise ClosureError(
-                f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
-                f"{singular[-1] / singular[0]:.1e}); remove the superfluous ones",
-                residual=float(singular[-1]),
-                tolerance=float(1e-10 * singular[0]),
-            )
-        products = np.einsum("aij,bjk->abik", matrices, matrices)
-        commutators = real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
-        commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
-        coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
-        residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
-        tolerance = 1e-10
-        if residuals.max() > tolerance:
-            a, b = divmod(int(residuals.argmax()), dim)
-            raise ClosureError(
-                f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g} "
-                f"for matrices of norm 1, tolerance {tolerance:.1g}); add the missing commutators to the basis",
-                residual=float(residuals.max()),
-                tolerance=tolerance,
-                indices=(a, b),
-            )
-        constants = coordinates.T.reshape(dim, dim, dim)
-        constants = (constants - constants.swapaxes(0, 1)) / 2
-        scales = sizes[:, None, None] * sizes[:, None] / sizes
-        constants = without_rounding(constants, scales, columns, commutators)
+        constants, given = constants_of_matrices(basis)
         return cls(constants, name=name, basis=given, basis_names=basis_names)
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
@@ -205,6 +185,14 @@ class LieAlgebra:
         return jnp.einsum(
             "abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu")
         )
+
+    def poisson_tensor(self, mu) -> jax.Array:
+        """The matrix ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, shape (dim, dim), at one mu, shape (dim,)."""
+        return jnp.einsum("abc,c->ba", self.structure_constants, mu)
+
+    def action(self, x) -> Action:
+        """``y -> [x, y]`` and ``mu -> ad*_x mu`` for one x, shape (dim,)."""
+        return ByMatrix(self.ad(x))
 
     def killing_form(self) -> np.ndarray:
         """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
@@ -295,6 +283,38 @@ class LieAlgebra:
         """
         return self._cartan_involution
 
+    def killing_inner_product(self) -> Operator:
+        """The form ``-kappa(x, theta y)`` as a matrix, theta a Cartan involution; ``-kappa`` where there is none.
+
+        Of a semisimple algebra it is positive definite. ``form @ x`` is the covector that it makes of x, shape (dim,).
+        """
+        if not self.is_semisimple():
+            return -self.killing_form()
+        form = -self.killing_form() @ self.cartan_involution()
+        return (form + form.T) / 2
+
+    # -- many copies ----------------------------------------------------------------------------------------------
+
+    def __pow__(self, sites) -> LieAlgebra:
+        return self._power(self, sites)
+
+    _power: ClassVar[Callable[..., LieAlgebra]]
+    """Copies are algebras of a class that is defined after this one, and that enters here."""
+
+    def _copies_bracket(self, x, y) -> jax.Array:
+        """The bracket for large batches, shape (..., dim)."""
+        return self.bracket(x, y) if self._terms is None else written_out(self._terms, x, y, self.dim)
+
+    def _copies_ad_star(self, x, mu) -> jax.Array:
+        """The coadjoint operator for large batches, shape (..., dim)."""
+        if self._terms is None:
+            return self.ad_star(x, mu)
+        return written_out(tuple((a, c, b, value) for a, b, c, value in self._terms), x, mu, self.dim)
+
+    @cached_property
+    def _terms(self) -> tuple[tuple[int, int, int, float], ...] | None:
+        return written_terms(self._constants)
+
     # -- Casimirs -----------------------------------------------------------------------------------------------
 
     def casimir_count(self) -> int:
@@ -314,13 +334,22 @@ class LieAlgebra:
         found = casimirs(self, degree)
         return found if self.basis_names is None else [F.with_names(*self.basis_names) for F in found]
 
+    def leading_casimirs(self) -> list[tuple[str, Callable]]:
+        """Casimirs of low degree that are quick to find and to evaluate, with names; worth following along a motion.
+
+        Functions from mu, shape (dim,), to a number: of a small algebra the polynomial ones, as many as there are; of
+        copies on sites those of each of a few, and the sums over many; of a large matrix algebra the traces of the
+        first powers.
+        """
+        return leading_casimirs(self)
+
     # -- Python ---------------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
         return f"LieAlgebra({self.name!r}, dim={self.dim})"
 
     def _repr_html_(self) -> str:
-        return algebra_html(self.name, self.structure_constants, self.basis_names)
+        return algebra_html(self.name, self.dim, lambda: self.structure_constants, self.basis_names)
 
     def __eq__(self, other) -> bool:
         return isinstance(other, LieAlgebra) and self._key == other._key

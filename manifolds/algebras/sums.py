@@ -11,35 +11,25 @@ from ..errors import (
     ShapeError,
 )
 from .axioms import AXIOM_TOLERANCE
+from .blocks import direct_sum_by_constants, joined_names, sum_of
 from .killing import row_space
 from .lie_algebra import LieAlgebra
 
+LARGEST_BY_CONSTANTS = 40
+"""Dimension up to which a direct sum is an array of structure constants."""
+
 
 def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
-    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute."""
+    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute.
+
+    Up to dimension 40 it is given by its structure constants; a larger one acts block by block, without them, and
+    copies of one algebra in a row as one batch. See :func:`manifolds.power`.
+    """
     if not algebras:
         raise ShapeError("direct_sum needs at least one algebra")
-    dim = sum(g.dim for g in algebras)
-    constants = np.zeros((dim, dim, dim))
-    start = 0
-    for g in algebras:
-        block = slice(start, start + g.dim)
-        constants[block, block, block] = g.structure_constants
-        start += g.dim
-    bases = [g.basis for g in algebras]
-    known = [basis for basis in bases if basis is not None]
-    basis = None
-    if len(known) == len(bases):
-        basis = np.array(
-            [
-                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
-                for i, own in enumerate(known)
-                for e in own
-            ]
-        )
-    return LieAlgebra(
-        constants, name=" + ".join(g.name for g in algebras), basis=basis, basis_names=_joined_names(*algebras)
-    )
+    if sum(g.dim for g in algebras) <= LARGEST_BY_CONSTANTS:
+        return direct_sum_by_constants(algebras)
+    return sum_of(algebras)
 
 
 def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
@@ -86,7 +76,7 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
         return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
     _check_derivations(g, rho, ideal)
     constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
-    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=_joined_names(g, ideal))
+    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=joined_names(g, ideal))
     adjoint = total._balanced[0].reshape(dim, -1)
     faithful = adjoint.any() and len(row_space(adjoint)) == dim
     return LieAlgebra(
@@ -143,12 +133,3 @@ def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
         return None
     upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
     return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
-
-
-# -- helpers ------------------------------------------------------------------------------------------------------
-
-
-def _joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
-    """The names of all basis elements, where all have some and no two the same."""
-    names = [name for g in algebras for name in g.basis_names or ()]
-    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None

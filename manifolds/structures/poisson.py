@@ -79,7 +79,7 @@ class LiePoisson(PoissonStructure):
         return self.algebra.dim
 
     def tensor(self, x) -> jax.Array:
-        return jnp.einsum("abc,c->ba", self.algebra.structure_constants, x)
+        return self.algebra.poisson_tensor(x)
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.algebra.ad_star(alpha, x)

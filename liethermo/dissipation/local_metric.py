@@ -1,0 +1,73 @@
+"""The projected metric of every site by itself."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds.matrices.symmetric import semidefinite_factor
+
+from ..errors import InputError
+from .base import Dissipation
+from .checks import checked_rates, semidefinite
+from .factor import Factor
+
+
+class LocalProjectedMetric(Dissipation):
+    """The projected metric of every site by itself: a system of many sites is damped as each of them would be alone.
+
+    ``K(alpha, beta) = sum_i rate_i [G(dH_i, dH_i) G(alpha_i, beta_i) - G(dH_i, alpha_i) G(dH_i, beta_i)]``, the indices
+    those of sites: BFM (2.2) at each, with dH_i the components of the gradient there. Each term has dH in its kernel,
+    so the energy of the whole is constant, and no rate depends on the number of sites. On so(3) at every site the force
+    is ``rate_i dH_i x (dS_i x dH_i)``; there it is also that of ``KillingDissipation(rate / 2)``.
+
+    Parameters
+    ----------
+    rate : float >= 0, or array of the shape of the sites
+    cometric : array, shape (d, d), optional
+        G of one site, positive definite; the identity by default.
+    """
+
+    rate: jax.Array
+    cometric: jax.Array | None
+
+    def __init__(self, rate=1.0, cometric=None):
+        self.rate = checked_rates(rate)
+        self.cometric = None if cometric is None else semidefinite(cometric, "the cometric of a site")
+
+    def prepared(self, system):
+        if system.space is not None:
+            raise InputError("LocalProjectedMetric is for systems on copies of an algebra, not on a manifold")
+        if self.rate.shape not in ((), system.sites):
+            raise InputError(
+                f"rates are one number, or have the shape of the sites, {system.sites}, not {self.rate.shape}"
+            )
+        d = system.shape[-1]
+        if self.cometric is not None and self.cometric.shape != (d, d):
+            raise InputError(f"the cometric of a site has shape ({d}, {d}), not {self.cometric.shape}")
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        a, b = dH.reshape(system.shape), dS.reshape(system.shape)
+        Ga, Gb = (a, b) if self.cometric is None else (a @ self.cometric, b @ self.cometric)
+        square, overlap = jnp.sum(Ga * a, axis=-1), jnp.sum(Ga * b, axis=-1)
+        return (self.rate[..., None] * (square[..., None] * Gb - overlap[..., None] * Ga)).ravel()
+
+    def factor(self, system, x, dH, dL):
+        """At each site all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, of the columns l of a root of G."""
+        d, count = system.shape[-1], math.prod(system.sites)
+        root = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
+        above = np.triu_indices(d, 1)
+        rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)
+        scale = jnp.where(rates > 0.0, jnp.sqrt(jnp.where(rates > 0.0, rates, 1.0)), 0.0)
+        gradients = dH.reshape(count, d) @ root
+
+        def turned(w):
+            W = jnp.zeros((count, d, d)).at[:, *above].add(w.reshape(count, -1))
+            skew = W - jnp.swapaxes(W, -1, -2)
+            return (scale * (jnp.einsum("nij,nj->ni", skew, gradients) @ root.T)).ravel()
+
+        return Factor(count * len(above[0]), turned, solenoidal=True)

@@ -1,0 +1,399 @@
+"""Direct sums of many algebras, and copies of one on sites: what they do is done block by block.
+
+No array over pairs of components is made: a bracket costs what those of the blocks cost, and so does the memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from .._arrays import as_numeric, real_components
+from .._sizes import check_memory, checked_size
+from ..errors import LieAlgebraError, ParameterError, ShapeError
+from ..matrices.blocks import BlockDiagonal
+from .lie_algebra import LieAlgebra
+from .on_demand import OnDemand
+from .polynomial import Polynomial
+
+FEW = 8
+"""Copies up to which the Casimirs of each are followed along a motion; of more copies their sum is."""
+
+LONGEST_LIST = 1_000_000
+"""Exponents in the Casimirs of all sites up to which they are listed one by one."""
+
+
+def power(g: LieAlgebra, sites) -> DirectSum:
+    """Copies of an algebra on sites, also written ``g ** sites``: elements of different sites commute.
+
+    Parameters
+    ----------
+    g : LieAlgebra
+    sites : int or tuple of int
+        How many copies; a tuple, such as ``(64, 64)``, for a lattice.
+
+    Returns
+    -------
+    LieAlgebra
+        Of dimension ``n * g.dim`` for n sites. Its elements have the shape ``(*sites, g.dim)``, or are flat: what
+        operations return has the shape of what they are given.
+
+    Raises
+    ------
+    ParameterError
+        If the sites are not positive integers.
+    SizeError
+        If one element would not fit into memory.
+    """
+    if not isinstance(g, LieAlgebra):
+        raise ParameterError(f"copies are of a LieAlgebra, not of {type(g).__name__}")
+    shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
+    if not shape:
+        raise ParameterError("copies of an algebra need a number of sites")
+    shape = tuple(checked_size(n, 1, "power(g, sites)", "each number of sites") for n in shape)
+    if isinstance(g, DirectSum) and g.sites is not None:
+        shape = (*shape, *g.sites)
+        g = g.blocks[0][0]
+    count = math.prod(shape)
+    check_memory(float(count) * g.dim, f"one element of {g.name} on {count} sites", "take fewer sites")
+    return DirectSum(((g, count),), shape)
+
+
+def sum_of(algebras: Sequence[LieAlgebra]) -> DirectSum:
+    """The direct sum of algebras in a row, equal neighbours taken together."""
+    blocks: list[tuple[LieAlgebra, int]] = []
+    for g in algebras:
+        parts = g.blocks if isinstance(g, DirectSum) else ((g, 1),)
+        for part, count in parts:
+            if blocks and (blocks[-1][0] is part or blocks[-1][0] == part):
+                blocks[-1] = (blocks[-1][0], blocks[-1][1] + count)
+            else:
+                blocks.append((part, count))
+    return DirectSum(tuple(blocks))
+
+
+@jax.tree_util.register_static
+class DirectSum(OnDemand):
+    """A direct sum by its blocks; see :func:`manifolds.power` and :func:`manifolds.direct_sum`.
+
+    Attributes
+    ----------
+    blocks : tuple of (LieAlgebra, int)
+        Each with how often it stands in a row.
+    sites : tuple of int, or None
+        Of copies of one algebra, as they were asked for.
+    """
+
+    def __init__(self, blocks: tuple[tuple[LieAlgebra, int], ...], sites: tuple[int, ...] | None = None):
+        self.blocks, self.sites = blocks, sites
+        if sites is None:
+            name = " + ".join(g.name if count == 1 else f"({g.name})^{count}" for g, count in blocks)
+        else:
+            name = f"({blocks[0][0].name})^{'x'.join(map(str, sites))}"
+        super().__init__(name, sum(g.dim * count for g, count in blocks))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.dim,) if self.sites is None else (*self.sites, self.blocks[0][0].dim)
+
+    @cached_property
+    def _key(self):
+        return self.blocks, self.sites
+
+    # -- the operations, block by block -----------------------------------------------------------------------------
+
+    def bracket(self, x, y) -> jax.Array:
+        """Lie bracket ``[x, y]``; elements have shape (..., dim) or ``(..., *sites, d)``, and so has the result."""
+        return self._blockwise("_copies_bracket", (x, "x"), (y, "y"))
+
+    def ad_star(self, x, mu) -> jax.Array:
+        """Coadjoint operator ``ad*_x mu``, for elements of shape (..., dim) or ``(..., *sites, d)``."""
+        return self._blockwise("_copies_ad_star", (x, "x"), (mu, "mu"))
+
+    def action(self, x) -> BlockAction:
+        return BlockAction(self, x)
+
+    def ad(self, x) -> jax.Array:
+        """Matrix of ``y -> [x, y]``, shape (..., dim, dim), mostly zeros: for small sums alone."""
+        self._check_square("the matrix of ad")
+        ads = [g.ad(part) for (g, _), part in zip(self.blocks, self.split(x), strict=True)]
+        return _block_diagonal(ads)
+
+    def split(self, x, what: str = "x") -> list[jax.Array]:
+        """The parts of an element in each kind of block, shape (..., count, d)."""
+        x, parts, start = self._flat(x, what)[0], [], 0
+        for g, count in self.blocks:
+            stop = start + g.dim * count
+            parts.append(x[..., start:stop].reshape(*x.shape[:-1], count, g.dim))
+            start = stop
+        return parts
+
+    def _blockwise(self, kernel: str, *elements) -> jax.Array:
+        shaped = any(self._flat(x, what)[1] for x, what in elements)
+        columns = zip(*(self.split(x, what) for x, what in elements), strict=True)
+        found = [getattr(g, kernel)(*parts) for (g, _), parts in zip(self.blocks, columns, strict=True)]
+        rows = [part.reshape(*part.shape[:-2], -1) for part in found]
+        joined = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
+        return joined.reshape(*joined.shape[:-1], *self.shape) if shaped else joined
+
+    def _flat(self, x, what: str) -> tuple[jax.Array, bool]:
+        """An element with its components in one axis, and whether it came with axes for the sites."""
+        array = jnp.asarray(as_numeric(x, what))
+        if self.sites is not None and array.shape[-len(self.shape) :] == self.shape:
+            array = array.reshape(*array.shape[: -len(self.shape)], self.dim)
+            return real_components(array, self.dim, what), True
+        if self.sites is not None and array.shape[-1:] != (self.dim,):
+            raise ShapeError(f"{what} has shape (..., {_axes(self.shape)}) or (..., {self.dim}), not {array.shape}")
+        return real_components(array, self.dim, what), False
+
+    def _element(self, x, what: str) -> jax.Array:
+        return self._flat(x, what)[0]
+
+    def _copies_bracket(self, x, y) -> jax.Array:
+        return self.bracket(x, y)
+
+    def _copies_ad_star(self, x, mu) -> jax.Array:
+        return self.ad_star(x, mu)
+
+    # -- structure: that of the blocks ------------------------------------------------------------------------------
+
+    def killing_form(self) -> np.ndarray:
+        return self._square("the Killing form", lambda g: g.killing_form())
+
+    def cartan_involution(self) -> np.ndarray:
+        return self._square("the Cartan involution", lambda g: g.cartan_involution())
+
+    def killing_inner_product(self) -> BlockDiagonal:
+        forms = tuple(_as_operator(g.killing_inner_product()) for g, _ in self.blocks)
+        return BlockDiagonal(forms, tuple(g.dim for g, _ in self.blocks), tuple(count for _, count in self.blocks))
+
+    def killing_signature(self) -> tuple[int, int, int]:
+        positive, negative, zero = np.sum([count * np.array(g.killing_signature()) for g, count in self.blocks], axis=0)
+        return int(positive), int(negative), int(zero)
+
+    def is_abelian(self) -> bool:
+        return all(g.is_abelian() for g, _ in self.blocks)
+
+    def is_semisimple(self) -> bool:
+        return all(g.is_semisimple() for g, _ in self.blocks)
+
+    def is_unimodular(self) -> bool:
+        return all(g.is_unimodular() for g, _ in self.blocks)
+
+    def derived_series(self) -> list[int]:
+        return _added([(g.derived_series(), count) for g, count in self.blocks])
+
+    def lower_central_series(self) -> list[int]:
+        return _added([(g.lower_central_series(), count) for g, count in self.blocks])
+
+    # -- Casimirs -----------------------------------------------------------------------------------------------------
+
+    def casimir_count(self) -> int:
+        return sum(count * g.casimir_count() for g, count in self.blocks)
+
+    def casimirs(self, degree: int) -> list:
+        """The Casimirs of each block in turn, as functions of the whole mu.
+
+        Raises
+        ------
+        LieAlgebraError
+            If they are too many to be listed: :meth:`site_casimirs` evaluates those of all sites together.
+        """
+        number = sum(count * len(g.casimirs(degree)) for g, count in self.blocks)
+        if number * self.dim > LONGEST_LIST:
+            raise LieAlgebraError(
+                f"{self.name} has {number} Casimirs of degree {degree}, too many to be listed as functions of all its "
+                f"{self.dim} components; site_casimirs({degree}) evaluates those of all sites together"
+            )
+        return [
+            _placed(F, start + i * g.dim, g.dim, self.dim)
+            for g, count, start in self._starts()
+            for i in range(count)
+            for F in g.casimirs(degree)
+        ]
+
+    def site_casimirs(self, degree: int) -> list[SiteCasimirs]:
+        """The Casimirs of the blocks, each a function of the whole mu with a value for every copy.
+
+        Of copies on sites the values have the shape ``(..., *sites)``.
+        """
+        return [self._on_copies(F, g, count, start) for g, count, start in self._starts() for F in g.casimirs(degree)]
+
+    def leading_casimirs(self) -> list[tuple[str, Callable]]:
+        found: list[tuple[str, Callable]] = []
+        for i, (g, count, start) in enumerate(self._starts()):
+            place = "" if len(self.blocks) == 1 else f" in block {i + 1}"
+            for name, F in g.leading_casimirs():
+                if count > FEW:
+                    found.append((f"sum of {name}{place}", Total(self._on_copies(F, g, count, start))))
+                    continue
+                for j in range(count):
+                    found.append((f"{name} at {j + 1}{place}", _placed(F, start + j * g.dim, g.dim, self.dim)))
+        return found
+
+    def _on_copies(self, F: Callable, g: LieAlgebra, count: int, start: int) -> SiteCasimirs:
+        return SiteCasimirs(F, g.dim, count, start, self.dim, self.sites)
+
+    def _starts(self) -> Iterator[tuple[LieAlgebra, int, int]]:
+        start = 0
+        for g, count in self.blocks:
+            yield g, count, start
+            start += g.dim * count
+
+    # -- constants ----------------------------------------------------------------------------------------------------
+
+    def _made_by_constants(self) -> LieAlgebra:
+        return direct_sum_by_constants([g for g, count in self.blocks for _ in range(count)])
+
+    def _square(self, what: str, of: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
+        self._check_square(what)
+        return scipy.linalg.block_diag(*(block for g, count in self.blocks for block in [of(g)] * count))
+
+
+class BlockAction:
+    """The action of one element of a sum: that of its parts."""
+
+    def __init__(self, g: DirectSum, x):
+        self.g, self.x = g, x
+
+    def bracket(self, y) -> jax.Array:
+        return self.g.bracket(self.x, y)
+
+    def ad_star(self, mu) -> jax.Array:
+        return self.g.ad_star(self.x, mu)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class SiteCasimirs:
+    """A Casimir of one algebra at each of its copies: ``mu -> values``, shape (..., dim) to (..., copies).
+
+    With sites, mu may have the shape ``(..., *sites, d)``, and the values have ``(..., *sites)``.
+    """
+
+    casimir: Callable
+    size: int
+    count: int
+    start: int
+    dim: int
+    sites: tuple[int, ...] | None
+
+    def __call__(self, mu) -> jax.Array:
+        mu = jnp.asarray(as_numeric(mu, "mu"))
+        shape = (self.count,) if self.sites is None else self.sites
+        axes = (*shape, self.size)
+        if self.sites is None or mu.shape[-len(axes) :] != axes:
+            mu = real_components(mu, self.dim, "mu")[..., self.start : self.start + self.count * self.size]
+            mu = mu.reshape(*mu.shape[:-1], *axes)
+        return self.casimir(mu)
+
+    def __str__(self) -> str:
+        return f"{self.casimir} at each of {self.count} copies"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Total:
+    """The sum of a Casimir over the copies, shape (..., dim) to (...)."""
+
+    part: SiteCasimirs
+
+    @property
+    def dim(self) -> int:
+        return self.part.dim
+
+    def __call__(self, mu) -> jax.Array:
+        return jnp.sum(self.part(real_components(mu, self.dim, "mu")).reshape(*jnp.shape(mu)[:-1], -1), axis=-1)
+
+    def __str__(self) -> str:
+        return f"sum of {self.part.casimir}"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Placed:
+    """A Casimir of one block as a function of the whole mu, shape (..., dim) to (...)."""
+
+    casimir: Callable
+    start: int
+    size: int
+    dim: int
+
+    def __call__(self, mu) -> jax.Array:
+        return self.casimir(real_components(mu, self.dim, "mu")[..., self.start : self.start + self.size])
+
+    def __str__(self) -> str:
+        return f"{self.casimir} of components {self.start + 1} to {self.start + self.size}"
+
+
+def _placed(F, start: int, size: int, dim: int) -> Polynomial | Placed:
+    if not isinstance(F, Polynomial):
+        return Placed(F, start, size, dim)
+    exponents = np.zeros((len(F.terms), dim), dtype=np.int64)
+    exponents[:, start : start + size] = F.exponents
+    return Polynomial(exponents, F.coefficients)
+
+
+def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
+    """The direct sum as one array of structure constants."""
+    dim = sum(g.dim for g in algebras)
+    constants, start = np.zeros((dim, dim, dim)), 0
+    for g in algebras:
+        block = slice(start, start + g.dim)
+        constants[block, block, block] = g.structure_constants
+        start += g.dim
+    bases = [g.basis for g in algebras]
+    known = [basis for basis in bases if basis is not None]
+    basis = None
+    if len(known) == len(bases):
+        basis = np.array(
+            [
+                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
+                for i, own in enumerate(known)
+                for e in own
+            ]
+        )
+    name = " + ".join(g.name for g in algebras)
+    return LieAlgebra(constants, name=name, basis=basis, basis_names=joined_names(*algebras))
+
+
+def joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
+    """The names of all basis elements, where all have some and no two the same."""
+    names = [name for g in algebras for name in g.basis_names or ()]
+    return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
+
+
+def _added(series: list[tuple[list[int], int]]) -> list[int]:
+    """Dimensions added up, each series so many times, and going on where it has ended."""
+    longest = max(len(dims) for dims, _ in series)
+    return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in series) for i in range(longest)]
+
+
+def _block_diagonal(parts: list[jax.Array]) -> jax.Array:
+    """Matrices, shapes (..., count, d, d), in the blocks of one, shape (..., n, n)."""
+    size = sum(part.shape[-3] * part.shape[-1] for part in parts)
+    found, start = jnp.zeros((*parts[0].shape[:-3], size, size)), 0
+    for part in parts:
+        count, d = part.shape[-3], part.shape[-1]
+        own = jnp.einsum("...idm,ij->...idjm", part, np.eye(count)).reshape(*part.shape[:-3], count * d, count * d)
+        found = found.at[..., start : start + count * d, start : start + count * d].set(own)
+        start += count * d
+    return found
+
+
+def _as_operator(form):
+    return jnp.asarray(form) if isinstance(form, np.ndarray) else form
+
+
+def _axes(shape: tuple[int, ...]) -> str:
+    return ", ".join(map(str, shape))
+
+
+LieAlgebra._power = staticmethod(power)
