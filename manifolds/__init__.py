@@ -9,9 +9,10 @@ import importlib
 from . import _precision, testing  # noqa: F401
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
-from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su
+from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
 from .algebras.invariants import TracePolynomial
 from .algebras.lie_algebra import LieAlgebra
+from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.polynomial import Polynomial
 from .algebras.sums import direct_sum, semidirect_sum
 from .errors import (
@@ -105,7 +106,9 @@ __all__ = [
     "LieAlgebraError",
     "LiePoisson",
     "ManifoldsError",
+    "MatrixAlgebra",
     "MatrixGroup",
+    "MatrixTrace",
     "MidpointRetraction",
     "NoPoisson",
     "NoPolynomialCasimirWarning",
@@ -158,6 +161,7 @@ __all__ = [
     "sp",
     "su",
     "testing",
+    "u",
 ]
 
 

@@ -2,6 +2,9 @@
 
 Every entry registers the instances on which the shared property suite runs (:func:`registered`): add an algebra
 here, with ``@register(...)``, and it is tested.
+
+The classical algebras of a dimension above 120 are :class:`manifolds.MatrixAlgebra`: the same bases, normalised alike,
+but brackets are products of matrices and no constants are made. su(512) takes some megabytes.
 """
 
 from __future__ import annotations
@@ -11,13 +14,22 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .._sizes import checked_size
+from .._sizes import check_memory, checked_size
 from ..errors import ParameterError
+from . import matrix_bases
 from ._null_space import rational_null_space
 from .lie_algebra import LieAlgebra
+from .matrix_algebra import Classical, MatrixAlgebra
+from .matrix_bases import MatrixBasis
 from .sums import direct_sum, semidirect_sum
 
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
+
+LARGEST_BY_CONSTANTS = 120
+"""Dimension up to which the classical algebras are arrays of structure constants: su(11), so(16), sp(7)."""
+
+WORKING_MATRICES = 20
+"""Matrices of doubles that a step of a method works with, at the least."""
 
 BIANCHI_KINDS = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX")
 
@@ -60,9 +72,10 @@ def so(p: int, q: int = 0) -> LieAlgebra:
     if (p, q) == (3, 0):
         i, j, k = np.eye(3)
         return _named([_e(k, j) - _e(j, k), _e(i, k) - _e(k, i), _e(j, i) - _e(i, j)], "so(3)")
-    form = np.diag([1.0] * p + [-1.0] * q)
-    basis = [(_unit(n, i, j) - _unit(n, j, i)) @ form for i in range(n) for j in range(i + 1, n)]
-    return _named(basis, f"so({p},{q})" if q else f"so({n})")
+    even = tuple(range(2, n, 2))
+    pfaffian = n // 2 if n % 2 == 0 else None
+    known = Classical(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, even, pfaffian)
+    return _classical(f"so({p},{q})" if q else f"so({n})", n, known, lambda: matrix_bases.orthogonal(p, q))
 
 
 @register((2,), (3,), (4,))
@@ -72,14 +85,16 @@ def su(n: int) -> LieAlgebra:
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
     """
     n = checked_size(n, 2, "su(n)")
-    basis = []
-    for k in range(1, n):
-        for j in range(k):
-            basis.append(-0.5j * (_unit(n, j, k) + _unit(n, k, j)))
-            basis.append(-0.5 * (_unit(n, j, k) - _unit(n, k, j)))
-        diagonal = np.diag([1.0] * k + [-float(k)] + [0.0] * (n - k - 1))
-        basis.append(-0.5j * math.sqrt(2.0 / (k * (k + 1))) * diagonal)
-    return _named(basis, f"su({n})")
+    known = Classical(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
+    return _classical(f"su({n})", n, known, lambda: matrix_bases.unitary(n, centre=False))
+
+
+@register((2,))
+def u(n: int) -> LieAlgebra:
+    """Anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
+    n = checked_size(n, 1, "u(n)")
+    known = Classical(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
+    return _classical(f"u({n})", n, known, lambda: matrix_bases.unitary(n, centre=True))
 
 
 @register((2,), (3,))
@@ -89,22 +104,17 @@ def sl(n: int) -> LieAlgebra:
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
     """
     n = checked_size(n, 2, "sl(n)")
-    diagonal = [_unit(n, i, i) - _unit(n, i + 1, i + 1) for i in range(n - 1)]
-    upper = [_unit(n, i, j) for i in range(n) for j in range(i + 1, n)]
-    lower = [_unit(n, j, i) for i in range(n) for j in range(i + 1, n)]
-    return _named(diagonal + upper + lower, f"sl({n})")
+    rotations = n * (n - 1) // 2
+    known = Classical(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
+    return _classical(f"sl({n})", n, known, lambda: matrix_bases.special_linear(n))
 
 
 @register((1,), (2,))
 def sp(n: int) -> LieAlgebra:
     """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
     n = checked_size(n, 1, "sp(n)")
-    zero = np.zeros((n, n))
-    blocks = [np.block([[_unit(n, i, j), zero], [zero, -_unit(n, j, i)]]) for i in range(n) for j in range(n)]
-    symmetric = [_unit(n, i, j) + (i != j) * _unit(n, j, i) for i in range(n) for j in range(i, n)]
-    blocks += [np.block([[zero, s], [zero, zero]]) for s in symmetric]
-    blocks += [np.block([[zero, zero], [s, zero]]) for s in symmetric]
-    return _named(blocks, f"sp({n})")
+    known = Classical(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
+    return _classical(f"sp({n})", 2 * n, known, lambda: matrix_bases.symplectic(n))
 
 
 @register(())
@@ -140,7 +150,9 @@ _OCTONIONS = (
 def gl(n: int) -> LieAlgebra:
     """All real matrices, basis E_ij row by row."""
     n = checked_size(n, 1, "gl(n)")
-    return _named([_unit(n, i, j) for i in range(n) for j in range(n)], f"gl({n})")
+    rotations = n * (n - 1) // 2
+    known = Classical(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
+    return _classical(f"gl({n})", n, known, lambda: matrix_bases.general_linear(n))
 
 
 @register((2,), (3,))
@@ -258,6 +270,14 @@ def _unit(n: int, i: int, j: int) -> np.ndarray:
     matrix = np.zeros((n, n))
     matrix[i, j] = 1.0
     return matrix
+
+
+def _classical(name: str, size: int, known: Classical, tables: Callable[[], MatrixBasis]) -> LieAlgebra:
+    """By constants up to LARGEST_BY_CONSTANTS, by products of matrices beyond; the basis is the same."""
+    check_memory(WORKING_MATRICES * float(size) ** 2, f"one step with matrices of {name}", "take smaller ones")
+    if sum(known.signature) <= LARGEST_BY_CONSTANTS:
+        return _named(tables().matrices(), name)
+    return MatrixAlgebra(name, tables(), known)
 
 
 def _named(basis, name: str) -> LieAlgebra:

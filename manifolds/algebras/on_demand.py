@@ -74,7 +74,8 @@ class OnDemand(LieAlgebra):
 
     def ad(self, x):
         self._check_square("the matrix of ad")
-        return self.by_constants.ad(x)
+        columns = self.bracket(jnp.asarray(x)[..., None, :], jnp.eye(self.dim))
+        return jnp.swapaxes(columns, -1, -2)
 
     def poisson_tensor(self, mu):
         self._check_square("the Poisson tensor")

@@ -1,0 +1,308 @@
+"""Classical matrix algebras of any size: what they do is done by products of matrices, O(N^3), in O(N^2) memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._arrays import is_traced, real_components, square_matrices
+from .._sizes import check_memory
+from ..errors import LieAlgebraError, ParameterError
+from ..matrices.blocks import Diagonal
+from .lie_algebra import LieAlgebra
+from .matrix_bases import MatrixBasis
+from .on_demand import OnDemand
+
+FOLLOWED_DEGREE = 4
+"""Traces of powers up to this one are followed along a motion."""
+
+Parts = tuple[jax.Array, ...]
+"""A matrix by its real part and, of complex ones, its imaginary part."""
+
+
+@dataclass(frozen=True)
+class Classical:
+    """What is known of a classical algebra without a computation.
+
+    Attributes
+    ----------
+    rank : int
+        The number of Casimirs.
+    signature : tuple of int
+        Positive, negative and zero eigenvalues of the Killing form.
+    killing : tuple of float
+        (c, d) of the Killing form ``c tr(xy) - d tr(x) tr(y)``.
+    compact : bool
+        Whether all matrices are anti-Hermitian.
+    degrees : tuple of int
+        Those of the traces of powers that generate the Casimirs.
+    pfaffian : int or None
+        The degree of the Pfaffian, where there is one besides.
+    """
+
+    rank: int
+    signature: tuple[int, int, int]
+    killing: tuple[float, float]
+    compact: bool
+    degrees: tuple[int, ...]
+    pfaffian: int | None = None
+
+
+@jax.tree_util.register_static
+class MatrixAlgebra(OnDemand):
+    """A classical algebra of large matrices; ``manifolds.su(N)`` and its neighbours make one where N is large.
+
+    ``[x, y]`` and ``ad*_x mu`` are found from the matrices of x, y and mu: mu is the matrix M of the algebra with
+    ``<mu, y> = Re tr(M^H y)``, so that ``ad*_x mu`` is that of ``[x^H, M]``. Products of complex matrices are three of
+    real ones, and of anti-Hermitian matrices a commutator is one product, less its adjoint.
+
+    Attributes
+    ----------
+    matrix_size : int
+        N.
+    tables : MatrixBasis
+    known : Classical
+    """
+
+    def __init__(self, name: str, tables: MatrixBasis, known: Classical):
+        super().__init__(name, tables.dim)
+        self.tables, self.known, self.matrix_size = tables, known, tables.size
+
+    @property
+    def _key(self):
+        return self.name, self.dim
+
+    # -- the operations -----------------------------------------------------------------------------------------------
+
+    def bracket(self, x, y) -> jax.Array:
+        x, y = self._element(x, "x"), self._element(y, "y")
+        return self._bracket(self.tables.matrix(x), self.tables.matrix(y))
+
+    def ad_star(self, x, mu) -> jax.Array:
+        x, mu = self._element(x, "x"), self._element(mu, "mu")
+        return self._ad_star(self.tables.matrix(x), mu)
+
+    def action(self, x) -> MatrixAction:
+        return MatrixAction(self, self.tables.matrix(self._element(x, "x")))
+
+    def _bracket(self, X: Parts, Y: Parts) -> jax.Array:
+        return self._components(self._commutator(X, Y))
+
+    def _ad_star(self, X: Parts, mu) -> jax.Array:
+        return self.tables.products(self._commutator(_adjoint(X), self.tables.matrix(self.tables.raised(mu))))
+
+    def _commutator(self, X: Parts, Y: Parts) -> Parts:
+        product = _product(X, Y)
+        other = _adjoint(product) if self.known.compact else _product(Y, X)
+        return tuple(a - b for a, b in zip(product, other, strict=True))
+
+    def _components(self, X: Parts) -> jax.Array:
+        return self.tables.raised(self.tables.products(X))
+
+    def hat(self, x) -> jax.Array:
+        """The matrix ``sum_a x_a e_a``, shape (..., N, N)."""
+        return _joined(self.tables.matrix(self._element(x, "x")))
+
+    def vee(self, X) -> jax.Array:
+        """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
+
+        Raises
+        ------
+        LieAlgebraError
+            If ``X`` is not in the algebra (residual above 1e-8 relative; not checked under tracing).
+        """
+        matrix = square_matrices(X, self.matrix_size, "X")
+        components = self._components(self._parts(matrix))
+        if not is_traced(matrix):
+            residual = float(jnp.max(jnp.abs(_joined(self.tables.matrix(components)) - matrix), initial=0.0))
+            tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(matrix), initial=0.0)))
+            if not residual <= tolerance:
+                trace = float(jnp.max(jnp.abs(jnp.trace(matrix, axis1=-2, axis2=-1))))
+                what = f", and its trace is {trace:.3g}" if trace > tolerance else ""
+                raise LieAlgebraError(
+                    f"the matrix is not in {self.name}: it is {residual:.3g} away from it (tolerance {tolerance:.1g})"
+                    + what,
+                    residual=residual,
+                    tolerance=tolerance,
+                )
+        return components
+
+    def dual_matrix(self, mu) -> jax.Array:
+        """The matrix M of the algebra with ``<mu, y> = Re tr(M^H hat(y))`` for every y, shape (..., N, N)."""
+        return _joined(self.tables.matrix(self.tables.raised(self._element(mu, "mu"))))
+
+    def from_dual_matrix(self, M) -> jax.Array:
+        """The inverse of :meth:`dual_matrix`; of any matrix, that of its part in the algebra, shape (..., dim)."""
+        return self.tables.products(self._parts(square_matrices(M, self.matrix_size, "M")))
+
+    def _parts(self, matrix) -> Parts:
+        return (matrix.real, matrix.imag)[: self.tables.parts]
+
+    # -- structure ----------------------------------------------------------------------------------------------------
+
+    @property
+    def basis(self) -> np.ndarray:
+        numbers = float(self.dim) * self.matrix_size**2 * self.tables.parts
+        check_memory(numbers, f"the matrices of the basis of {self.name}", "hat and vee need no list of them")
+        return self._matrices
+
+    @cached_property
+    def _matrices(self) -> np.ndarray:
+        return self.tables.matrices()
+
+    def _made_by_constants(self) -> LieAlgebra:
+        one = jnp.eye(self.dim)
+        constants = np.stack([np.asarray(self.bracket(e, one)) for e in one])
+        constants[np.abs(constants) < 1e-15 * np.abs(constants).max()] = 0.0
+        return LieAlgebra((constants - constants.swapaxes(0, 1)) / 2, name=self.name, basis=self.basis)
+
+    def killing_form(self) -> np.ndarray:
+        self._check_square("the Killing form")
+        return np.asarray(jax.vmap(self._killing)(jnp.eye(self.dim)))
+
+    def _killing(self, x) -> jax.Array:
+        """The covector ``kappa(x, .)``."""
+        c, d = self.known.killing
+        X = self.tables.matrix(x)
+        traces = [jnp.trace(part, axis1=-2, axis2=-1)[..., None, None] * np.eye(self.matrix_size) for part in X]
+        return self.tables.products(
+            tuple(c * a - d * sign * t for a, t, sign in zip(_adjoint(X), traces, (1.0, -1.0), strict=False))
+        )
+
+    def killing_inner_product(self) -> Any:
+        if self.is_semisimple() and self.tables.orthogonal:
+            return Diagonal(jnp.asarray(self.known.killing[0] * self.tables.squares))
+        return TraceForm(self)
+
+    def killing_signature(self) -> tuple[int, int, int]:
+        return self.known.signature
+
+    def cartan_involution(self) -> np.ndarray:
+        if not self.is_semisimple():
+            raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
+        self._check_square("the Cartan involution")
+        images = jax.vmap(lambda e: self._components(tuple(-a for a in _adjoint(self.tables.matrix(e)))))
+        return np.asarray(images(jnp.eye(self.dim)).T)
+
+    def is_abelian(self) -> bool:
+        return False
+
+    def is_unimodular(self) -> bool:
+        return True
+
+    def derived_series(self) -> list[int]:
+        centre = self.known.signature[2]
+        return [self.dim, self.dim - centre] if centre else [self.dim]
+
+    def lower_central_series(self) -> list[int]:
+        return self.derived_series()
+
+    # -- Casimirs -----------------------------------------------------------------------------------------------------
+
+    def casimir_count(self) -> int:
+        return self.known.rank
+
+    def casimirs(self, degree: int) -> list:
+        """The trace of a power of the matrix of mu, where it is no polynomial in those of lower degree.
+
+        Raises
+        ------
+        LieAlgebraError
+            Of the degree of the Pfaffian, which is not formed for large matrices.
+        """
+        if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
+            raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
+        if degree == self.known.pfaffian:
+            raise LieAlgebraError(
+                f"{self.name} has a Casimir of degree {degree}, its Pfaffian, that is not formed for large matrices; "
+                "its square is the determinant, a polynomial in the traces of the even powers"
+            )
+        return [MatrixTrace(self, int(degree))] if degree in self.known.degrees else []
+
+    def leading_casimirs(self) -> list[tuple[str, Callable]]:
+        return [(str(F), F) for d in self.known.degrees if d <= FOLLOWED_DEGREE for F in [MatrixTrace(self, d)]]
+
+
+class MatrixAction:
+    """The action of one x, by its matrix."""
+
+    def __init__(self, g: MatrixAlgebra, X: Parts):
+        self.g, self.X = g, X
+
+    def bracket(self, y) -> jax.Array:
+        return self.g._bracket(self.X, self.g.tables.matrix(y))
+
+    def ad_star(self, mu) -> jax.Array:
+        return self.g._ad_star(self.X, mu)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class TraceForm:
+    """``-kappa(x, theta y)`` or, of an algebra that is not semisimple, ``-kappa(x, y)``, as a linear map."""
+
+    algebra: MatrixAlgebra
+
+    def __matmul__(self, x) -> jax.Array:
+        g = self.algebra
+        if g.is_semisimple():
+            return g.known.killing[0] * g.tables.products(g.tables.matrix(x))
+        return -g._killing(x)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class MatrixTrace:
+    """The Casimir ``tr(M(mu)**degree)``, of anti-Hermitian matrices ``tr((i M)**degree)``: (..., dim) to (...).
+
+    M(mu) is :meth:`MatrixAlgebra.dual_matrix`.
+    """
+
+    algebra: MatrixAlgebra
+    degree: int
+
+    @property
+    def dim(self) -> int:
+        return self.algebra.dim
+
+    def __call__(self, mu) -> jax.Array:
+        g = self.algebra
+        raised = g.tables.raised(real_components(mu, g.dim, "mu"))
+        if g.known.compact and self.degree == 2:
+            return jnp.sum(jnp.asarray(mu) * raised, axis=-1)
+        M = g.tables.matrix(raised)
+        if g.known.compact:  # i (a + i b) = -b + i a
+            M = (-M[1], M[0]) if len(M) == 2 else (jnp.zeros_like(M[0]), M[0])
+        left = M
+        for _ in range(self.degree // 2 - 1):
+            left = _product(left, M)
+        if self.degree == 1:
+            return jnp.trace(M[0], axis1=-2, axis2=-1)
+        right = _product(left, M) if self.degree % 2 else left
+        found = jnp.sum(left[0] * jnp.swapaxes(right[0], -1, -2), axis=(-2, -1))  # Re tr(A B)
+        return found if len(M) == 1 else found - jnp.sum(left[1] * jnp.swapaxes(right[1], -1, -2), axis=(-2, -1))
+
+    def __str__(self) -> str:
+        return f"tr({'(i M)' if self.algebra.known.compact else 'M'}**{self.degree})"
+
+
+def _product(X: Parts, Y: Parts) -> Parts:
+    if len(X) == 1:
+        return (X[0] @ Y[0],)
+    (a, b), (c, d) = X, Y
+    real, imaginary, both = a @ c, b @ d, (a + b) @ (c + d)
+    return real - imaginary, both - real - imaginary
+
+
+def _adjoint(X: Parts) -> Parts:
+    return tuple(sign * jnp.swapaxes(part, -1, -2) for sign, part in zip((1.0, -1.0), X, strict=False))
+
+
+def _joined(X: Parts) -> jax.Array:
+    return X[0] if len(X) == 1 else jax.lax.complex(X[0], X[1])

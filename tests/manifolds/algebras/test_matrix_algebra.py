@@ -1,0 +1,110 @@
+"""Classical algebras by products of matrices, against the same algebras by structure constants."""
+
+import jax
+import numpy as np
+import pytest
+
+import manifolds as mf
+from manifolds.algebras import catalogue
+
+LONG = [("u", 3), ("so", 5), ("sp", 2), ("gl", 3)]
+PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark.slow) for p in LONG)]
+
+
+@pytest.fixture(scope="module", params=PAIRS, ids=lambda p: f"{p[0]}{p[1:]}")
+def pair(request):
+    name, *sizes = request.param
+    constructor = getattr(mf, name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalogue, "LARGEST_BY_CONSTANTS", 0)
+        by_matrices = constructor(*sizes)
+    by_constants = constructor(*sizes)
+    assert isinstance(by_matrices, mf.MatrixAlgebra)
+    assert not isinstance(by_constants, mf.MatrixAlgebra)
+    return by_matrices, by_constants
+
+
+def test_operations_and_forms_are_those_of_the_constants(pair):
+    m, c = pair
+    x, y, mu = np.random.default_rng(0).standard_normal((3, 4, c.dim))
+    for name, arguments in [("bracket", (x, y)), ("ad_star", (x, mu)), ("ad", (x,)), ("hat", (x,))]:
+        np.testing.assert_allclose(getattr(m, name)(*arguments), getattr(c, name)(*arguments), atol=1e-14)
+    np.testing.assert_allclose(m.vee(m.hat(x)), x, atol=1e-15)
+    action = m.action(x[0])
+    np.testing.assert_allclose(action.bracket(y[0]), c.bracket(x[0], y[0]), atol=1e-14)
+    np.testing.assert_allclose(action.ad_star(mu[0]), c.ad_star(x[0], mu[0]), atol=1e-14)
+    np.testing.assert_allclose(m.killing_form(), c.killing_form(), atol=1e-13)
+    np.testing.assert_allclose(m.killing_inner_product() @ x[0], c.killing_inner_product() @ x[0], atol=1e-13)
+    if c.is_semisimple():
+        np.testing.assert_allclose(m.cartan_involution(), c.cartan_involution(), atol=1e-14)
+    M = np.asarray(m.dual_matrix(mu))
+    paired = np.einsum("nij,nij->n", M.conj(), np.asarray(m.hat(y))).real
+    np.testing.assert_allclose(paired, (mu * y).sum(axis=1), atol=1e-14)
+    np.testing.assert_allclose(m.from_dual_matrix(M), mu, atol=1e-14)
+
+
+def test_structure_is_that_of_the_constants(pair):
+    m, c = pair
+    for question in (
+        "is_abelian is_semisimple is_compact_type is_solvable is_nilpotent is_unimodular derived_series "
+        "lower_central_series killing_signature casimir_count"
+    ).split():
+        assert getattr(m, question)() == getattr(c, question)(), question
+    np.testing.assert_allclose(m.structure_constants, c.structure_constants, atol=1e-15)
+    np.testing.assert_array_equal(m.basis, c.basis)
+
+
+def test_traces_are_independent_casimirs_as_many_as_there_are(pair):
+    m, _ = pair
+    (mu,) = np.random.default_rng(1).standard_normal((1, m.dim))
+    gradients = []
+    for degree in range(1, 2 * m.matrix_size):
+        for F in m.casimirs(degree):
+            gradient = np.asarray(jax.grad(F)(mu))
+            assert np.abs(m.ad_star(gradient, mu)).max() < 1e-13 * np.abs(gradient).max()
+            gradients.append(gradient / np.linalg.norm(gradient))
+    assert np.linalg.matrix_rank(np.array(gradients), tol=1e-6) == len(gradients) == m.casimir_count()
+
+
+@pytest.mark.slow
+def test_suite_holds(pair):
+    assert mf.testing.check_algebra(pair[0], degree=2).passed
+
+
+def test_the_representation_changes_with_the_size():
+    assert type(mf.su(11)) is mf.LieAlgebra
+    assert isinstance(mf.su(12), mf.MatrixAlgebra)
+    assert mf.su(12) == mf.su(12) != mf.su(13)
+
+
+def test_large_algebras_take_memory_of_a_few_states():
+    g = mf.su(128)
+    x, y, mu = np.random.default_rng(2).standard_normal((3, g.dim)) / 100
+    X, Y = np.asarray(g.hat(x)), np.asarray(g.hat(y))
+    np.testing.assert_allclose(g.hat(g.bracket(x, y)), X @ Y - Y @ X, atol=1e-12)
+    assert float(g.ad_star(x, mu) @ y) == pytest.approx(float(mu @ g.bracket(x, y)), abs=1e-11)
+    names = [name for name, _ in g.leading_casimirs()]
+    assert names == ["tr((i M)**2)", "tr((i M)**3)", "tr((i M)**4)"]
+    assert g.casimir_count() == 127
+    for F in (F for _, F in g.leading_casimirs()):
+        gradient = jax.grad(F)(mu)
+        assert np.abs(g.ad_star(gradient, mu)).max() < 1e-12 * max(1.0, np.abs(gradient).max())
+
+
+@pytest.mark.parametrize(
+    ("attempt", "error", "says"),
+    [
+        (lambda: mf.su(10**5), mf.SizeError, "one step with matrices of su.100000. would take 1.6e.03 GB"),
+        (lambda: mf.su(512).structure_constants, mf.SizeError, "1.44e.08 GB"),
+        (lambda: mf.so(900).killing_form(), mf.SizeError, "GB"),
+        (lambda: mf.su(400).basis, mf.SizeError, "GB.*hat and vee need no list"),
+        (lambda: mf.su(12).vee(1j * np.eye(12)), mf.LieAlgebraError, "its trace is 12"),
+        (lambda: mf.so(20).vee(np.triu(np.ones((20, 20)), 1)), mf.LieAlgebraError, r"not in so\(20\): it is 0.5 away"),
+        (lambda: mf.su(12).bracket(np.zeros(142), np.zeros(143)), mf.ShapeError, "last axis 143"),
+        (lambda: mf.so(20).casimirs(10), mf.LieAlgebraError, "Pfaffian"),
+        (lambda: mf.su(12).casimirs(0), mf.ParameterError, "degree"),
+    ],
+)
+def test_refusals(attempt, error, says):
+    with pytest.raises(error, match=says):
+        attempt()
