@@ -1,5 +1,6 @@
 """Systems on copies of an algebra: states in the shape of the sites, and dissipation site by site or of the whole."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -141,3 +142,20 @@ def test_laws_hold_on_many_sites(method):
 def test_refusals(attempt, says):
     with pytest.raises(lt.InputError, match=says):
         attempt()
+
+
+@pytest.mark.parametrize(
+    "dissipation",
+    [
+        lt.LocalProjectedMetric(np.arange(6.0).reshape(SITES), np.diag([1.0, 2.0, 3.0])),
+        lt.KillingDissipation(0.3),
+        lt.InnerProductDissipation(np.diag([1.0, 0.0, 3.0])),
+    ],
+    ids=lambda d: type(d).__name__,
+)
+def test_factors_are_those_of_the_friction_matrix(dissipation):
+    made = system(dissipation, validate=False)
+    x = made.state(STATE)
+    B = made.dissipation.factor(made, x, made.energy.gradient(x), ())
+    columns = np.asarray(jax.vmap(B.times, out_axes=1)(np.eye(B.size)))
+    np.testing.assert_allclose(columns @ columns.T, made.friction_matrix(x), atol=1e-12)
