@@ -8,11 +8,12 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from .results.audit import Audit
     from .results.ensemble import Ensemble
     from .results.solution import Solution
     from .spec import Spec
@@ -50,6 +51,11 @@ def _options(
 ) -> None: ...
 
 
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="In place of what the spec says, for example run.step=0.01."),
+]
+StoreFolder = Annotated[Path, typer.Argument(metavar="STORE.zarr", help="A result of `liethermo study`.")]
 SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, described in TOML.")]
 
 
@@ -74,24 +80,27 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; by default named after the spec, here.")
     ] = None,
+    change: Changes = None,
 ) -> None:
     """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
     from .runs.integrate import integrate
     from .spec import read
 
-    plan = read(spec)
+    plan = read(spec, change or ())
     system = plan.system()
     folder = _folder(spec, Path(spec.stem) if out is None else out)
     start, end = plan.run.t_span
-    typer.echo(f"{plan.model}, {plan.method}, step {plan.run.step:g}, t = {start:g} to {end:g}")
+    typer.echo(plan.told)
     file = folder / plan.outputs.netcdf
     solution = integrate(
         system,
         plan.run.initial,
         (start, end),
-        plan.run.step,
+        plan.step,
         plan.method,
         save_every=plan.run.save_every,
+        until=plan.until,
+        attitude=plan.run.attitude,
         on_failure="return",
         save_to=file,
     ).with_provenance(spec=plan.table)
@@ -106,11 +115,64 @@ def run(
 
 @app.command()
 @_told()
-def check(spec: SpecFile) -> None:
+def study(
+    spec: SpecFile,
+    out: Annotated[
+        Path | None, typer.Option(metavar="STORE.zarr", help="Folder of the results; by default named after the spec.")
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.")
+    ] = None,
+    change: Changes = None,
+) -> None:
+    """Run the study of a spec file, or what of it is not done yet; audit the laws, and draw a measure."""
+    from .spec import read
+    from .spec.study import study_of
+
+    plan = read(spec, change or ())
+    store = Path(f"{spec.stem}.zarr") if out is None else out
+    found = study_of(plan, store)
+    typer.echo(plan.told)
+    with _client(cluster) as client:
+        reached = found.run(client)
+    typer.echo(str(reached))
+    passed = _print_rows(found.audit())
+    if plan.study is not None and reached.done:
+        _draw_study(store, plan.study.figure, store.with_suffix(f".{plan.outputs.figure_format}"))
+    raise typer.Exit(0 if passed and reached.ok else FAILED)
+
+
+@app.command()
+@_told()
+def status(store: StoreFolder) -> None:
+    """Tell how far the study in a store is, also while it runs."""
+    from .studies.study import status as status_of
+
+    typer.echo(str(status_of(store)))
+
+
+@app.command()
+@_told()
+def plot(
+    store: StoreFolder,
+    measure: Annotated[str | None, typer.Option(metavar="NAME", help="By default the first that can be drawn.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="A .png, .pdf or .svg file.")] = None,
+) -> None:
+    """Draw a measure of the study in a store."""
+    _draw_study(store, measure, store.with_suffix(".png") if out is None else out)
+
+
+@app.command()
+@_told()
+def check(spec: SpecFile, change: Changes = None) -> None:
     """Validate a spec file and test the axioms of its system at random points, without running it."""
     from .spec import read
 
-    plan = read(spec)
+    plan = read(spec, change or ())
+    if plan.study is not None:
+        from .spec.study import study_of
+
+        study_of(plan, "unused.zarr")
     report = plan.system().check()
     typer.echo(f"{spec}: the spec is valid")
     rows = [(row.axiom, row.residual, row.tolerance, row.passed, row.note) for row in report.rows]
@@ -207,10 +269,49 @@ def _print_audit(result: Solution | Ensemble) -> bool:
         typer.echo(f"{result.status} ({result.stats.wall_time:.1f} s)")
     else:
         typer.echo(f"{result} ({result.wall_time:.1f} s)")
+    return _print_rows(audit)
+
+
+def _print_rows(audit: Audit) -> bool:
+    """Print an audit; returns whether the laws held."""
     rows = [(row.law, row.value, row.tolerance, row.passed, row.note) for row in audit.rows]
     _print_verdicts(("law", "measured", "allowed"), rows)
     typer.echo(audit.verdict)
     return audit.passed
+
+
+@contextlib.contextmanager
+def _client(address: str | None) -> Iterator[Any]:
+    """A client of a Dask cluster; None where no address was given."""
+    if address is None:
+        yield None
+        return
+    from distributed import Client
+
+    from .errors import FileError
+
+    try:
+        client = Client(address, timeout=20)
+    except (OSError, ValueError) as error:
+        raise FileError(f"there is no Dask scheduler at {address}: {error}") from error
+    with client:
+        yield client
+
+
+def _draw_study(store: Path, measure: str | None, file: Path) -> None:
+    """Draw a measure of a store into a file, and tell of it; where none can be drawn, why."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    from .errors import InputError
+    from .results.study_plot import study as draw
+    from .studies.study import load_study
+
+    try:
+        draw(load_study(store), measure, file)
+        typer.echo(f"In {store}; drawn in {file}")
+    except InputError as error:
+        if measure is not None:
+            raise
+        typer.echo(f"In {store}; nothing is drawn: {error}")
 
 
 def _print_verdicts(

@@ -337,8 +337,8 @@ REFUSALS = {
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
         [
-            'method.name = "Referense": must be one of "MetriplecticGauss", "MetriplecticMidpoint", '
-            '"MetriplecticRungeKutta", "Reference" (did you mean Reference?)'
+            f'method.name = "Referense": must be one of {", ".join(f"{chr(34)}{name}{chr(34)}" for name in METHODS)} '
+            "(did you mean Reference?)"
         ],
     ),
     "option of a method": (

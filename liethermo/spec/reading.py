@@ -1,0 +1,226 @@
+"""A spec file read, and checked as a whole before anything is computed."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import os
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import models
+from ..errors import AxiomError, FileError, InputError, SpecError
+from ..integrators import DEFAULT_METHOD, METHODS
+from ..runs.adaptive import Adaptive
+from ..runs.events import Relaxed
+from ..systems import System
+from .checking import arguments, checked
+from .messages import given, raised, shown, suggestion
+from .schema import SECTIONS, AdaptiveStep, File, Method, Model, Outputs, Run, StudyOfFile
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A run, ready to start.
+
+    Attributes
+    ----------
+    path : Path
+    table : dict
+        The whole file, as JSON data.
+    build : function
+        Returns the system when called with ``parameters``.
+    parameters : dict
+    method : OneStepMethod or Reference
+    run : Run
+    outputs : Outputs
+    study : StudyOfFile, optional
+    """
+
+    path: Path
+    table: dict[str, Any]
+    build: Callable[..., System]
+    parameters: dict[str, Any]
+    method: Any
+    run: Run
+    outputs: Outputs
+    study: StudyOfFile | None = None
+
+    @property
+    def step(self) -> float | Adaptive:
+        """The step as :func:`liethermo.integrate` takes it."""
+        step = self.run.step
+        if isinstance(step, AdaptiveStep):
+            return Adaptive(step.adaptive, step.atol, step.first, step.largest)
+        return step
+
+    @property
+    def until(self) -> Relaxed | None:
+        """The event at which runs end."""
+        return None if self.run.until is None else Relaxed(self.run.until.relaxed)
+
+    @property
+    def allowed(self) -> dict[str, Any]:
+        """The arguments that the model takes, with their values in this file or their defaults."""
+        taken = inspect.signature(self.build).parameters.values()
+        defaults = {p.name: None if p.default is p.empty else p.default for p in taken if p.kind is not p.VAR_KEYWORD}
+        return {**defaults, **self.parameters}
+
+    @property
+    def told(self) -> str:
+        """The run in a line."""
+        start, end = self.run.t_span
+        step = self.step if isinstance(self.step, Adaptive) else f"step {self.step:g}"
+        return f"{self.model}, {self.method}, {step}, t = {start:g} to {end:g}"
+
+    def system(self) -> System:
+        """The system, which the initial state has been seen to fit.
+
+        Raises
+        ------
+        SpecError
+            If the system cannot be built from the parameters.
+        AxiomError
+            If it is not metriplectic.
+        """
+        try:
+            system = self.build(**self.parameters)
+        except AxiomError:
+            raise
+        except Exception as error:  # the function may be anyone's
+            raise self._refused(raised(error, self.build)) from error
+        if not isinstance(system, System):
+            raise self._refused(f"it returned {system!r:.60}, not a system such as lt.LiePoissonSystem")
+        try:
+            system.state(self.run.initial)
+        except InputError as error:
+            raise SpecError(self.path, [f"run.initial = {shown(self.run.initial)}: {error}"]) from error
+        if "momentum_sphere" in self.outputs.figures and system.dim != 3:
+            problem = f"momentum_sphere needs states of 3 components, and these have {system.dim}"
+            raise SpecError(self.path, [f"outputs.figures = {shown(self.outputs.figures)}: {problem}"])
+        return system
+
+    @property
+    def model(self) -> str:
+        """The name of the model, or ``module:function``."""
+        return self.table["model"].get("name") or self.table["model"]["function"]
+
+    def _refused(self, why: str) -> SpecError:
+        return SpecError(self.path, [f"{given('model', self.table['model'])}: {why}"])
+
+
+def read(path: str | os.PathLike, changes: Sequence[str] = ()) -> Spec:
+    """Read a spec file and check everything but the system, which is left to :meth:`Spec.system`.
+
+    ``changes`` are texts "section.key=value" that take the place of what the file says, values as in TOML.
+
+    For ``function = "module:function"``, the folder of the file and the current one become importable.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    SpecError
+        With all that is wrong in it.
+    """
+    path = Path(path)
+    table = _parse(path)
+    problems: list[str] = []
+    for change in changes:
+        _change(table, change, problems)
+    checked("", File, table, problems, "a spec file")
+    needed = [name for name in SECTIONS if name != "study" or "study" in table]
+    found = {name: checked(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in needed}
+    model, run, method, outputs = (found[name] for name in ("model", "run", "method", "outputs"))
+    build: Any = model and _builder(model, path.resolve().parent, problems)
+    parameters: Any = build and arguments("model.parameters", build, model.parameters, problems)
+    integrator = method and _integrator(method, problems)
+    if problems:
+        raise SpecError(path, problems)
+    return Spec(path, table, build, parameters, integrator, run, outputs, found.get("study"))
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"cannot read the spec file {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SpecError(path, [f"it is not valid TOML: {error}"]) from error
+    return json.loads(json.dumps(table, default=str))  # dates and times, which no key takes, become text
+
+
+def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
+    """Make one change to the content of a file."""
+    key, equals, text = change.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        problems.append(f"--set {change}: must be section.key=value, such as run.step=0.01")
+        return
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()  # a text without quotes, which a shell takes away
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            problems.append(f"--set {change}: {part} is no section")
+            return
+    table[parts[-1]] = value
+
+
+def _builder(model: Model, folder: Path, problems: list[str]) -> Callable[..., System] | None:
+    """The function that the section ``[model]`` names."""
+    if model.name is not None and model.function is None:
+        return getattr(models, model.name)
+    if model.function is not None and model.name is None:
+        try:
+            return _imported(model.function, folder)
+        except InputError as error:
+            problems.append(f"model.function = {shown(model.function)}: {error}")
+            return None
+    names = ", ".join(map(shown, models.__all__))
+    problems.append(f'model: give either name (one of {names}) or function = "module:function", not both')
+    return None
+
+
+def _imported(target: str, folder: Path) -> Callable[..., System]:
+    if not re.fullmatch(r"[\w.]+:\w+", target):
+        raise InputError('must be "module:function", such as "mysystem:build" for the function build in mysystem.py')
+    module_name, name = target.split(":")
+    for place in (str(Path.cwd()), str(folder)):
+        if place not in sys.path:
+            sys.path.insert(0, place)
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name and f"{module_name}.".startswith(f"{error.name}."):
+            raise InputError(f"no module {error.name!r} in {folder}, in the current folder or installed") from error
+        raise InputError(f"importing {module_name!r} failed with {type(error).__name__}: {error}") from error
+    function = getattr(module, name, None)
+    if not callable(function):
+        own = [key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__]
+        raise InputError(f"{module.__file__} has no function {name!r}{suggestion(name, own)}")
+    return function
+
+
+def _integrator(method: Method, problems: list[str]):
+    if method.name is None and not method.model_extra:
+        return DEFAULT_METHOD
+    kind = METHODS[method.name or "MetriplecticMidpoint"]
+    options = arguments("method", kind, method.model_extra or {}, problems)
+    if options is None:
+        return None
+    try:
+        return kind(**options)
+    except (TypeError, ValueError) as error:
+        listed = set(re.findall(r"\w+", str(error))).difference(map(str, options.values()))  # what the message allows
+        hints = [suggestion(value, listed) for value in options.values() if isinstance(value, str)]
+        problems.append(f"{given('method', options)}: {error}{''.join(hints)}")
+        return None

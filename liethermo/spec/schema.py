@@ -1,0 +1,208 @@
+"""What a spec file may say: its sections and their keys, with what each is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, FiniteFloat, Tag
+
+from .. import models
+from ..integrators import METHODS
+from .messages import refusal, shown, suggestion
+
+FIGURES = ("momentum_sphere", "laws")
+FORMATS = ("png", "pdf", "svg")
+
+
+def one_of(options: Iterable[str]) -> BeforeValidator:
+    allowed = list(options)
+
+    def check(value):
+        if value not in allowed:
+            raise refusal(f"must be one of {', '.join(map(shown, allowed))}{suggestion(str(value), allowed)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def _increasing(span: tuple[float, float]) -> tuple[float, float]:
+    if span[1] <= span[0]:
+        raise refusal("must increase: time runs forwards, since entropy grows")
+    return span
+
+
+def _netcdf_name(name: str) -> str:
+    if not re.fullmatch(r"[^/\\]+\.nc", name):
+        raise refusal('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
+    return name
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class File(Section):
+    """The whole file."""
+
+    model: Any = None
+    run: Any = None
+    method: Any = None
+    outputs: Any = None
+    study: Any = None
+
+
+class Model(Section):
+    """What is run: a model of the library, or a function of yours that returns a system."""
+
+    name: Annotated[str, one_of(models.__all__)] | None = Field(
+        None, description="a model of the library; `liethermo models` lists them"
+    )
+    function: str | None = Field(
+        None, description='in its place `"module:function"`, looked for beside the file and in the current folder'
+    )
+    parameters: dict[str, Any] = Field({}, description="the arguments of the model or the function")
+
+
+class AdaptiveStep(Section):
+    """Steps that the error chooses."""
+
+    adaptive: FiniteFloat = Field(gt=0, description="the error of a step, relative to the state: `lt.Adaptive(rtol)`")
+    atol: FiniteFloat = Field(0.0, ge=0, description="the error that is allowed besides")
+    first: FiniteFloat | None = Field(None, gt=0, description="the first step to try")
+    largest: FiniteFloat | None = Field(None, gt=0, description="no step is longer")
+
+
+class Until(Section):
+    """Where a run ends before its time."""
+
+    relaxed: FiniteFloat = Field(gt=0, description="the entropy production below which the run ends: `lt.Relaxed(tol)`")
+
+
+def _kind(value: Any) -> str:
+    return "table" if isinstance(value, dict) else "number"
+
+
+Step = Annotated[
+    Annotated[FiniteFloat, Field(gt=0), Tag("number")] | Annotated[AdaptiveStep, Tag("table")], Discriminator(_kind)
+]
+
+
+class Run(Section):
+    """The initial state, the span of time, and the steps."""
+
+    initial: list[FiniteFloat] = Field(min_length=1, description="the state to start from, a list of numbers")
+    t_span: Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_increasing)] = Field(
+        description="start and end, for example [0.0, 100.0]"
+    )
+    step: Step = Field(description="the step size, a number greater than 0, or {adaptive = 1e-8}")
+    save_every: int = Field(1, ge=1, description="every so-manieth state is kept")
+    until: Until | None = Field(None, description="where the run ends before its time, for example {relaxed = 1e-8}")
+    attitude: list[list[FiniteFloat]] | None = Field(
+        None, description="the element of the group at the start, a matrix, where the system has a group"
+    )
+
+
+class Method(BaseModel):
+    """The integrator; keys other than its name are its parameters."""
+
+    model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
+    # options without a name are those of the midpoint scheme
+    name: Annotated[str, one_of(METHODS)] | None = Field(
+        None, description=f"one of {', '.join(METHODS)}; the default is that of `integrate`"
+    )
+
+
+class Outputs(Section):
+    """What `liethermo run` writes into its folder."""
+
+    netcdf: Annotated[str, AfterValidator(_netcdf_name)] = Field("solution.nc", description="the file of the solution")
+    figures: list[Annotated[str, one_of(FIGURES)]] = Field(["laws"], description=f"some of {', '.join(FIGURES)}")
+    figure_format: Annotated[str, one_of(FORMATS)] = Field("png", description=f"one of {', '.join(FORMATS)}")
+
+
+class Points(Section):
+    """Values of an axis that lie evenly."""
+
+    first: FiniteFloat = Field(description="the first value")
+    last: FiniteFloat = Field(description="the last value")
+    points: int = Field(ge=1, description="how many")
+    scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
+
+
+class Sample(Section):
+    """Several parameters that vary together along an axis."""
+
+    zip: dict[str, list[FiniteFloat]] | None = Field(None, description="equally many values of each parameter")
+    latin_hypercube: int | None = Field(None, ge=1, description="points of a Latin hypercube, with `ranges`")
+    sobol: int | None = Field(None, ge=1, description="points of a Sobol sequence, with `ranges`")
+    ranges: dict[str, list[FiniteFloat | str]] | None = Field(
+        None, description='of each parameter [low, high], or [low, high, "log"]'
+    )
+    seed: int = Field(0, description="of the sample")
+
+
+def _sort(value: Any) -> str:
+    return "list" if not isinstance(value, dict) else "points" if "points" in value else "sample"
+
+
+AxisOfFile = Annotated[
+    Annotated[list[FiniteFloat | str], Field(min_length=1), Tag("list")]
+    | Annotated[Points, Tag("points")]
+    | Annotated[Sample, Tag("sample")],
+    Discriminator(_sort),
+]
+
+
+class MeasureOfFile(Section):
+    """A measure with a parameter."""
+
+    relaxed: FiniteFloat | None = Field(
+        None, gt=0, description="the time at which the entropy production falls below this, where the run ends"
+    )
+    at: list[FiniteFloat] | None = Field(None, min_length=1, description="values at these times")
+    what: str = Field("x", description="of which series: x, energy, entropy or attitude")
+
+
+def _word(value: Any) -> str:
+    return "measure" if isinstance(value, dict) else "word"
+
+
+Measured = Annotated[Annotated[str, Tag("word")] | Annotated[MeasureOfFile, Tag("measure")], Discriminator(_word)]
+
+
+class StudyOfFile(Section):
+    """What `liethermo study` runs: the axes, and what is kept of each point."""
+
+    axes: dict[str, AxisOfFile] = Field(
+        min_length=1,
+        description="by parameters of the model, entries of them or of the state (`rate`, `inertia[0]`, `initial[2]`): "
+        "lists of values, {first, last, points, scale}, or {zip = ...}, {latin_hypercube, ranges, seed}, {sobol, ...}",
+    )
+    measure: dict[str, Measured] = Field(
+        {"final": "final"},
+        min_length=1,
+        description='what is kept, by names of yours: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
+        '{at = [1.0, 2.0], what = "x"}',
+    )
+    chunk: int | None = Field(None, ge=1, description="points of a chunk, about")
+    units: dict[str, str] = Field({}, description="of axes and measures")
+    names: dict[str, str] = Field({}, description="long names of axes and measures")
+    figure: str | None = Field(None, description="the measure that is drawn; by default the first that can be")
+
+
+SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudyOfFile}
+
+
+def keys() -> list[tuple[str, str, str, str]]:
+    """Every key of a spec file with its section, its default and what it is, as the documentation lists them."""
+    tables = {"run.step": AdaptiveStep, "run.until": Until, "study.axes.NAME": (Points, Sample)}
+    parts = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureOfFile)]
+    found = []
+    for section, schemas in parts:
+        for schema in schemas if isinstance(schemas, tuple) else (schemas,):
+            for name, field in schema.model_fields.items():
+                default = "needed" if field.is_required() else "" if field.default is None else shown(field.default)
+                found.append((section, name, default, field.description or ""))
+    return found
