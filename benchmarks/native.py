@@ -41,6 +41,13 @@ SUMMARY = np.dtype(
 )
 """``Summary`` of c/ensemble.c."""
 
+RING = np.dtype(
+    [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
+    + [("least_entropy_increment", "f8")]
+    + [(name, "i8") for name in ("status", "steps", "iterations")]
+)
+"""``Record`` of c/spins.c."""
+
 
 def compiler() -> str | None:
     """The C compiler: ``$CC``, or ``cc``; None where there is none."""
@@ -129,6 +136,28 @@ class Bodies:
         )
         _require_success(out)
         return out
+
+
+class Ring:
+    """The step loop of a ring of spins with a bath, in threads of OpenMP; parameters as of spins.c."""
+
+    def __init__(self, parameters: Sequence[float]):
+        self._library, self._parameters = program("spins.c", "-fopenmp"), np.array(parameters, dtype=float)
+
+    def integrate(self, x0, step: float, steps: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
+        """The state after so many steps from x0, shape (3 count + 1,), and a record of :data:`RING`."""
+        x, record = np.array(x0, dtype=float), np.zeros(1, RING)
+        self._library.omp_set_num_threads(ctypes.c_int(threads))
+        self._library.integrate_ring(
+            _pointer(self._parameters),
+            _pointer(x),
+            ctypes.c_int64(len(x) // 3),
+            ctypes.c_double(step),
+            ctypes.c_int64(steps),
+            _pointer(record),
+        )
+        _require_success(record)
+        return x, record
 
 
 @functools.cache

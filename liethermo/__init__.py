@@ -19,6 +19,7 @@ from .dissipation.four_bracket import FourBracket
 from .dissipation.friction import Friction
 from .dissipation.friction_operator import FrictionOperator
 from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.landau_lifshitz import LandauLifshitz
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
@@ -35,6 +36,7 @@ from .errors import (
     NonFiniteError,
     SpecError,
 )
+from .functions import magnetism
 from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
@@ -80,10 +82,12 @@ from .systems import (
     EulerPoincareClosedSystem,
     EulerPoincareSystem,
     EvolutionSystem,
+    HeatBaths,
     Herglotz,
     LiePoissonSystem,
     MetriplecticSystem,
     SimpleClosedSystem,
+    SpinSystem,
     Subsystem,
     System,
     ThermodynamicHerglotz,
@@ -130,6 +134,7 @@ __all__ = [
     "GlobalRateWarning",
     "Gonzalez",
     "Graph",
+    "HeatBaths",
     "Herglotz",
     "InCharts",
     "IndefiniteError",
@@ -138,6 +143,7 @@ __all__ = [
     "IntegrationError",
     "KillingDissipation",
     "Kinetic",
+    "LandauLifshitz",
     "LiePoissonSystem",
     "LieVariational",
     "LiethermoError",
@@ -159,6 +165,7 @@ __all__ = [
     "SimpleClosedSystem",
     "Solution",
     "SpecError",
+    "SpinSystem",
     "Stats",
     "Status",
     "Study",
@@ -177,6 +184,7 @@ __all__ = [
     "latin_hypercube",
     "load",
     "load_study",
+    "magnetism",
     "models",
     "plot",
     "read_graph",

@@ -71,6 +71,7 @@ from .structures.contact import (
     SplitContact,
 )
 from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
+from .structures.spins import Spins
 
 __all__ = [
     "GL",
@@ -134,6 +135,7 @@ __all__ = [
     "SpecialOrthogonal",
     "SpecialUnitary",
     "Sphere",
+    "Spins",
     "SplitContact",
     "Stiefel",
     "TracePolynomial",

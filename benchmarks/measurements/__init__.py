@@ -10,6 +10,7 @@ NAMES = (
     "dimension",
     "bodies",
     "network",
+    "lattice",
     "first_run",
     "memory",
 )

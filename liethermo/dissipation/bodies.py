@@ -18,9 +18,9 @@ import scipy.sparse
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from manifolds.structures.contact import Places
 
+from ..functions.edges import Edges
 from ..functions.indices import Indices, as_pattern, cliques
 from .base import Dissipation, Law, SkewFriction
-from .edges import Edges
 from .factor import Factor
 
 

@@ -109,9 +109,9 @@ def solve_stages(
 ) -> Solved:
     """Solve ``k = slopes(k)`` from ``guess``.
 
-    ``scale(k)`` is the size that the plateau is measured against, ``inverted(k)`` a function from ``slopes - k`` to what
-    Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where fixed-point
-    iteration fails.
+    ``scale(k)`` is the size that the plateau is measured against, ``inverted(k)`` a function from ``slopes - k`` to
+    what Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where
+    fixed-point iteration fails.
     """
     measure = rules.size(guess.shape[-1])
     first = fixed_point(slopes, guess, scale, rules=rules)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterator
 
 import jax
@@ -37,6 +38,9 @@ SAMPLES = 3
 PATTERNS = 8
 """Arrays of errors for each size: few, since a program holds them."""
 
+LONGEST = 10_000
+"""Numbers in an array up to which it does; longer ones it makes."""
+
 
 def with_rounding(function: Callable, x) -> tuple[jax.Array, jax.Array]:
     """``function(x)`` and the size at which it is rounded: its error is about eps times that, entry by entry.
@@ -55,7 +59,9 @@ def with_rounding(function: Callable, x) -> tuple[jax.Array, jax.Array]:
     def erring(shares):
         return _evaluated(closed.jaxpr, closed.consts, [x], itertools.count(), shares)[0]
 
-    found = jax.vmap(erring)(np.eye(SAMPLES + 1, SAMPLES, -1) * SHARE)  # one program, as one is quicker to compile
+    # one program, as one is quicker to compile; of large arrays one sample after another, for they need memory
+    each = jax.vmap(erring) if np.size(x) <= LONGEST else functools.partial(jax.lax.map, erring)
+    found = each(np.eye(SAMPLES + 1, SAMPLES, -1) * SHARE)
     right, wrong = found[0], found[1:]
     size = jnp.max(jnp.abs(wrong - right), axis=0) / SHARE
     return right, jnp.where(jnp.isfinite(size), size, 0.0)
@@ -85,7 +91,8 @@ def _erring(value, number: int, shares):
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
     shape = np.shape(value)[-1:]
-    errors = [share * _pattern(shape, (number + SAMPLES * i) % PATTERNS) for i, share in enumerate(shares)]
+    pattern = _pattern if math.prod(shape) <= LONGEST else _made_pattern
+    errors = [share * pattern(shape, (number + SAMPLES * i) % PATTERNS) for i, share in enumerate(shares)]
     return value + value * sum(errors[1:], errors[0])
 
 
@@ -94,3 +101,10 @@ def _pattern(shape: tuple[int, ...], number: int) -> np.ndarray:
     """Numbers of size one half to one and either sign."""
     random = np.random.default_rng(number)
     return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
+
+
+def _made_pattern(shape: tuple[int, ...], number: int) -> jax.Array:
+    """The like from a product that overflows the digits of a sine, entry by entry."""
+    v = 43758.5453 * jnp.sin(12.9898 * jnp.arange(1.0, shape[0] + 1.0) + 78.233 * number)
+    v = 2.0 * (v - jnp.floor(v)) - 1.0
+    return jnp.where(v < 0.0, -0.5, 0.5) + 0.5 * v

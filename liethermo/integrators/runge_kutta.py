@@ -46,6 +46,9 @@ class MetriplecticRungeKutta(OneStepMethod):
     independent of these. What a function changes by is taken from a discrete gradient along the step, whose rounding
     vanishes with the step. So a state that relaxes is not held off its equilibrium by rounding.
 
+    Vectors of constant length, such as many spins, are held one by one, in work and memory that grow with their number:
+    each is brought back to its sphere along its radius, and the corrections above are made along the spheres.
+
     Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
     by its own quadrature.
 
@@ -203,13 +206,21 @@ class MetriplecticRungeKutta(OneStepMethod):
         def misses(d) -> jax.Array:
             return changes - jnp.stack([jnp.dot(change(law.function, x, d, low), d) for law in laws])
 
-        def directions(d):
-            return [system.raised(x + (low + d), law.function.gradient(x + (low + d))) for law in laws]
+        spheres = system.spheres
 
+        def directions(d):
+            end = x + (low + d)
+            found = [system.raised(end, law.function.gradient(end)) for law in laws]
+            return found if spheres is None else [spheres.along(end, v) for v in found]
+
+        def landed(d):
+            return d if spheres is None else spheres.reached(x, low, d)
+
+        d = landed(d)
         found = directions(d)
         for i in range(self.corrections):
             found = directions(d) if 0 < i < 3 else found  # the last time they are as good as they get
-            d = d + towards(found, misses(d))
+            d = landed(d + towards(found, misses(d)))
         squares = jnp.stack([jnp.dot(v, v) for v in found])
         left = misses(d) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
         return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
@@ -218,7 +229,8 @@ class MetriplecticRungeKutta(OneStepMethod):
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
         functions = system.functions()
         laws = [_Law(system.energy, LAWS[system.energy_law])] if system.energy_law in LAWS else []
-        laws += [_Law(functions[name], 0.0) for name in self.held]
+        local = set() if system.spheres is None else {system.spheres.name}
+        laws += [_Law(functions[name], 0.0) for name in self.held if name not in local]
         laws += [_Law(C, 0.0) for C in self.functions]
         if system.entropy_law in LAWS:
             assert system.entropy is not None

@@ -12,6 +12,7 @@ from .heat_grid import heat_grid
 from .mass_spring_gas import mass_spring_gas
 from .oscillator import damped_oscillator
 from .rigid_body import free_rigid_body, rigid_body
+from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
 
@@ -25,6 +26,8 @@ __all__ = [
     "mass_spring_gas",
     "moving_thermo_particles",
     "rigid_body",
+    "single_spin",
+    "spin_lattice",
     "thermo_particles",
     "thermo_springs",
     "thermoelastic_chain",

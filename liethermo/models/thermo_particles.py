@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..dissipation.edges import edges
+from ..functions.edges import edges
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Copies, Subsystem

@@ -13,6 +13,7 @@ from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
 from .simple_closed import SimpleClosedSystem
+from .spins import HeatBaths, SpinSystem
 
 __all__ = [
     "AttitudeSystem",
@@ -24,11 +25,13 @@ __all__ = [
     "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
+    "HeatBaths",
     "Herglotz",
     "Legendre",
     "LiePoissonSystem",
     "MetriplecticSystem",
     "SimpleClosedSystem",
+    "SpinSystem",
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",

@@ -21,6 +21,7 @@ from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
 from ..functions.energy import Energy, as_energy, is_traced
 from ..functions.on_spaces import on_points, on_sites
+from ..functions.spheres import Spheres
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
@@ -292,6 +293,11 @@ class System(eqx.Module):
     def has_all_casimirs(self) -> bool:
         """Whether every Casimir is known to be a function of :meth:`casimirs`."""
         return False
+
+    @property
+    def spheres(self) -> Spheres | None:
+        """Which vectors of the state have constant lengths, too many for a function each; None where none are known."""
+        return None
 
     def functions(self) -> dict[str, Energy]:
         """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name."""

@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 import scipy.sparse
 
-from ...dissipation.edges import edges
 from ...errors import FileError, InputError
+from ...functions.edges import edges
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from manifolds.structures.contact import Places
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
-from ...dissipation.edges import Edges, edges, parts
 from ...errors import InputError
 from ...functions.checks import check_scalar
+from ...functions.edges import Edges, edges, parts
 from ...functions.energy import Energy, Function, TimeDependent, is_traced, needed_arguments
 from ...functions.indices import as_pattern, pattern, union
 from ...functions.mechanics import is_free_of, is_mechanical

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import liethermo as lt
 import manifolds as mf
 from liethermo.dissipation.bodies import HeatConduction
-from liethermo.dissipation.edges import Edges
+from liethermo.functions.edges import Edges
 from tests.cases import tolerance
 
 seeds = st.integers(0, 10**6)

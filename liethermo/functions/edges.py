@@ -1,7 +1,8 @@
-"""Weighted graphs between the parts of a composed system, from matrices or lists of edges, checked."""
+"""Weighted graphs between the parts of a system, from matrices or lists of edges, checked."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -30,8 +31,8 @@ class Edges(NamedTuple):
     weight: jax.Array
 
 
-def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
-    """The edges of a symmetric graph without negative weights; those of weight zero are left out.
+def edges(graph, nodes: int, what: str, names: Sequence[str], signed: bool = False) -> Edges:
+    """The edges of a symmetric graph; those of weight zero are left out.
 
     Parameters
     ----------
@@ -40,8 +41,10 @@ def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
     nodes : int
     what : str
         What the weights are, for messages.
-    names : tuple of str
+    names : sequence of str
         Of the nodes, for messages.
+    signed : bool
+        Whether weights may be negative.
 
     Raises
     ------
@@ -55,10 +58,10 @@ def edges(graph, nodes: int, what: str, names: tuple[str, ...]) -> Edges:
         return Edges(first, second, weight)
     for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
         raise InputError(f"{what} of {names[first[e]]} with itself is {weight[e]:g}: leave the diagonal zero")
-    for e in np.flatnonzero(~((weight >= 0.0) & np.isfinite(weight)))[:1]:
+    for e in np.flatnonzero(~((signed | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
         ends = f"{names[first[e]]} and {names[second[e]]}"
-        raise InputError(f"{what} between {ends} is {weight[e]:g}: it must be finite and >= 0")
-    kept = weight > 0.0
+        raise InputError(f"{what} between {ends} is {weight[e]:g}: it must be finite{'' if signed else ' and >= 0'}")
+    kept = weight != 0.0
     return Edges(first[kept], second[kept], jnp.asarray(weight[kept]))
 
 

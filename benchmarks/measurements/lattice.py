@@ -1,0 +1,132 @@
+"""Many spins with a bath: a step against the same scheme in C, and how its time and memory grow."""
+
+from __future__ import annotations
+
+import functools
+import time
+
+import numpy as np
+
+import liethermo as lt
+
+from .. import child as process
+from .. import laws
+from ..contest import of_one_scheme
+from ..native import Ring
+from ..report import Report, Table, Target, ratio, take_part
+from ..timing import race
+from .memory import STATUS, _resident
+
+EXCHANGE, AXIS, RATE, STEP = 1.0, 0.1, 0.1, 0.02
+COUNT, FEW, STEPS = 100_000, 2, 12
+SIZES = (1_000, 10_000, 100_000, 1_000_000)
+METHODS = {
+    "midpoint": lt.MetriplecticMidpoint(),
+    "Gauss 4": lt.MetriplecticGauss(2),
+    "explicit 4": lt.MetriplecticRungeKutta(4),
+}
+THREADS = (1, 2)
+
+
+def run(quick: bool) -> Report:
+    """Two tables: against C, and by size."""
+    count, rounds = (1_000, 1) if quick else (COUNT, 5)
+    system, x0 = ring(count), start(count)
+
+    def theirs(threads: int, steps: int):
+        return Ring([EXCHANGE, AXIS, RATE, count]).integrate(x0, STEP, steps, threads)
+
+    candidates = {
+        f"C, {threads} threads": lambda threads=threads: functools.partial(theirs, threads) for threads in THREADS
+    }
+    found, skipped = take_part(candidates)
+    works = {name: functools.partial(work, STEPS) for name, work in found.items()}
+    few = {(name, FEW): functools.partial(work, FEW) for name, work in found.items()}
+    works["array engine"] = functools.partial(of_library, system, x0, STEPS)
+    few["array engine", FEW] = functools.partial(of_library, system, x0, FEW)
+    outcomes = race(works | few, rounds=rounds)
+    seconds, rows = {}, []
+    for name in works:
+        result = outcomes[name].result
+        seconds[name] = (outcomes[name].seconds - outcomes[name, FEW].seconds) / (STEPS - FEW)
+        if isinstance(result, lt.Solution):
+            iterations, kept = result.stats.iterations_per_step, of_stats(result)
+        else:
+            iterations, kept = float((result[1]["iterations"] / result[1]["steps"])[0]), laws.of_runs(result[1])
+        rows.append([name, seconds[name], ratio(seconds[name], seconds.get("C, 1 threads")), iterations, *kept.cells()])
+    columns = {"": "text", "Time a step": "seconds", "Relative to C": "ratio", "Iterations a step": "number"}
+    caption = f"A ring of {count:,} spins with exchange and an easy axis; steps of {STEP} by the midpoint scheme."
+    text = (
+        "Damped spins that heat a bath, `lt.models.spin_lattice`. The program in C makes one pass over the memory in "
+        "each iteration, its derivatives written by hand, with the same stopping rules."
+    )
+    if found:
+        ours = outcomes["array engine"].result.x[-1]
+        apart = np.abs(outcomes["C, 1 threads"].result[0] - ours).max() / np.abs(ours).max()
+        text += f" After {STEPS} steps the states differ by {of_one_scheme(float(apart), STEPS):.0e}."
+    tables = [Table(caption, columns | laws.COLUMNS, rows), growth((1_000,) if quick else SIZES)]
+    target = Target(
+        "10⁵ coupled spins, a step against C", 3.0, ratio(seconds["array engine"], seconds.get("C, 1 threads"))
+    )
+    return Report("Many spins", text, tables, [target], skipped)
+
+
+def growth(sizes) -> Table:
+    """Time and memory of a step by the number of spins, each row in a process of its own."""
+    rows = []
+    for method in METHODS:
+        for count in sizes:
+            found = process.call("lattice", method, str(count))
+            row = [method, count, found["first"], found["step"], found["step"] / count, found["iterations"]]
+            rows.append([*row, found["peak"], found["lengths"], *laws.Laws(*found["laws"]).cells()])
+    columns = {"Method": "text", "Spins": "count", "The first call": "seconds", "A step": "seconds"}
+    columns |= {"A step, for each spin": "seconds", "Iterations a step": "number"}
+    columns |= {"Peak memory": "gigabytes", "| |s| - 1 |": "error"}
+    caption = (
+        f"Steps of {STEP}. The first call compiles; peak memory is that of the process, 0.4 GB of it the packages'."
+    )
+    return Table(caption, columns | laws.COLUMNS, rows)
+
+
+def child(method: str, count: str) -> dict:
+    """The part that runs in a process of its own."""
+    system, x0 = ring(int(count)), start(int(count))
+    work = functools.partial(of_library, system, x0, method=METHODS[method])
+    times = [time.perf_counter()]
+    for steps in (FEW, FEW, STEPS):
+        solution = work(steps)
+        times.append(time.perf_counter())
+    first, few, many = np.diff(times)
+    kept = of_stats(solution)
+    lengths = np.linalg.norm(system.spins(solution.x[-1]), axis=-1)
+    return {
+        "first": first,
+        "step": (many - few) / (STEPS - FEW),
+        "iterations": solution.stats.iterations_per_step,
+        "peak": _resident() if STATUS.is_file() else None,
+        "lengths": float(np.abs(lengths - 1.0).max()),
+        "laws": [kept.energy_drift, kept.least_entropy_increment],
+    }
+
+
+def ring(count: int) -> lt.SpinSystem:
+    """A ring with a bath of its own size."""
+    return lt.models.spin_lattice(count, EXCHANGE, AXIS, rate=RATE)
+
+
+def start(count: int) -> np.ndarray:
+    """Spins in disorder, and the bath at entropy zero."""
+    s = np.random.default_rng(0).standard_normal((count, 3))
+    return np.append((s / np.linalg.norm(s, axis=1)[:, None]).ravel(), 0.0)
+
+
+def of_library(system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod = METHODS["midpoint"]) -> lt.Solution:
+    """So many steps, the last state kept."""
+    return lt.integrate(system, x0, (0.0, steps * STEP), STEP, method, save_every=steps, engine="array")
+
+
+def of_stats(solution: lt.Solution) -> laws.Laws:
+    """The laws as they were followed at every step: an audit would take some of these again."""
+    stats, first = solution.stats, float(solution.energy[0])
+    drift = max(abs(energy - first) for energy in stats.energy_range) / abs(first)
+    return laws.Laws(drift, stats.least_entropy_increment / float(np.abs(solution.entropy).max()))

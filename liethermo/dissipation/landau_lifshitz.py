@@ -1,0 +1,137 @@
+"""Damping of spins, site by site: to a lower energy, or with a bath whose entropy takes the heat."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import real_array
+from manifolds.structures.spins import Spins, cross
+
+from ..errors import InputError
+from ..functions.indices import Indices
+from .base import Dissipation
+from .checks import checked_rate
+from .factor import Factor
+
+
+class LandauLifshitz(Dissipation):
+    """Landau-Lifshitz damping, ``lambda_i s_i x (s_i x dH_i)`` at each site i: every |s_i| is kept, and H falls.
+
+    With ``t_i = s_i x dH_i`` the energy falls at the rate ``sum lambda_i |t_i|^2``. In a system without baths that is
+    all: a double bracket, which needs no entropy. In one with baths of entropies y_b and temperatures
+    ``T_b = dH/dy_b`` the heat goes to the bath b(i) of the site and the energy is constant,
+
+        s_i' = … + lambda_i s_i x (s_i x dH_i),   y_b' = sum_{i in b} lambda_i |t_i|^2 / T_b,
+
+    which is ``K dS`` with ``K = sum_i lambda_i |T_b| w_i^T w_i`` and maps
+    ``w_i alpha = s_i x alpha_i - t_i alpha_b / T_b``
+    whose kernels dH lies in. Each site is damped as it would be alone, however many there are.
+
+    Gilbert's form ``s' = gamma s x dH - alpha s x s'`` is the same motion with ``gamma / (1 + alpha^2)`` in place of
+    gamma and ``lambda = alpha gamma / (1 + alpha^2)``, for |s| = 1: see :meth:`gilbert`.
+
+    Parameters
+    ----------
+    rate : float >= 0, or array of the shape of the sites
+        lambda_i.
+    bath : array of int, of the shape of the sites, optional
+        b(i), the number of the bath that a site heats, from 0; by default all heat the first.
+    baths : int
+        How many baths there are; a system fills it in.
+
+    References
+    ----------
+    Landau & Lifshitz 1935; Gilbert 2004 (eq. 12); Bloch, Krishnaprasad, Marsden & Ratiu 1996 for the double bracket.
+    """
+
+    rate: jax.Array
+    bath: Indices | None = eqx.field(static=True)
+    baths: int = eqx.field(static=True)
+
+    def __init__(self, rate=1.0, bath=None, baths: int = 0):
+        array = real_array(rate)
+        self.rate = checked_rate(array) if array.shape == () else array
+        if array.shape and not isinstance(array, jax.core.Tracer) and not (np.asarray(array) >= 0.0).all():
+            raise InputError(f"a dissipation rate must be >= 0, not {float(np.asarray(array).min())}")
+        self.bath = bath if bath is None or isinstance(bath, Indices) else Indices(bath)
+        self.baths = baths
+
+    @staticmethod
+    def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
+        """Gyromagnetic ratio and rate of Landau and Lifshitz for the damping alpha and the ratio of Gilbert's form."""
+        alpha, ratio = real_array(alpha), real_array(ratio)
+        return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
+
+    @property
+    def energy_law(self):
+        return "conserved" if self.baths else "nonincreasing"
+
+    @property
+    def entropy_law(self):
+        return "nondecreasing" if self.baths else "conserved"
+
+    @property
+    def keeps_casimirs(self) -> bool:
+        return True  # those of the spins: the entropies of baths, which are made to grow, are not listed as such
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    def prepared(self, system):
+        spins = system.poisson
+        if not isinstance(spins, Spins):
+            raise InputError(
+                "LandauLifshitz damps the spins of a SpinSystem; on so(3) at every site DoubleBracket is the same "
+                "without a bath"
+            )
+        if self.rate.shape not in ((), spins.sites):
+            raise InputError(
+                f"rates are one number, or have the shape {spins.sites} of the sites, not {self.rate.shape}"
+            )
+        if self.bath is not None:
+            numbers = np.asarray(self.bath)
+            if numbers.shape != spins.sites:
+                raise InputError(f"bath is a number for each of the sites {spins.sites}, not of shape {numbers.shape}")
+            if not (numbers.min() >= 0 and numbers.max() < spins.others):
+                outside = int(numbers[(numbers < 0) | (numbers >= spins.others)][0])
+                raise InputError(f"a site heats bath {outside}, but there are {spins.others}, which count from 0")
+        return LandauLifshitz(self.rate, self.bath, spins.others)
+
+    def force(self, system, x, dH, dS, dL):
+        spins = system.poisson
+        s, a, rate = spins.spins(x), spins.spins(dH), self.rate.reshape(-1, 1)
+        torque = cross(s, a)
+        if not self.baths:
+            return spins.joined(rate * cross(s, torque), jnp.zeros(0))
+        T, e = dH[3 * spins.count :], dS[3 * spins.count :]
+        pull = cross(s, spins.spins(dS)) - self._of_sites(e / T) * torque
+        pull = rate * self._of_sites(jnp.abs(T)) * pull
+        return spins.joined(cross(pull, s), self._of_baths(-torque * pull) / T)
+
+    def factor(self, system, x, dH, dL):
+        spins = system.poisson
+        s, a, rate = spins.spins(x), spins.spins(dH), self.rate.reshape(-1, 1)
+        torque = cross(s, a)
+        T = dH[3 * spins.count :]
+
+        def times(w):
+            w = w.reshape(spins.count, 3)
+            return spins.joined(cross(w, s), self._of_baths(-torque * w) / T if self.baths else jnp.zeros(0))
+
+        size = rate * self._of_sites(jnp.abs(T)) if self.baths else rate
+        root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
+        return Factor(3 * spins.count, lambda w: times(root * w.reshape(spins.count, 3)))
+
+    def _of_sites(self, values) -> jax.Array:
+        """Values of baths, shape (m,), at the sites that heat them, shape (count, 1) or (1, 1)."""
+        return values[:1, None] if self.bath is None else values[np.asarray(self.bath).ravel()][:, None]
+
+    def _of_baths(self, values) -> jax.Array:
+        """The sums of values at sites, shape (count, 3), for each bath."""
+        if self.bath is None:
+            return jnp.zeros(self.baths).at[0].set(jnp.sum(values))
+        return jax.ops.segment_sum(jnp.sum(values, axis=1), np.asarray(self.bath).ravel(), self.baths)

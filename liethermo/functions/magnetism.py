@@ -1,0 +1,353 @@
+"""Energies of spins on sites: exchange, Dzyaloshinskii-Moriya, anisotropy, Zeeman, on lattices and on any graph.
+
+Every term is quadratic, so its gradient at a midpoint is a discrete gradient, and costs what there are sites and edges.
+States hold the spins first, site by site in C order, ``(s_1x, s_1y, s_1z, s_2x, …)``; what comes behind is left alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from manifolds._arrays import real_array
+from manifolds.structures.spins import cross
+
+from ..errors import InputError
+from .each import Each
+from .edges import edges
+from .energy import Energy, Sum, is_traced
+from .indices import cliques
+
+
+def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
+    """Heisenberg exchange, ``-sum J_ij s_i . s_j`` over pairs: J > 0 aligns neighbours.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+        A tuple, such as ``(64, 64)``, for a lattice.
+    strength : float, or array; or graph
+        J: one number for all pairs; an array of the shape of the sites, that of the pair of each site with the one
+        ahead (or a list of such, one for each neighbour). Or, with ``neighbours=None``, the graph itself: a symmetric
+        matrix of all sites, dense or sparse, or a list of edges ``(i, j, J)``, each pair once, sites in C order.
+    neighbours : sequence of tuples of int, optional
+        Offsets to the sites ahead on a lattice, each pair of opposite ones once: by default one along every axis.
+    periodic : bool or tuple of bool
+        Whether the lattice closes on itself, along each axis.
+
+    Raises
+    ------
+    InputError
+    """
+    shape = checked_sites(sites)
+    if neighbours is None and _is_graph(strength):
+        return _on_graph(shape, strength)
+    return _lattice(shape, strength, None, neighbours, periodic, "an exchange constant")
+
+
+def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Energy:
+    """Antisymmetric exchange, ``sum D_ij . (s_i x s_j)`` over pairs: it turns neighbours against each other.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+    vectors : array, shape (3,), or ``(*sites, 3)``; or a list of them, one for each neighbour; or list of edges
+        D of each pair of a site with the one ahead; or edges ``(i, j, D)``, D being that from i to j.
+    neighbours, periodic
+        As of :func:`exchange`.
+
+    Raises
+    ------
+    InputError
+    """
+    shape = checked_sites(sites)
+    if neighbours is None and _is_edge_list(vectors):
+        ends, D = _directed(vectors, math.prod(shape))
+        return Each(_turned, _places(ends[:, 0], ends[:, 1]), D)
+    return _lattice(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
+
+
+def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
+    """Uniaxial anisotropy, ``-sum K_i (n_i . s_i)^2``: an easy axis for K > 0, a hard one for K < 0.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+    strength : float, or array of the shape of the sites
+    axis : array, shape (3,) or ``(*sites, 3)``
+        n_i; its length counts.
+
+    Raises
+    ------
+    InputError
+    """
+    shape = checked_sites(sites)
+    K = _of_sites(strength, shape, (), "an anisotropy constant")
+    n = _of_sites(axis, shape, (3,), "an axis")
+    return OnSites(shape, -2.0 * K[..., None, None] * n[..., :, None] * n[..., None, :], None)
+
+
+def zeeman(sites, field, moment=1.0) -> Energy:
+    """The energy in a field, ``-sum mu_i B_i . s_i``.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+    field : array, shape (3,) or ``(*sites, 3)``
+    moment : float, or array of the shape of the sites
+
+    Raises
+    ------
+    InputError
+    """
+    shape = checked_sites(sites)
+    B, moment = _of_sites(field, shape, (3,), "a field"), _of_sites(moment, shape, (), "a moment")
+    return OnSites(shape, None, -moment[..., None] * B)
+
+
+class OnSites(Energy):
+    """``sum_i s_i . A_i s_i / 2 + b_i . s_i``.
+
+    Attributes
+    ----------
+    sites : tuple of int
+    A, b : array, shapes (3, 3) and (3,), the same at all sites, or with the axes of the sites before; or None
+    """
+
+    sites: tuple[int, ...] = eqx.field(static=True)
+    A: jax.Array | None
+    b: jax.Array | None
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        s = spins_of(x, self.sites)
+        linear = 0.0 if self.b is None else jnp.sum(self.b * s)
+        return linear + (jnp.zeros(()) if self.A is None else 0.5 * jnp.sum(s * self._turned(s)))
+
+    def gradient(self, x) -> jax.Array:
+        s = spins_of(x, self.sites)
+        found = jnp.zeros_like(s) if self.A is None else self._turned(s)
+        return placed(found if self.b is None else found + self.b, x)
+
+    def _turned(self, s) -> jax.Array:
+        """``A_i s_i``, by components: a matrix product of order three is no work for a library."""
+        assert self.A is not None
+        parts = [self.A[..., i] * s[..., i, None] for i in range(3)]
+        return parts[0] + parts[1] + parts[2]
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
+
+    def check_places(self, dim: int, role: str) -> None:
+        check_room(self.sites, dim, role)
+
+
+class Bonds(Energy):
+    """``sum_i -J_i s_i . s_{i+o} + D_i . (s_i x s_{i+o})`` on a lattice, o an offset.
+
+    Attributes
+    ----------
+    sites, offset : tuple of int
+    J : array, shape () or that of the sites, or None
+    D : array, shape (3,) or ``(*sites, 3)``, or None
+    """
+
+    sites: tuple[int, ...] = eqx.field(static=True)
+    offset: tuple[int, ...] = eqx.field(static=True)
+    J: jax.Array | None
+    D: jax.Array | None
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        s = spins_of(x, self.sites)
+        return jnp.sum(s * self._from_ahead(s))
+
+    def gradient(self, x) -> jax.Array:
+        s = spins_of(x, self.sites)
+        return placed(self._from_ahead(s) + self._from_behind(s), x)
+
+    def _from_ahead(self, s) -> jax.Array:
+        """What a site is given by the one ahead of it: ``-J s' + s' x D``."""
+        ahead = self._shifted(s, -1)
+        found = jnp.zeros_like(s) if self.J is None else -self.J[..., None] * ahead
+        return found if self.D is None else found + cross(ahead, self.D)
+
+    def _from_behind(self, s) -> jax.Array:
+        found = jnp.zeros_like(s)
+        if self.J is not None:
+            found = self._shifted(-self.J[..., None] * s if self.J.ndim else s, 1)
+            found = found if self.J.ndim else -self.J * found
+        return found if self.D is None else found + self._shifted(cross(self.D, s), 1)
+
+    def _shifted(self, s, sign: int) -> jax.Array:
+        for axis, by in enumerate(self.offset):
+            s = s if by == 0 else jnp.roll(s, sign * by, axis=axis)
+        return s
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        here = np.arange(math.prod(self.sites)).reshape(self.sites)
+        ahead = np.roll(here, [-by for by in self.offset], axis=range(here.ndim))
+        return cliques(_places(here.ravel(), ahead.ravel()), dim)
+
+    def check_places(self, dim: int, role: str) -> None:
+        check_room(self.sites, dim, role)
+
+
+def spins_of(x, sites: tuple[int, ...]) -> jax.Array:
+    """The spins of a state, shape ``(*sites, 3)``."""
+    return x[: 3 * math.prod(sites)].reshape(*sites, 3)
+
+
+def placed(covectors, x) -> jax.Array:
+    """Covectors of the spins, shape ``(*sites, 3)``, as one of the state x."""
+    flat = covectors.reshape(-1)
+    return flat if flat.size == x.size else jnp.concatenate([flat, jnp.zeros(x.size - flat.size)])
+
+
+def checked_sites(sites) -> tuple[int, ...]:
+    """The shape of a lattice, or (count,)."""
+    shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
+    good = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
+    if not shape or not good:
+        raise InputError(f"sites are a positive integer, or some for a lattice such as (64, 64), not {sites!r}")
+    return tuple(int(n) for n in shape)
+
+
+def check_room(sites: tuple[int, ...], dim: int, role: str) -> None:
+    """InputError where a state has no room for the spins that a term is of."""
+    count = math.prod(sites)
+    if 3 * count > dim:
+        raise InputError(f"{role} has a term of {count} spins, which a state with {dim} components has no room for")
+
+
+def _lattice(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
+    axes = len(shape)
+    offsets = np.eye(axes, dtype=int).tolist() if neighbours is None else neighbours
+    offsets = [_checked_offset(offset, axes) for offset in offsets]
+    if any(opposite in offsets for opposite in ([-o for o in offset] for offset in offsets)):
+        raise InputError(f"the neighbours {offsets} name a pair twice: give one of each two opposite offsets")
+    closed = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
+    if len(closed) != axes:
+        raise InputError(f"periodic is true or false, or such for each of the {axes} axes, not {periodic!r}")
+    given = strength if vectors is None else vectors
+    each = (
+        given
+        if isinstance(given, list) and len(given) == len(offsets) and np.ndim(given[0])
+        else [given] * len(offsets)
+    )
+    tail = () if vectors is None else (3,)
+    terms = []
+    for offset, one in zip(offsets, each, strict=True):
+        value = _of_sites(one, shape, tail, what)
+        inside = _inside(shape, offset, closed)
+        if not inside.all():  # pairs that a border cuts
+            value = jnp.where(inside.reshape(*shape, *(1 for _ in tail)), value, 0.0)
+        terms.append(
+            Bonds(shape, tuple(offset), value, None) if vectors is None else Bonds(shape, tuple(offset), None, value)
+        )
+    return terms[0] if len(terms) == 1 else Sum(tuple(terms))
+
+
+def _checked_offset(offset, axes: int) -> list[int]:
+    found = [offset] if np.ndim(offset) == 0 else list(offset)
+    if len(found) != axes or any(int(o) != o for o in found) or not any(found):
+        raise InputError(f"a neighbour is an offset of {axes} integers, not all zero, not {offset!r}")
+    return [int(o) for o in found]
+
+
+def _inside(shape, offset, closed) -> np.ndarray:
+    """Which sites have the one ahead, shape of the sites."""
+    inside = np.ones(shape, dtype=bool)
+    for axis, (n, by, around) in enumerate(zip(shape, offset, closed, strict=True)):
+        place = np.arange(n) + by
+        here = (np.ones(n, dtype=bool) if around else (place >= 0) & (place < n)).reshape(
+            [-1 if a == axis else 1 for a in range(len(shape))]
+        )
+        inside = inside & here
+    return inside
+
+
+def _of_sites(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
+    """A value of all sites, or one for each."""
+    array = real_array(value)
+    if array.shape not in (tail, (*shape, *tail)):
+        wanted = f"{tail} or {(*shape, *tail)}" if tail else f"of one number, or {shape}"
+        raise InputError(f"{what} has the shape {wanted}, not {array.shape}")
+    if not is_traced(array) and not np.isfinite(np.asarray(array)).all():
+        raise InputError(f"{what} is not finite")
+    return array
+
+
+def _is_edge_list(graph) -> bool:
+    return (
+        isinstance(graph, list | tuple) and len(graph) > 0 and all(isinstance(e, tuple) and len(e) == 3 for e in graph)
+    )
+
+
+def _is_graph(strength) -> bool:
+    return (
+        scipy.sparse.issparse(strength)
+        or _is_edge_list(strength)
+        or (
+            not isinstance(strength, list) and np.ndim(strength) == 2 and np.shape(strength)[0] == np.shape(strength)[1]
+        )
+    )
+
+
+def _on_graph(shape, graph) -> Energy:
+    count = math.prod(shape)
+    found = edges(graph, count, "the exchange", _Sites(), signed=True)
+    if len(found.first) == 0:
+        raise InputError("the graph of an exchange has no edges")
+    return Each(_aligned, _places(found.first, found.second), found.weight)
+
+
+class _Sites(Sequence):
+    """Names of any number of sites, made when one is asked for."""
+
+    def __getitem__(self, i):
+        return f"site {i}"
+
+    def __len__(self) -> int:
+        return 0
+
+
+def _directed(listed, count: int) -> tuple[np.ndarray, jax.Array]:
+    for i, j, _ in listed:
+        if not (0 <= i < count and 0 <= j < count):
+            raise InputError(f"the edge ({i}, {j}) leaves the {count} sites, which count from 0")
+        if i == j:
+            raise InputError(f"the edge ({i}, {j}) joins a site with itself")
+    pairs = [frozenset(edge[:2]) for edge in listed]
+    if len(set(pairs)) < len(pairs):
+        raise InputError("an edge is given twice: a pair of sites has one Dzyaloshinskii-Moriya vector")
+    D = real_array(np.array([edge[2] for edge in listed], dtype=float))
+    if D.shape != (len(pairs), 3):
+        raise InputError(f"an edge (i, j, D) has a vector D, shape (3,), but together they have shape {D.shape}")
+    return np.array([edge[:2] for edge in listed], dtype=int), D
+
+
+def _places(first, second) -> np.ndarray:
+    """The components of two spins, shape (edges, 6)."""
+    ends = np.stack([first, second], axis=1)
+    return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
+
+
+def _aligned(y, J):
+    return -J * jnp.dot(y[:3], y[3:])
+
+
+def _turned(y, D):
+    return jnp.dot(D, cross(y[:3], y[3:]))

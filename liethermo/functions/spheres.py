@@ -1,0 +1,77 @@
+"""Vectors of constant length in a large state: as many first integrals, each of few components, held one by one.
+
+Held with the others by a system of equations they would need a matrix with a row for each. But the gradient of
+``|s_i|^2`` at s_i is s_i, and those of different sites have no component in common: each sphere is returned to along
+its own radius, and what else a correction does is done along the spheres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .energy import Energy
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """The first ``count`` vectors of three components of a state have constant lengths.
+
+    Attributes
+    ----------
+    count : int
+    name : str
+        Of the first integral that is the sum of their squares.
+    """
+
+    count: int
+    name: str
+
+    def along(self, x, v) -> jax.Array:
+        """v, shape (n,), less its radial components at x."""
+        s, part = self._vectors(x), self._vectors(v)
+        square = _dot(s, s)
+        return self._replaced(v, part - (_dot(s, part) / jnp.where(square > 0.0, square, 1.0)) * s)
+
+    def reached(self, x, low, d) -> jax.Array:
+        """The displacement from x + low that ends where d does, but at the lengths of the start.
+
+        From what the squares change by, not from their values: so it is as exact as d is small.
+        """
+        start, step = self._vectors(x + low), self._vectors(d)
+        change = _dot(step, 2.0 * start + step)
+        end = start + step
+        square = _dot(end, end)
+        share = change / jnp.where(square > 0.0, square, 1.0)
+        root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
+        return self._replaced(d, step - (share / (1.0 + root)) * end)
+
+    def _vectors(self, v) -> jax.Array:
+        return v[: 3 * self.count].reshape(self.count, 3)
+
+    def _replaced(self, v, vectors) -> jax.Array:
+        flat = vectors.reshape(-1)
+        return flat if flat.size == v.size else jnp.concatenate([flat, v[flat.size :]])
+
+
+def _dot(u, v) -> jax.Array:
+    return jnp.sum(u * v, axis=-1, keepdims=True)
+
+
+class Squares(Energy):
+    """``sum |s_i|^2 / 2`` over the sites: the Casimir that is followed along a run."""
+
+    count: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return 0.5 * jnp.sum(x[: 3 * self.count] ** 2)
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.where(jnp.arange(x.size) < 3 * self.count, x, 0.0)

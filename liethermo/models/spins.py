@@ -1,0 +1,105 @@
+"""Spins: one that is switched by a field, and lattices of many."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..dissipation.landau_lifshitz import LandauLifshitz
+from ..errors import InputError
+from ..functions.energy import Energy, Sum
+from ..functions.magnetism import anisotropy, checked_sites, dzyaloshinskii_moriya, exchange, zeeman
+from ..systems import HeatBaths, SpinSystem
+
+
+def single_spin(field=1.0, rate=0.1, baths: HeatBaths | None = None) -> SpinSystem:
+    """A spin in a field B along the third axis, ``H = -B s_3``, which damping turns to it.
+
+    With |s| = 1 the motion is known: see :func:`single_spin_solution`. It takes the time
+    ``log(s' / s) / (rate B)`` from a polar angle to another, s the tangents of their halves: 'switching'.
+
+    Parameters
+    ----------
+    field : float
+        B.
+    rate : float, >= 0
+        Of :class:`liethermo.LandauLifshitz`.
+    baths : HeatBaths, optional
+        What takes the heat; without, the energy falls.
+    """
+    return SpinSystem(1, zeeman(1, _along_third(field)), LandauLifshitz(rate), baths)
+
+
+def single_spin_solution(t, start, field: float = 1.0, rate: float = 0.1) -> np.ndarray:
+    """The exact spin at some times, shape (..., 3), from a unit vector at t = 0.
+
+    ``s_3 = tanh(rate B t + artanh s_3(0))``, and the rest turns by the angle ``B t`` [Landau & Lifshitz 1935].
+    """
+    t, s = np.asarray(t, dtype=float), np.asarray(start, dtype=float)
+    growth = rate * field * t
+    # s_3(0) may be 1 to rounding: of tanh(a + b) and sech(a + b) without the artanh
+    third = (np.sinh(growth) + s[2] * np.cosh(growth)) / (np.cosh(growth) + s[2] * np.sinh(growth))
+    shrunk = 1.0 / (np.cosh(growth) + s[2] * np.sinh(growth))
+    c, d = np.cos(field * t), np.sin(field * t)
+    return np.stack([shrunk * (c * s[0] - d * s[1]), shrunk * (d * s[0] + c * s[1]), third], axis=-1)
+
+
+def spin_lattice(
+    sites=(32, 32),
+    exchange_constant=1.0,
+    anisotropy_constant=0.0,
+    field=(0.0, 0.0, 0.0),
+    dmi=None,
+    rate=0.1,
+    baths: HeatBaths | bool = True,
+    bath=None,
+    periodic=True,
+    axis=(0.0, 0.0, 1.0),
+) -> SpinSystem:
+    """Damped spins on a lattice, or on a graph, with exchange, anisotropy, a field and antisymmetric exchange.
+
+    ``H = -sum J s_i . s_j - sum K (n . s_i)^2 - sum B . s_i + sum D . (s_i x s_j)``, the terms of ``lt.magnetism``.
+    A state has the spins site by site, and behind them the entropy of each bath; ``system.state(spins)`` takes spins of
+    shape ``(*sites, 3)`` alone.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+    exchange_constant : float, array or graph
+        J: see :func:`liethermo.magnetism.exchange`; a symmetric matrix or a list of edges puts the spins on a graph.
+    anisotropy_constant : float, or array of the shape of the sites
+    field : array, shape (3,) or ``(*sites, 3)``
+    dmi : array, list of edges, or None
+        D: see :func:`liethermo.magnetism.dzyaloshinskii_moriya`.
+    rate : float >= 0, or array of the shape of the sites
+        Of :class:`liethermo.LandauLifshitz`.
+    baths : HeatBaths or bool
+        What takes the heat. True for one of the heat capacity of the sites together, at first of temperature 1; False
+        for none: the energy falls then.
+    bath : array of int, of the shape of the sites, optional
+        Which bath each site heats.
+    periodic : bool or tuple of bool
+    axis : array, shape (3,) or ``(*sites, 3)``
+        Of the anisotropy.
+    """
+    shape = checked_sites(sites)
+    terms: list[Energy] = [*exchange(shape, exchange_constant, periodic=periodic).terms]
+    if np.any(anisotropy_constant):
+        terms.append(anisotropy(shape, anisotropy_constant, axis))
+    if np.any(field):
+        terms.append(zeeman(shape, field))
+    if dmi is not None:
+        terms += dzyaloshinskii_moriya(shape, dmi, periodic=periodic).terms
+    if not isinstance(baths, HeatBaths | bool):
+        raise InputError(f"baths are lt.HeatBaths, True for one of the size of the lattice, or False, not {baths!r}")
+    heated = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
+    return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), heated)
+
+
+def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_constant: float = 0.0, field=0.0):
+    """Of a small wave on a ring of spins along the third axis: ``2 J (1 - cos q) + 2 K + B``, q an angle per site."""
+    return 2.0 * exchange_constant * (1.0 - np.cos(wave_number)) + 2.0 * anisotropy_constant + field
+
+
+def _along_third(field):
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(field, dtype=jnp.float64)])

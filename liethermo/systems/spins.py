@@ -1,0 +1,198 @@
+"""Spins on sites, alone or with the baths that they heat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds._arrays import real_array
+
+from ..dissipation.base import Dissipation
+from ..errors import InputError
+from ..functions.each import Each
+from ..functions.energy import Energy, Function, Negative, Sum, TimeDependent, as_energy, is_traced
+from ..functions.magnetism import checked_sites, spins_of
+from ..functions.spheres import Spheres, Squares
+from .base import System
+
+LENGTHS = "sum |s|^2 / 2"
+
+
+class SpinSystem(System):
+    """``s_i' = gamma_i s_i x grad_i H`` at every site, damped, alone or with baths of their own entropies.
+
+    A state is ``(s_1, s_2, …, y_1, …, y_m)`` in one row: the spins site by site in C order, then the entropy of each
+    bath. Baths have the energy ``U(y)``, and ``T_b = dU/dy_b`` is their temperature; energy and entropy of the whole
+    are ``H(s) + U(y)`` and ``sum y_b``. Every |s_i| is constant, to rounding, with every method of this library: no
+    charts are needed, and memory and time of a step grow with the number of sites.
+
+    Parameters
+    ----------
+    sites : int or tuple of int
+    energy : Energy or function from s, shape ``(*sites, 3)``, to a scalar
+        Such as a sum of the terms in ``lt.magnetism``. May depend on time.
+    dissipation : LandauLifshitz, optional
+    baths : HeatBaths, optional
+    ratio : float, or array of the shape of the sites
+        gamma_i.
+    momentum_maps : dict of functions, or a sequence of them
+        Of s, shape ``(*sites, 3)``.
+    validate : bool
+
+    Raises
+    ------
+    InputError, FunctionError, AxiomError
+    """
+
+    lattice: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        sites,
+        energy,
+        dissipation: Dissipation | None = None,
+        baths: HeatBaths | None = None,
+        ratio=1.0,
+        momentum_maps=(),
+        validate: bool = True,
+    ):
+        self.lattice = checked_sites(sites)
+        poisson = mf.Spins(self.lattice, 0 if baths is None else baths.number, ratio)
+        terms = [_of_spins(term, self.lattice) for term in as_energy(energy, "the energy").terms]
+        entropy = None
+        if baths is not None:
+            terms.append(baths.at(3 * poisson.count))
+            entropy = _LastSum(baths.number)
+        named = momentum_maps if isinstance(momentum_maps, Mapping) else {J.__name__: J for J in momentum_maps}
+        maps = {name: _of_spins(as_energy(J, f"momentum map {name!r}"), self.lattice) for name, J in named.items()}
+        whole = terms[0] if len(terms) == 1 else Sum(tuple(terms))
+        self._build(poisson, poisson.dim, whole, entropy, dissipation, maps, validate)
+
+    def state(self, x, batch: bool = False) -> jax.Array:
+        """A state in one row; also from spins of shape ``(*sites, 3)`` alone, with every bath at entropy zero."""
+        shape, given = (*self.lattice, 3), np.shape(x)
+        if given != (self.dim,) and given[-len(shape) :] == shape and (batch or len(given) == len(shape)):
+            flat = jnp.reshape(jnp.asarray(x, dtype=jnp.float64), (*given[: -len(shape)], -1))
+            x = jnp.concatenate([flat, jnp.zeros((*flat.shape[:-1], self.dim - flat.shape[-1]))], axis=-1)
+        elif given[-1:] != (self.dim,):
+            raise InputError(
+                f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {given}"
+            )
+        return super().state(x, batch)
+
+    def spins(self, x) -> jax.Array:
+        """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""
+        x = jnp.asarray(x)
+        return x[..., : self._size].reshape(*x.shape[:-1], *self.lattice, 3)
+
+    def temperatures(self, x) -> jax.Array:
+        """Of the baths in states, shape (..., n) to (..., m)."""
+        x = jnp.asarray(x)
+        return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(x)[..., self._size :]
+
+    @property
+    def _size(self) -> int:
+        """How many components the spins have."""
+        return 3 * math.prod(self.lattice)
+
+    def casimirs(self) -> dict[str, Energy]:
+        return {LENGTHS: Squares(math.prod(self.lattice))}
+
+    @property
+    def spheres(self) -> Spheres:
+        return Spheres(math.prod(self.lattice), LENGTHS)
+
+    def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
+        found = super().samples(count, seed, scale)
+        found[..., self._size :] *= min(1.0, 1.0 / scale)  # of a temperature exp(y) that is finite
+        return found
+
+
+class HeatBaths(eqx.Module):
+    """Baths, each with an energy that is a function of its own entropy y: by default ``U = c T exp(y / c)``.
+
+    That is a constant heat capacity c, and the temperature T at y = 0.
+
+    Parameters
+    ----------
+    capacity, temperature : float > 0, or array, shape (number,)
+    number : int
+    energy : function from y, a scalar, to a scalar, optional
+        The same for all baths, in place of the two numbers. It has to increase.
+    """
+
+    parameters: tuple[jax.Array, ...]
+    function: Callable
+    number: int = eqx.field(static=True)
+
+    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
+        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+            raise InputError(f"the number of baths is a positive integer, not {number!r}")
+        given = {"capacity": capacity, "temperature": temperature} if energy is None else {}
+        self.parameters = tuple(_positive(value, what, number) for what, value in given.items())
+        self.function, self.number = _warmth if energy is None else _OfEntropy(energy), number
+
+    def at(self, place: int) -> Energy:
+        """Their energy, of the components of a state from this place on."""
+        return Each(self.function, place + np.arange(self.number)[:, None], *self.parameters)
+
+
+def _positive(value, what: str, number: int) -> jax.Array:
+    array = real_array(value)
+    if array.shape not in ((), (number,)):
+        raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
+    if not is_traced(array) and not bool(((array > 0.0) & jnp.isfinite(array)).all()):
+        raise InputError(f"the {what} of a bath must be positive and finite, not {array.tolist()}")
+    return jnp.broadcast_to(array, (number,))
+
+
+def _warmth(y, capacity, temperature):
+    return capacity * temperature * jnp.exp(y[0] / capacity)
+
+
+class _OfEntropy(eqx.Module):
+    energy: Callable
+
+    def __call__(self, y):
+        return self.energy(y[0])
+
+
+def _of_spins(term: Energy, lattice: tuple[int, ...]) -> Energy:
+    """A plain function of spins on their sites as one of states; terms of other kinds are of states already."""
+    if isinstance(term, Negative):
+        return Negative(_of_spins(term.term, lattice))
+    if isinstance(term, Function | TimeDependent):
+        return type(term)(_OfSpins(term.function, lattice))
+    return term
+
+
+class _OfSpins(eqx.Module):
+    """A function of spins on their sites, as one of states."""
+
+    function: Callable
+    lattice: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, x, *time):
+        return self.function(spins_of(x, self.lattice), *time)
+
+
+class _LastSum(Energy):
+    """The sum of the last components: the entropies of the baths."""
+
+    number: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return jnp.sum(x[-self.number :])
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.where(jnp.arange(x.size) < x.size - self.number, 0.0, 1.0)

@@ -1,0 +1,344 @@
+"""Spins: their energies against sums over edges, damping against its formula, laws, closed forms, refusals."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.sparse
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.models.spins import single_spin_solution, spin_wave_frequency
+
+SITES = (3, 4)
+COUNT = 12
+RANDOM = np.random.default_rng(7)
+SPINS = RANDOM.standard_normal((*SITES, 3))
+JS, DS = RANDOM.standard_normal(SITES), RANDOM.standard_normal((*SITES, 3))
+
+
+def unit(*sites, seed=0):
+    s = np.random.default_rng(seed).standard_normal((*sites, 3))
+    return s / np.linalg.norm(s, axis=-1, keepdims=True)
+
+
+def over_pairs(s, offsets, closed, pair):
+    """The sum of ``pair(site, s_i, s_j)`` over pairs of a site with the one ahead, as loops."""
+    total = 0.0
+    for site in np.ndindex(*SITES):
+        for offset in offsets:
+            ahead = [a + b for a, b in zip(site, offset, strict=True)]
+            if any(not around and not 0 <= a < n for a, n, around in zip(ahead, SITES, closed, strict=True)):
+                continue
+            total = total + pair(site, s[site], s[tuple(a % n for a, n in zip(ahead, SITES, strict=True))])
+    return total
+
+
+NEAREST = [(1, 0), (0, 1)]
+MATRIX = np.triu(RANDOM.standard_normal((COUNT, COUNT)) * (RANDOM.random((COUNT, COUNT)) < 0.3), 1)
+EDGES = [(int(i), int(j), float(MATRIX[i, j])) for i, j in zip(*np.nonzero(MATRIX), strict=True)]
+VECTORS = [(3, 1, (0.1, 0.2, -0.3)), (0, 11, (1.0, 0.0, 0.5))]
+
+
+def on_edges(s, edges, pair):
+    flat = s.reshape(-1, 3)
+    return sum(pair(flat[i], flat[j], weight) for i, j, weight in edges)
+
+
+def aligned(a, b, J):
+    return -J * jnp.dot(a, b)
+
+
+def turned(a, b, D):
+    return jnp.dot(jnp.asarray(D), jnp.cross(a, b))
+
+
+mag = lt.magnetism
+ENERGIES = {
+    "exchange": (
+        mag.exchange(SITES, 0.7),
+        lambda s: over_pairs(s, NEAREST, (True, True), lambda site, a, b: -0.7 * a @ b),
+    ),
+    "open, of each pair": (
+        mag.exchange(SITES, JS, periodic=(False, True)),
+        lambda s: over_pairs(s, NEAREST, (False, True), lambda site, a, b: -JS[site] * (a @ b)),
+    ),
+    "diagonal neighbours": (
+        mag.exchange(SITES, [JS, 2.0 * JS], neighbours=[(1, -1), (0, 2)]),
+        lambda s: (
+            over_pairs(s, [(1, -1)], (True, True), lambda site, a, b: -JS[site] * (a @ b))
+            + over_pairs(s, [(0, 2)], (True, True), lambda site, a, b: -2.0 * JS[site] * (a @ b))
+        ),
+    ),
+    "matrix": (mag.exchange(COUNT, MATRIX + MATRIX.T), lambda s: on_edges(s, EDGES, aligned)),
+    "sparse": (mag.exchange(COUNT, scipy.sparse.csr_array(MATRIX + MATRIX.T)), lambda s: on_edges(s, EDGES, aligned)),
+    "edges": (mag.exchange(SITES, EDGES), lambda s: on_edges(s, EDGES, aligned)),
+    "DMI": (
+        mag.dzyaloshinskii_moriya(SITES, DS, periodic=False),
+        lambda s: over_pairs(s, NEAREST, (False, False), lambda site, a, b: turned(a, b, DS[site])),
+    ),
+    "DMI on edges": (mag.dzyaloshinskii_moriya(SITES, VECTORS), lambda s: on_edges(s, VECTORS, turned)),
+    "anisotropy": (
+        mag.anisotropy(SITES, JS, DS),
+        lambda s: -jnp.sum(JS * jnp.sum(DS * s, axis=-1) ** 2),
+    ),
+    "Zeeman": (mag.zeeman(SITES, (0.1, 0.2, 0.3), JS), lambda s: -jnp.sum(JS * (s @ jnp.array([0.1, 0.2, 0.3])))),
+}
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_energies_are_the_sums_over_their_edges(name):
+    energy, written = ENERGIES[name]
+    x = jnp.append(SPINS.ravel(), 3.0)  # what comes behind the spins is left alone
+    value, gradient = jax.value_and_grad(lambda x: written(x[:-1].reshape(*SITES, 3)))(x)
+    assert energy.is_quadratic
+    assert float(energy.value(x)) == pytest.approx(float(value), abs=1e-13)
+    np.testing.assert_allclose(energy.gradient(x), gradient, atol=1e-13)
+    pattern = energy.couplings(37).toarray()
+    hessian = np.asarray(jax.jacfwd(energy.gradient)(x))
+    assert not hessian[~pattern].any()
+
+
+def formula(x, sites, H_s, rate, ratio, capacity):
+    """The motion written once more, in NumPy: one bath."""
+    s, a = x[:-1].reshape(-1, 3), H_s(x[:-1]).reshape(-1, 3)
+    torque = np.cross(s, a)
+    r, g = np.broadcast_to(rate, sites).reshape(-1, 1), np.broadcast_to(ratio, sites).reshape(-1, 1)
+    T = np.exp(x[-1] / capacity)
+    return np.append((g * torque + r * np.cross(s, torque)).ravel(), np.sum(r * torque**2) / T)
+
+
+def small(**changes):
+    """Three spins with everything."""
+    given = {"exchange_constant": 0.8, "anisotropy_constant": 0.3, "field": (0.2, 0.0, 0.5), "dmi": (0.1, 0.3, 0.0)}
+    return lt.models.spin_lattice(3, rate=np.array([0.1, 0.5, 0.2]), **given | changes)
+
+
+def test_damping_is_landau_and_lifshitz_s():
+    ratio, rate = np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.5, 0.2])
+    energy = mag.exchange(3, 0.8) + mag.zeeman(3, (0.2, 0.0, 0.5))
+    system = lt.SpinSystem(3, energy, lt.LandauLifshitz(rate), lt.HeatBaths(2.0), ratio)
+    x = np.append(unit(3).ravel(), 0.4)
+
+    def written(s):
+        s = s.reshape(3, 3)
+        return -0.8 * jnp.sum(s * jnp.roll(s, 1, 0)) - s.sum(0) @ jnp.array([0.2, 0.0, 0.5])
+
+    gradient = jax.grad(written)
+    expected = formula(x, (3,), lambda s: np.asarray(gradient(s)), rate, ratio, 2.0)
+    np.testing.assert_allclose(system.vector_field(x), expected, atol=1e-14)
+    assert system.check().passed
+    alone = lt.SpinSystem(3, energy, lt.LandauLifshitz(rate), ratio=ratio)
+    np.testing.assert_allclose(alone.vector_field(x[:-1]), expected[:-1], atol=1e-14)
+    assert alone.energy_law == "nonincreasing"
+    assert alone.check().passed
+    gamma, damping = lt.LandauLifshitz.gilbert(0.3, 2.0)
+    s, a = unit(2)
+    landau = gamma * np.cross(s, a) + damping * np.cross(s, np.cross(s, a))
+    np.testing.assert_allclose(landau, 2.0 * np.cross(s, a) - 0.3 * np.cross(s, landau), atol=1e-14)
+
+
+def test_each_site_heats_its_own_bath():
+    system = small(baths=lt.HeatBaths([1.0, 2.0], [1.0, 3.0], number=2), bath=np.array([1, 0, 1]))
+    assert system.check().passed
+    x = np.concatenate([unit(3).ravel(), [0.1, -0.2]])
+    flow, gradient = np.asarray(system.vector_field(x)), np.asarray(system.energy.gradient(x))
+    torque = np.cross(x[:9].reshape(3, 3), gradient[:9].reshape(3, 3))
+    heat = np.array([0.1, 0.5, 0.2]) * np.sum(torque**2, axis=1)
+    T = np.array([np.exp(0.1), 3.0 * np.exp(-0.1)])
+    np.testing.assert_allclose(system.temperatures(x), T, atol=1e-14)
+    np.testing.assert_allclose(flow[9:], np.array([heat[1], heat[0] + heat[2]]) / T, atol=1e-14)
+
+
+@pytest.mark.parametrize("baths", [True, lt.HeatBaths(number=2)])
+def test_the_force_is_that_of_its_factor_for_any_gradients(baths):
+    system = small(baths=baths, bath=None if baths is True else np.array([1, 0, 1]))
+    x, dH, dS = RANDOM.standard_normal((3, system.dim))
+    B = system.dissipation.factor(system, x, jnp.asarray(dH), ())
+    force = system.dissipation.force(system, x, jnp.asarray(dH), jnp.asarray(dS), ())
+    np.testing.assert_allclose(force, B.times(B.transposed(jnp.asarray(dS))), atol=1e-13)
+    np.testing.assert_allclose(B.transposed(jnp.asarray(dH)), 0.0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_the_suite_of_dissipations():
+    lt.testing.check_dissipation(small())
+
+
+@functools.cache
+def reference(t=1.0):
+    """By SciPy from the formula, the gradient from JAX."""
+    system = small(baths=lt.HeatBaths(3.0))
+    x = np.append(unit(3).ravel(), 0.0)
+    gradient = jax.jit(lambda x: system.energy.gradient(x))
+
+    def H_s(s):
+        return np.asarray(gradient(np.append(s, 0.0)))[:-1]
+
+    def field(t, x):
+        return formula(x, (3,), H_s, np.array([0.1, 0.5, 0.2]), 1.0, 3.0)
+
+    return system, x, scipy.integrate.solve_ivp(field, (0.0, t), x, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    [
+        (lt.MetriplecticRungeKutta(4), 4, (10, 20, 40)),
+        (lt.MetriplecticGauss(2), 4, (5, 10, 20)),
+        pytest.param(lt.MetriplecticMidpoint(), 2, (20, 40, 80), marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticGauss(1), 2, (20, 40, 80), marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticRungeKutta(8), 8, (3, 5, 8), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_methods_converge_to_the_motion_at_their_order_with_the_laws_exact(method, order, steps):
+    system, x, exact = reference()
+    errors = []
+    for n in steps:
+        solution = lt.integrate(system, x, (0.0, 1.0), 1.0 / n, method)
+        errors.append(np.abs(solution.x[-1] - exact).max())
+        assert np.ptp(solution.energy) < 1e-14 * abs(solution.energy[0])
+        assert np.diff(solution.entropy).min() > 0.0
+        assert np.abs(np.linalg.norm(system.spins(solution.x), axis=-1) - 1.0).max() < 2e-15
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert -slope == pytest.approx(order, abs=0.3)
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
+def test_a_single_spin_switches_when_the_closed_form_says(method):
+    B, rate = 2.0, 0.15
+    system = lt.models.single_spin(B, rate)
+    start = np.array([np.sin(3.0), 0.0, np.cos(3.0)])
+    run = functools.partial(lt.integrate, system, start, method=method)
+    solution = run((0.0, 20.0), 0.01, save_every=50)
+    exact = single_spin_solution(solution.t, start, B, rate)
+    error = 3e-3 if method.order == 2 else 1e-10
+    np.testing.assert_allclose(solution.x, exact, atol=error)
+    assert np.abs(np.linalg.norm(solution.x, axis=1) - 1.0).max() < 1e-14
+    time = run((0.0, 20.0), 0.01, until=lambda s: s[2]).event_time
+    switched = -np.arctanh(start[2]) / (rate * B)
+    assert time == pytest.approx(switched, rel=3e-4 if method.order == 2 else 1e-10)  # midpoint: (h B)^2 / 4
+
+
+def test_the_closed_form_solves_the_equations():
+    start, t = np.array([0.6, 0.0, -0.8]), 1.7
+    exact = functools.partial(single_spin_solution, start=start, field=1.3, rate=0.4)
+    s, slope = exact(t), (exact(t + 1e-5) - exact(t - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, lt.models.single_spin(1.3, 0.4).vector_field(s), atol=1e-9)
+    assert s[2] == pytest.approx(np.tanh(0.4 * 1.3 * t + np.arctanh(-0.8)), abs=1e-15)
+
+
+def test_a_small_wave_on_a_ring_has_the_frequency_of_its_length():
+    n, J, K, amplitude = 24, 0.9, 0.2, 1e-5
+    system = lt.models.spin_lattice(n, J, K, rate=0.0, baths=False)
+    q = 2.0 * np.pi * 5 / n
+    s = np.stack([amplitude * np.cos(q * np.arange(n)), amplitude * np.sin(q * np.arange(n)), np.ones(n)], axis=1)
+    s /= np.linalg.norm(s, axis=1, keepdims=True)
+    solution = lt.integrate(system, system.state(s), (0.0, 2.0), 0.05, lt.MetriplecticRungeKutta(6), engine="array")
+    wave = np.asarray(system.spins(solution.x))[..., 0] + 1j * np.asarray(system.spins(solution.x))[..., 1]
+    phase = np.unwrap(np.angle(wave @ np.exp(-1j * q * np.arange(n))))
+    frequency = np.polyfit(solution.t, phase, 1)[0]
+    assert abs(frequency) == pytest.approx(spin_wave_frequency(q, J, K), rel=1e-8)
+    assert solution.audit().passed
+
+
+BOTH = [lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)]
+
+
+def damped(count, h, t, method, **given):
+    system = lt.models.spin_lattice(count, anisotropy_constant=0.1, **given)
+    n = max(1, round(t / h))
+    solution = lt.integrate(system, system.state(unit(count)), (0.0, n * h), h, method, save_every=n, engine="array")
+    energy, stats = solution.energy, solution.stats
+    assert max(abs(energy[0] - np.array(stats.energy_range))) <= 1e-13 * abs(energy[0])
+    assert stats.least_entropy_increment > 0.0
+    assert np.abs(np.linalg.norm(system.spins(solution.x), axis=-1) - 1.0).max() < 1e-14
+    return solution
+
+
+@pytest.mark.parametrize("method", BOTH, ids=str)
+def test_ten_thousand_damped_spins_with_a_bath(method):
+    damped(10_000, 0.1, 2.0, method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [*BOTH, lt.MetriplecticGauss(2)], ids=str)
+@pytest.mark.parametrize("h", [0.1, 0.03, 0.01, 0.003, 0.001])
+def test_ten_thousand_damped_spins_with_a_bath_at_every_step(method, h):
+    damped(10_000, h, 2.0, method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", BOTH, ids=str)
+def test_a_million_damped_spins(method):
+    damped(1_000_000, 0.1, 0.5, method)
+
+
+@pytest.mark.slow
+def test_double_brackets_on_a_lattice_lower_the_energy_to_the_last_bit_of_the_lengths():
+    system = lt.models.spin_lattice((16, 16), anisotropy_constant=0.1, baths=False, rate=0.3)
+    for method in (lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)):
+        solution = lt.integrate(system, system.state(unit(16, 16)), (0.0, 10.0), 0.1, method, engine="array")
+        assert np.diff(solution.energy).max() < 0.0
+        assert np.abs(np.linalg.norm(system.spins(solution.x), axis=-1) - 1.0).max() < 1e-14
+        assert solution.audit().passed
+
+
+def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
+    system = small()
+    monkeypatch.setattr(lt.SpinSystem, "spheres", None)
+    solution = lt.integrate(
+        system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(4), engine="compiled"
+    )
+    assert np.abs(np.linalg.norm(system.spins(solution.x), axis=-1) - 1.0).max() > 1e-6
+
+
+CHAIN = [(0, 1, 1.0), (1, 2, 1.0)]
+REFUSED = [
+    (lambda: small().state(np.zeros((3, 2))), r"spins in shape \(3, 3\), or all 10 components in one row"),
+    (lambda: small().state(np.zeros((4, 3))), r"spins in shape \(3, 3\)"),
+    (lambda: small().state(np.zeros(9)), "all 10 components"),
+    (lambda: mag.exchange(3, [(0, 1, 1.0), (1, 3, 1.0)]), r"the edge \(1, 3\) leaves the 3 parts"),
+    (lambda: mag.exchange(3, np.triu(np.ones((3, 3)), 1)), "the exchange is not symmetric"),
+    (lambda: mag.exchange(3, np.ones((3, 3))), "of site 0 with itself"),
+    (lambda: mag.exchange(4, np.ones((3, 3))), r"\(4, 4\) matrix for 4 parts"),
+    (lambda: mag.exchange(3, [(0, 1, np.inf)]), "between site 0 and site 1 is inf: it must be finite"),
+    (lambda: mag.exchange((4, 4), np.ones(3)), "an exchange constant has the shape of one number"),
+    (lambda: mag.exchange((4, 4), 1.0, neighbours=[(1, 0), (-1, 0)]), "name a pair twice"),
+    (lambda: mag.exchange((4, 4), 1.0, neighbours=[(0, 0)]), "not all zero"),
+    (lambda: mag.exchange((4, 4), 1.0, periodic=(True,)), "each of the 2 axes"),
+    (lambda: mag.exchange((4, 0)), "sites are a positive integer"),
+    (lambda: mag.dzyaloshinskii_moriya(3, [(0, 3, (1, 0, 0))]), r"the edge \(0, 3\) leaves the 3 sites"),
+    (lambda: mag.dzyaloshinskii_moriya(3, [(0, 1, (1, 0, 0)), (1, 0, (1, 0, 0))]), "given twice"),
+    (lambda: mag.zeeman(3, (1.0, 2.0)), r"a field has the shape \(3,\) or \(3, 3\), not \(2,\)"),
+    (lambda: lt.SpinSystem(3, mag.exchange(4, 1.0)), "a term of 4 spins"),
+    (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(np.ones(4))), r"have the shape \(3,\) of the sites"),
+    (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(-1.0)), "must be >= 0"),
+    (lambda: lt.LandauLifshitz([0.1, -0.2]), "must be >= 0, not -0.2"),
+    (lambda: small(bath=np.array([0, 0, 1])), "a site heats bath 1, but there are 1"),
+    (lambda: small(bath=np.array([0, 0])), "a number for each of the sites"),
+    (lambda: lt.HeatBaths(-1.0), "must be positive and finite"),
+    (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
+    (lambda: small(baths=2.0), "baths are lt.HeatBaths, True"),
+    (
+        lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
+        "damps the spins of a SpinSystem",
+    ),
+]
+
+
+@pytest.mark.parametrize(("attempt", "says"), REFUSED)
+def test_refusals(attempt, says):
+    with pytest.raises(lt.InputError, match=says):
+        attempt()
+
+
+def test_ratios_and_sites_of_the_structure_are_checked():
+    with pytest.raises(mf.ParameterError, match=r"has shape \(3,\), not \(2,\)"):
+        mf.Spins(3, ratio=np.ones(2))
+    assert mf.Spins((2, 3), 1).tensor(RANDOM.standard_normal(19)).shape == (19, 19)
+    assert float(mf.Spins(2, 1, [1.0, 3.0]).jacobi_residual(RANDOM.standard_normal(7))) < 1e-14
