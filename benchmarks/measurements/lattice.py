@@ -127,6 +127,9 @@ def of_library(system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod =
 
 def of_stats(solution: lt.Solution) -> laws.Laws:
     """The laws as they were followed at every step: an audit would take some of these again."""
-    stats, first = solution.stats, float(solution.energy[0])
+    stats, entropy, first = solution.stats, solution.entropy, float(solution.energy[0])
+    assert stats.energy_range is not None
+    assert stats.least_entropy_increment is not None
+    assert entropy is not None
     drift = max(abs(energy - first) for energy in stats.energy_range) / abs(first)
-    return laws.Laws(drift, stats.least_entropy_increment / float(np.abs(solution.entropy).max()))
+    return laws.Laws(drift, stats.least_entropy_increment / float(np.abs(entropy).max()))

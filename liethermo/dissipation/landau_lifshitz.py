@@ -30,7 +30,7 @@ class LandauLifshitz(Dissipation):
     ``w_i alpha = s_i x alpha_i - t_i alpha_b / T_b``
     whose kernels dH lies in. Each site is damped as it would be alone, however many there are.
 
-    Gilbert's form ``s' = gamma s x dH - alpha s x s'`` is the same motion with ``gamma / (1 + alpha^2)`` in place of
+    Gilbert's form ``s' = gamma s x dH + alpha s x s'`` is the same motion with ``gamma / (1 + alpha^2)`` in place of
     gamma and ``lambda = alpha gamma / (1 + alpha^2)``, for |s| = 1: see :meth:`gilbert`.
 
     Parameters

@@ -138,7 +138,7 @@ def test_damping_is_landau_and_lifshitz_s():
     gamma, damping = lt.LandauLifshitz.gilbert(0.3, 2.0)
     s, a = unit(2)
     landau = gamma * np.cross(s, a) + damping * np.cross(s, np.cross(s, a))
-    np.testing.assert_allclose(landau, 2.0 * np.cross(s, a) - 0.3 * np.cross(s, landau), atol=1e-14)
+    np.testing.assert_allclose(landau, 2.0 * np.cross(s, a) + 0.3 * np.cross(s, landau), atol=1e-14)
 
 
 def test_each_site_heats_its_own_bath():
