@@ -445,21 +445,12 @@ POWERS = 4
 """Times that the Jacobian matrix is applied to see how large it is."""
 
 
-def error_and_stretch(system: System, method: OneStepMethod, x, low, h, k):
-    """The estimate of the local error and, from the start of the step, how the motion stretches what lies near.
+def stretch(system: System, x) -> jax.Array:
+    """How the motion stretches what lies near a state.
 
     The Jacobian matrix, shape (n, n), of a few components; otherwise its first :data:`POWERS` powers times a vector,
     each over the size of the one before, shape (POWERS, n).
     """
-    return _error_and_stretch(system, method, *(jnp.asarray(a) for a in (x, low, h, k)))
-
-
-@program
-def _error_and_stretch(system, method, x, low, h, k):
-    return method.error(system, x, low, h, k), _stretch(*method.judged(system, x))
-
-
-def _stretch(system: System, x):
     stretched, n = _linearised(system, x), x.shape[0]
     if n <= FEW:
         return jax.vmap(stretched)(jnp.eye(n)).T

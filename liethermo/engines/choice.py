@@ -16,7 +16,10 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine, State
+from .compiled.paced import lane_pace
 from .compiled.stepper import CompiledEngine
+from .pace import Pacing
+from .paces import Paces, SinglePaces
 from .sparse.newton import SparseEngine
 
 ENGINES = ("auto", "array", "compiled", "sparse")
@@ -113,6 +116,16 @@ class Chosen:
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
 
+    def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> Paces:
+        """The run with a pace, about to start at x at a time; see :func:`.pace.begun`."""
+        if isinstance(self._engine, CompiledEngine):
+            return _Compiled(self, pacing, x, t, stop, length)
+        return self._single(pacing).begin(x, t, stop, length)
+
+    def _single(self, pacing: Pacing) -> SinglePaces:
+        step = self._engine.step if self._engine.name == "sparse" else None
+        return SinglePaces(self.system, self.method, pacing, step)
+
     def _choose(self) -> Engine:
         system, method, auto = self.system, self.method, self.asked == "auto"
         if self.asked == "sparse" and self.noise is not None:
@@ -154,6 +167,41 @@ class Chosen:
             raise error
         warn_of_fallback(error)
         self._engine = ArrayEngine(self.system, self.method)
+
+
+class _Compiled:
+    """A compiled run with a pace, that the array engine takes over where it meets what cannot be unrolled."""
+
+    number = 1
+
+    def __init__(self, chosen: Chosen, pacing: Pacing, x, t: float, stop: float, length: float):
+        self._chosen, self._pacing, self._start = chosen, pacing, (x, t, stop, length)
+        try:
+            self._paces: Paces = lane_pace(chosen.system, chosen.method, pacing, x, t, stop, length)
+        except UnsupportedPrimitive as error:
+            self._take_over(error)
+
+    def _take_over(self, error: UnsupportedPrimitive) -> None:
+        self._chosen._fall_back(error)
+        self._paces = self._chosen._single(self._pacing).begin(*self._start)
+
+    def follow(self, most: int) -> None:
+        try:
+            self._paces.follow(most)
+        except UnsupportedPrimitive as error:
+            before = self._paces
+            self._take_over(error)
+            assert isinstance(self._paces, SinglePaces)
+            self._paces.continued(before).follow(most)
+
+    def read(self, name: str, chosen: Any = slice(None)):
+        return self._paces.read(name, chosen)
+
+    def write(self, name: str, chosen, values) -> None:
+        self._paces.write(name, chosen, values)
+
+    def stepped(self, chosen, h):
+        return self._paces.stepped(chosen, h)
 
 
 def is_small(system: System, most: int) -> bool:

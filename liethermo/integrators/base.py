@@ -42,9 +42,12 @@ class OneStepMethod(eqx.Module):
     stages : int
     systems : str
         What it is for, in words; :meth:`check` refuses others.
+    fixed : str
+        Of a method without an estimate of its error, why its steps are of one size.
     """
 
     systems: ClassVar[str] = EVERY_SYSTEM
+    fixed: ClassVar[str] = "it does not estimate the error of its steps"
 
     @property
     @abstractmethod
@@ -145,7 +148,7 @@ class OneStepMethod(eqx.Module):
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
-        raise InputError(f"{self} has no error estimate, so its steps cannot be adaptive")
+        raise InputError(f"{self} has no error estimate: {self.fixed}")
 
     def judged(self, system: System, x) -> tuple[System, jax.Array]:
         """The part of the system, and of the state, that the estimate of the error is about."""
@@ -181,6 +184,14 @@ class GaussMethod(OneStepMethod):
 
     def predict(self, k, before) -> jax.Array:
         return 2.0 * k - before if self.number == 1 else beyond(self.number) @ k
+
+
+ONE_SIZE = (
+    "what a variational scheme keeps without holding it, such as the energy of a free motion, it keeps by steps of one "
+    "size alone, which conserve a function near it [Hairer, Lubich & Wanner 2006, VIII.1]; steps that follow an error "
+    "let it drift. Take a smaller fixed step, or lt.MetriplecticGauss where laws are to hold at steps of any size"
+)
+"""Why variational schemes have steps of one size."""
 
 
 def checked_stages(stages) -> int:

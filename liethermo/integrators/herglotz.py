@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from manifolds.matrices.linear import solve
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy
 from ..systems import EvolutionSystem, System
-from .base import OneStepMethod
+from .base import ONE_SIZE, OneStepMethod
 
 
 class DiscreteHerglotz(OneStepMethod):
@@ -35,6 +36,7 @@ class DiscreteHerglotz(OneStepMethod):
     """
 
     systems = "evolution systems"
+    fixed: ClassVar[str] = ONE_SIZE
 
     discrete_lagrangian: Callable
 

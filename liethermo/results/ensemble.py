@@ -61,8 +61,9 @@ class Ensemble:
     energy, entropy : ndarray, shape (B,) or (B, times), as x has
         Final ones for ``"summary"``. ``entropy`` is None for a system without one.
     status : ndarray of int8, shape (B,)
-        Places in ``STATUSES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 8 inadmissible: a trajectory
-        that could not be started, with its parameters or from its state.
+        Places in ``STATUSES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
+        adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started, with its
+        parameters or from its state.
     steps : ndarray of int64, shape (B,)
         Steps taken; where the status is not 0 the one after is the one that failed.
     residual : ndarray, shape (B,)
@@ -87,6 +88,8 @@ class Ensemble:
         Over every step, less the work done from outside.
     end_time : ndarray, shape (B,)
         Time reached.
+    rejected : ndarray of int64, shape (B,)
+        Adaptive steps that were tried and were too long.
     x0 : ndarray, shape (B, n)
         Initial states.
     laws : Laws
@@ -126,6 +129,7 @@ class Ensemble:
     smallest_energy: np.ndarray
     largest_energy: np.ndarray
     end_time: np.ndarray
+    rejected: np.ndarray
     x0: np.ndarray
     laws: Laws
     engine: str
@@ -153,6 +157,11 @@ class Ensemble:
     def ok(self) -> np.ndarray:
         """Which trajectories came to their end, shape (B,)."""
         return np.isin(self.status, (Code.COMPLETED, Code.EVENT))
+
+    @property
+    def event_time(self) -> np.ndarray:
+        """When events happened, shape (B,); NaN where none did."""
+        return np.where(self.status == Code.EVENT, self.end_time, np.nan)
 
     # -- one trajectory -------------------------------------------------------------------------------------------
 
@@ -205,6 +214,7 @@ class Ensemble:
         return Stats(
             steps=int(self.steps[i]),
             fixed_point_iterations=int(self.iterations[i]),
+            rejected=int(self.rejected[i]),
             worst_residual=float(self.residual[i]) if self.ok[i] else 0.0,
             energy_range=(float(self.smallest_energy[i]), float(self.largest_energy[i])) if moved else None,
             least_entropy_increment=entropy,
@@ -240,6 +250,7 @@ class Ensemble:
             laws=self.laws,
             provenance={**self.provenance, "trajectory": i, "x0": self.x0[i].tolist()},
             attitude=attitude,
+            event_time=float(self.end_time[i]) if self.status[i] == Code.EVENT else None,
             witness=lambda: evidence,
         )
 
@@ -390,7 +401,7 @@ SERIES = ("energy", "entropy", "work")
 NUMBERS = tuple(
     "status steps residual energy_drift largest_energy_increment least_entropy_increment entropy_scale "
     "energy_sensitivity entropy_sensitivity first_energy entropy_change relaxation_time iterations smallest_energy "
-    "largest_energy end_time".split()
+    "largest_energy end_time rejected".split()
 )
 """One of each trajectory."""
 

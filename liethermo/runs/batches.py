@@ -16,6 +16,7 @@ import numpy as np
 from ..engines import array
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
+from ..engines.paces import step_all
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
@@ -126,11 +127,11 @@ def run_compiled(
     by_threads(work, len(record.x0))
 
 
-def first_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: float) -> dict[str, np.ndarray]:
-    """The states after one step of all members of a small family."""
+def first_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+    """The states after one step of all members of a small family, each of its own size."""
     lanes, number = Lanes(family, method), len(x)
     blocks = lanes.stepper.begin(lanes.parameters(slice(None), number), x)
-    lanes.stepper.run(lanes.first, blocks, h, 1, 1)
+    lanes.stepper.run(lanes.first, blocks, np.resize(h, len(blocks) * LANES), 1, 1)
     return {name: values[:number] for name, values in lanes.stepper.fields(blocks).items()}
 
 
@@ -178,11 +179,11 @@ def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tall
             return
 
 
-def first_array(family: Family, method: OneStepMethod, x: np.ndarray, h: float) -> dict[str, np.ndarray]:
-    """The states after one step of all members of a small family."""
+def first_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+    """The states after one step of all members of a small family, each of its own size."""
     parameters, axes = family.batched(slice(None))
     state = begin_all(family.form, parameters, axes, method, jnp.asarray(x))
-    state, _ = advance_all(family.form, parameters, axes, method, state, jnp.asarray(h), 1, jnp.asarray(1))
+    state = step_all(family.form, parameters, axes, method, state, jnp.asarray(h))
     return {name: np.asarray(value) for name, value in state._asdict().items()}
 
 

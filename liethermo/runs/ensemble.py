@@ -15,9 +15,12 @@ from ..results.ensemble import STATUSES, Ensemble
 from ..results.evidence import has_estimate
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.scalarize import UnsupportedPrimitive
+from .adaptive import Adaptive, pacing_of
 from .batches import THREADS, Tally, first_array, first_compiled, run_array, run_compiled
+from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
+from .paced import Many
 from .preparation import NO_GROUP, as_run, check_choice, laws_of
 from .presented import provenance_of
 from .progress import Progress
@@ -32,13 +35,14 @@ def ensemble(
     system: System | Callable[[Any], System] | Family,
     x0s,
     t_span: tuple[float, float],
-    step: float,
+    step: float | Adaptive,
     method: OneStepMethod | None = None,
     *,
     parameters=None,
     outputs: Literal["final", "trajectory", "summary"] | None = None,
     save_every: int = 1,
     save_at=None,
+    until: Relaxed | Callable | None = None,
     engine: Literal["auto", "array", "compiled"] = "auto",
     attitude=None,
     progress: bool | None = None,
@@ -56,8 +60,9 @@ def ensemble(
     x0s : array, shape (n,) or (B, n)
         Initial states; one for all, or one each. Of a system on sites ``(*sites, d)`` may stand in the place of n; the
         states of an ensemble are flat, and ``system.points`` shows them on the sites.
-    t_span, step, method, save_every, save_at
-        As for :func:`integrate`.
+    t_span, step, method, save_every, save_at, until
+        As for :func:`integrate`: with ``lt.Adaptive(rtol, atol)`` every trajectory has steps of its own, the same as
+        alone, and with ``until`` an end of its own. ``e.end_time`` and ``e.event_time`` tell when.
     parameters : optional
         One set for each trajectory: arrays with the trajectories in front. For a function, whatever it takes (an
         array, a dict of arrays, …). For a system, a dict from the names of its parameters, such as
@@ -95,9 +100,18 @@ def ensemble(
     check_choice("engine", engine, ("auto", "array", "compiled"))
     if save_at is not None and outputs != "trajectory":
         raise InputError(f'save_at is for outputs="trajectory", not {outputs!r}')
-    course = Course(t_span, step, save_every if outputs == "trajectory" and save_at is None else None)
+    own_ends = isinstance(step, Adaptive) or until is not None
+    if own_ends and outputs == "trajectory" and save_at is None:
+        raise InputError(
+            "trajectories with adaptive steps or events are kept at times that all have in common: give save_at"
+        )
+    if own_ends and noise is not None:
+        raise InputError("steps with noise are of one size, and nothing is known of a path between them: give a step")
+    h = t_span[1] - t_span[0] if isinstance(step, Adaptive) and len(t_span) == 2 else step
+    course = Course(t_span, h, save_every if outputs == "trajectory" and save_at is None else None)
+    stops = stops_of(save_at, course.start, course.end)
     if save_at is not None:
-        course = Course(t_span, step, None, stops_of(save_at, course.start, course.end))
+        course = Course(t_span, h, None, stops)
 
     family = Family.of(system, parameters)
     if np.ndim(x0s) > 2 and getattr(system, "space", None) is None and not getattr(system, "sites", ()):
@@ -118,22 +132,30 @@ def ensemble(
         family, states = family.through(DrivenSystem), np.asarray(member.begin(states, course.start, batch=True))
     method.check(member)
     record = Record(family, member, states, course, outputs)
+    event = None if until is None else Event(until, member)
+    pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
+
+    def take(engine: str, tally: Tally) -> None:
+        if pacing is not None:
+            many = Many(family, method, pacing, event, record, stops, tally)
+            (many.run_compiled if engine == "compiled" else many.run_array)()
+        else:
+            (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)
 
     small = engine == "auto" and is_small(member, COMPILED_DIM)
     chosen = "compiled" if engine == "compiled" or small else "array"
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
         if chosen == "compiled":
             try:
-                run_compiled(family, method, record, Tally(bar.update), paths)
+                take(chosen, Tally(bar.update))
             except UnsupportedPrimitive as error:
                 if engine == "compiled":
                     raise
                 warn_of_fallback(error)
                 chosen = "array"
         if chosen == "array":
-            run_array(family, method, record, Tally(bar.update), paths)
-    h = course.parts[0].h if course.parts[0].full else course.parts[0].last
-    first = FirstSteps(record, method, first_compiled if chosen == "compiled" else first_array, h)
+            take(chosen, Tally(bar.update))
+    first = FirstSteps(record, method, first_compiled if chosen == "compiled" else first_array)
     return record.result(
         run,
         len(reasons) + len(run),
@@ -142,7 +164,9 @@ def ensemble(
         engine=chosen,
         wall_time=time.perf_counter() - started,
         provenance={
-            **provenance_of(told, method, course.h, (course.start, course.end), course.every),
+            **provenance_of(
+                told, method, step if isinstance(step, Adaptive) else course.h, (course.start, course.end), course.every
+            ),
             "engine": chosen,
             "noise": None if noise is None else noise.listed(),
         },

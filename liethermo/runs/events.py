@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ..engines.codes import Code
 from ..errors import FunctionError, InputError
+from ..functions.gradients import EPS
 from ..systems import System
 from ..tracing.interpret import evaluator
+from ..tracing.traced import settled
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,14 @@ class Event:
     Parameters
     ----------
     until : Relaxed or function from a state, shape (n,), to a scalar
+    system : System
+
+    Attributes
+    ----------
+    function : pytree
+        Of a system and a state, for engines.
+    falling : bool
+        Whether it is watched for a fall alone.
     """
 
     def __init__(self, until: Relaxed | Callable, system: System):
@@ -43,52 +56,84 @@ class Event:
         if isinstance(until, Relaxed):
             if system.entropy_law != "nondecreasing":
                 raise InputError("Relaxed(tol) watches the entropy production, and this system produces no entropy")
-            self._function = evaluator(excess, (system, np.float64(until.tol)), system.dim)
+            self.function: Any = Excess(jnp.asarray(until.tol))
         elif callable(until):
-            self._function = evaluator(_of_points, (system, until), system.dim)
+            seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+            self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
+        self._value = evaluator(_value, (system, self.function), system.dim)
         if np.shape(self(system.samples(1)[0])) != ():
             raise FunctionError("the event function must return one number")
 
     def __call__(self, x: np.ndarray) -> float:
-        return self._function(x[None])[0]
+        return self._value(x[None])[0]
 
     def happens(self, before: float, after: float) -> bool:
         """Whether it happens between two values."""
         return before > 0.0 >= after or (not self.falling and before < 0.0 <= after)
 
 
-def excess(model, x):
-    system, tol = model
-    return system.entropy_production(x) - tol
+class Excess(eqx.Module):
+    """The entropy production above one."""
+
+    tol: jax.Array
+
+    def __call__(self, system: System, x):
+        return system.entropy_production(x) - self.tol
 
 
-def _of_points(model, x):
+class OfPoints(eqx.Module):
+    """A function of what the user sees of a state."""
+
+    function: Callable
+
+    def __call__(self, system: System, x):
+        return self.function(system.seen(x))
+
+
+def _value(model, x):
     system, function = model
-    return function(system.seen(x))
+    return function(system, x)
 
 
-def located(event: Event, advance: Callable, system, method, state, new, h: float, before: float, after: float):
-    """The step that ends where the event happens, to rounding: its size and the state it leads to.
+def located(value: Callable[[np.ndarray, np.ndarray], np.ndarray], before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The shares of steps in which events happen, shape (m,), to rounding [Chandrupatla 1997].
 
-    Looked for among steps from the same state, so that the event is as accurate as the method and the laws hold there;
-    one that fails is replaced by the collocation polynomial of the whole step.
+    Looked for among steps from the same states, so that an event is as accurate as the method and the laws hold there.
+    Each of them is found by itself, whatever the others are.
+
+    Parameters
+    ----------
+    value : function of (shares, places) to values
+        Of what is watched, after these shares of the steps with these places.
+    before, after : array, shape (m,)
+        The values at both ends of the steps, of different signs.
     """
-    from scipy.optimize import brentq  # here, as its import takes a tenth of a second, and few runs have events
+    a, b = np.zeros(len(before)), np.ones(len(before))
+    fa, fb = before.copy(), after.copy()
+    c, fc = a.copy(), fa.copy()
+    share = np.full(len(before), 0.5)
+    found = np.where(fb == 0.0, 1.0, np.nan)
+    while (left := np.flatnonzero(np.isnan(found))).size:
+        t = a[left] + share[left] * (b[left] - a[left])
+        ft = value(t, left)
+        same = np.sign(ft) == np.sign(fa[left])
+        c[left], fc[left] = np.where(same, a[left], b[left]), np.where(same, fa[left], fb[left])
+        other, fo = np.where(same, b[left], a[left]), np.where(same, fb[left], fa[left])
+        a[left], fa[left], b[left], fb[left] = t, ft, other, fo
+        best = np.where(np.abs(ft) < np.abs(fo), t, other)
+        width, least = np.abs(other - t), 4.0 * EPS * np.abs(best) + 1e-300
+        done = (width <= least) | (ft == 0.0) | ~np.isfinite(ft)
+        found[left] = np.where(done, np.where(ft == 0.0, t, best), np.nan)
+        share[left] = _share(t, other, c[left], ft, fo, fc[left], 0.5 * least / np.fmax(width, least))
+    return found
 
-    if after == 0.0:
-        return h, new
-    x, k = np.asarray(state.x), np.asarray(new.k)
 
-    def value(theta: float) -> float:
-        if theta in (0.0, 1.0):
-            return after if theta else before
-        end = advance(state, theta * h)
-        found = event(np.asarray(end.x)) if int(end.status) == Code.COMPLETED else math.nan
-        if math.isfinite(found):
-            return found
-        return event(np.asarray(method.along(system, x, h * method.weights(theta) @ k)))
-
-    theta = float(brentq(value, 0.0, 1.0, xtol=1e-15, rtol=8.9e-16))
-    return theta * h, advance(state, theta * h)
+def _share(a, b, c, fa, fb, fc, least) -> np.ndarray:
+    """Where between a and b to look next: by inverse quadratic interpolation where that is safe, or halfway."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+        safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+        t = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+    return np.clip(np.where(safe & np.isfinite(t), t, 0.5), least, 1.0 - least)

@@ -232,7 +232,7 @@ class Family:
         """Which parameters differ, shape (p,), all arrays one after another."""
         return np.concatenate([np.zeros(0, bool), *(np.full(value[0].size, len(value) > 1) for value in self.values)])
 
-    def flat(self, chosen: slice, number: int) -> np.ndarray:
+    def flat(self, chosen: slice | np.ndarray, number: int) -> np.ndarray:
         """The parameters of some members, shape (number, p)."""
         rows = [value[chosen] if len(value) > 1 else value for value in self.values]
         columns = [np.broadcast_to(row.reshape(len(row), -1), (number, row[0].size)) for row in rows]

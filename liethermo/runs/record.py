@@ -35,7 +35,7 @@ from .timetable import Course
 NUMBERS = (
     "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale relaxation_time "
     "residual energy_sensitivity entropy_sensitivity first_energy entropy_change smallest_energy largest_energy "
-    "end_time distance"
+    "end_time first_step distance"
 ).split()
 
 Part = slice | np.ndarray
@@ -62,7 +62,8 @@ class Record:
         size = len(x0)
         self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in NUMBERS}
         self.status = np.full(size, Code.INTERRUPTED, dtype=np.int8)
-        self.steps, self.iterations = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
+        self.steps, self.iterations, self.rejected = (np.zeros(size, dtype=np.int64) for _ in range(3))
+        self.rows["first_step"][:] = course.parts[0].h if course.parts[0].full else course.parts[0].last
         self.rows["end_time"][:] = course.start
         self.x = np.full((size, member.dim), np.nan) if outputs == "final" else None
         self.path = np.full((size, len(self.times), member.dim + 2), np.nan) if outputs == "trajectory" else None
@@ -77,6 +78,11 @@ class Record:
         """States at the kept times from the so-manieth on, with energy and entropy, shape (trajectories, m, n + 2)."""
         if self.path is not None:
             self.path[chosen, first : first + states.shape[1]] = states
+
+    def keep_at(self, chosen: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
+        """The states of some trajectories, each at one of the kept times."""
+        if self.path is not None:
+            self.path[chosen, np.searchsorted(self.times, t)] = states
 
     def put(self, chosen: Part, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """The outcome of some trajectories of equal steps: fields of :class:`liethermo.engines.array.State`."""
@@ -124,7 +130,7 @@ class Record:
             whole[run] = values
             return whole
 
-        rows = {name: placed(values) for name, values in self.rows.items() if name != "distance"}
+        rows = {name: placed(values) for name, values in self.rows.items() if name not in ("distance", "first_step")}
         x, energy, entropy, t = self.x, rows.pop("energy"), rows.pop("entropy"), self.times[-1:]
         if self.path is not None:
             x, energy, entropy = self.path[..., :-2], placed(self.path[..., -2]), placed(self.path[..., -1])
@@ -145,6 +151,7 @@ class Record:
             status=placed(self.status, Code.INADMISSIBLE),
             steps=placed(self.steps, 0),
             iterations=placed(self.iterations, 0),
+            rejected=placed(self.rejected, 0),
             x0=placed(x0),
             attitude=placed(attitude),
             attitude0=placed(attitude0),
@@ -168,7 +175,7 @@ class Alone:
             x = np.stack([record.x0[j], record.x[j]])
         else:
             x = record.path[j, : len(plain.t), :-2]
-        steps = np.minimum(np.diff(plain.t), record.course.h)
+        steps = np.minimum(np.diff(plain.t), record.rows["first_step"][j])
         energy = plain.energy_balance
         found = presented(
             system,
@@ -182,6 +189,7 @@ class Alone:
             status=plain.status,
             stats=plain.stats,
             provenance=plain.provenance,
+            event_time=plain.event_time,
         )
         return replace(found, provenance=plain.provenance)
 
@@ -189,11 +197,11 @@ class Alone:
 class FirstSteps:
     """Finds the local errors of first steps, and how the laws' functions are rounded there, when it is called."""
 
-    def __init__(self, record: Record, method: OneStepMethod, step_all: Callable, h: float):
+    def __init__(self, record: Record, method: OneStepMethod, step_all: Callable):
         some = spread(len(record.x0), STEPS_AGAIN)
         self.family, self.member, self.method = record.family.select(some), record.member, method
         self.x, self.distance = np.ascontiguousarray(record.x0[some]), record.rows["distance"][some]
-        self.h, self.start, self.step_all = h, record.course.start, step_all
+        self.h, self.start, self.step_all = record.rows["first_step"][some], record.course.start, step_all
 
     def __call__(self) -> Evidence:
         form, number = self.family.form, len(self.x)
@@ -204,8 +212,7 @@ class FirstSteps:
         told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
         if not told.any():
             return found
-        h = np.full((number, 1), self.h)
-        steps = np.concatenate([own, self.x, h, after["k"].reshape(number, -1)], axis=1)[told]
+        steps = np.concatenate([own, self.x, self.h[:, None], after["k"].reshape(number, -1)], axis=1)[told]
         errors = at_points(_first_errors, (form, self.method, len(own[0])), steps)
         relative = errors / np.fmax(moved, WHOLE * self.distance)[told]
         return replace(found, local_error=float(np.nan_to_num(relative).max()), error_time=self.start)

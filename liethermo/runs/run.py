@@ -117,9 +117,7 @@ class Run:
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
         numbers = self.system.dim * ((1 if save_at is None else 0) / every + (self.method.stages + 1 if dense else 0))
         outcome = run_stepwise(
-            self.system,
-            self.method,
-            self.engine.step,
+            self.engine,
             state,
             (start, end),
             step,

@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from ..engines.array import State
+from ..engines.choice import Chosen
 from ..engines.codes import Code
+from ..engines.pace import CAUGHT
+from ..engines.paces import Guide
 from ..errors import InputError
-from ..systems import System
-from .adaptive import UNDERFLOW, Adaptive, Control, Growth, allowed_error, first_step, judged
+from .adaptive import UNDERFLOW, Adaptive, pacing_of
 from .events import Event, located
 from .timetable import Timetable
 
@@ -37,10 +40,8 @@ class Outcome:
 
 
 def run(
-    system: System,
-    method,
-    advance: Callable,
-    state,
+    engine: Chosen,
+    state: State,
     span: tuple[float, float],
     step: float | Adaptive,
     stops: np.ndarray,
@@ -52,10 +53,8 @@ def run(
 
     Parameters
     ----------
-    advance : function from (state, h) to the state after a step
-        As an engine's ``stepping`` gives it.
     state : State
-        As its ``begin`` gives it.
+        As the engine's ``begin`` gives it.
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
     keep : function of (t, end, h, state before, state after)
@@ -63,76 +62,91 @@ def run(
     most_kept : float
         Adaptive steps after which there is no room for more.
     """
-    t, end = span
-    adaptive, shortest = step if isinstance(step, Adaptive) else None, UNDERFLOW * (end - t)
-    control, growth = Control(step, method.order, first_step(state, end - t)), Growth(system, method)
-    value = event(np.asarray(state.x)) if event else 0.0
-    outcome, stop, table, tried = Outcome(state), -1, None, 0
+    outcome, stops = Outcome(state), stops[stops > span[0]]
     try:
-        if adaptive is not None:
-            control.h = min(control.h, judged(growth, system, method, state, state, control.h)[1])
-        while t < end:
-            if stop < 0 or stops[stop] <= t:
-                stop += 1
-                continue
-            if adaptive is None:
-                if table is None or table.end <= t:
-                    table, since = Timetable((t, float(stops[stop])), step, None), int(state.step)
-                n = int(state.step) - since
-                h, reached = table.h if n < table.full else table.last, table.time(n + 1)
-            else:
-                h, arrives = _fitted(control, t, stops[stop])
-                reached = float(stops[stop]) if arrives else t + h
-                if tried >= adaptive.most_steps or int(state.step) >= most_kept:
-                    outcome.limit = "steps" if tried >= adaptive.most_steps else "memory"
-                    return outcome
-            new = advance(state, h)
-            tried += 1
-            if adaptive is not None:
-                error, longest = math.inf, math.inf
-                if int(new.status) == Code.COMPLETED:
-                    found, longest = judged(growth, system, method, state, new, h)
-                    error = found / allowed_error(adaptive, state, new)
-                if not error <= 1.0 or h > 1.1 * longest:
-                    outcome.rejected += 1
-                    if not error <= 1.0:
-                        control.reject(error, h)
-                    control.h = min(control.h, longest)
-                    if control.h < shortest:
-                        outcome.underflow = control.h
-                        outcome.state = new if int(new.status) != Code.COMPLETED else state
-                        return outcome
-                    continue
-                control.accept(error, h)
-                control.h = min(control.h, growth.longest(control.h))
-            if int(new.status) != Code.COMPLETED:
-                outcome.state = new
-                return outcome
-            after = event(np.asarray(new.x)) if event else 0.0
-            if event and event.happens(value, after):
-                h, new = located(event, advance, system, method, state, new, h, value, after)
-                if h > shortest:
-                    keep(t, t + h, h, state, new)
-                    outcome.state = new
-                outcome.event_time = t + h
-                return outcome
-            keep(t, reached, h, state, new)
-            t = reached
-            outcome.state = state = new
-            value = after
+        if isinstance(step, Adaptive):
+            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept)
+        else:
+            _fixed(engine, outcome, span, step, stops, event, keep)
     except KeyboardInterrupt:
         outcome.interrupted = True
     return outcome
 
 
-def _fitted(control: Control, t: float, stop: float) -> tuple[float, bool]:
-    """The next step, so that none ends just short of a stop; and whether it ends there."""
-    left = stop - t
-    if left <= control.h * (1 + 1e-12):
-        return left, True
-    if left < 2.0 * control.h:
-        return 0.5 * left, False
-    return control.h, False
+def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep, most_kept) -> None:
+    """By the paces that ensembles have too: attempt by attempt."""
+    length = span[1] - span[0]
+    pacing = pacing_of(step, engine.method, length, event)
+    paces = engine.paces(pacing, np.asarray(outcome.state.x), span[0], float(stops[0]), length)
+    guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
+
+    def told(name: str) -> float:
+        return float(paces.read(name)[0])
+
+    while True:
+        guide.resume()
+        code, t = int(told("status")), told("t")
+        if code == CAUGHT and event is not None:
+            _happened(engine, outcome, event, keep, t, told("taken"), float(pacing.shortest))
+        if code != Code.COMPLETED:
+            break
+        if int(outcome.state.step) >= most_kept:
+            outcome.limit = "memory"
+            return
+        paces.follow(1)
+        outcome.rejected = int(told("rejected"))
+        if told("step") > int(outcome.state.step):
+            before, outcome.state = outcome.state, State(*(paces.read(name)[0] for name in State._fields))
+            outcome.state = outcome.state._replace(status=np.int64(0))
+            keep(t, told("t"), told("taken"), before, outcome.state)
+    if code == Code.STEP_LIMIT:
+        outcome.limit = "steps"
+    elif code == Code.STEP_UNDERFLOW:
+        outcome.underflow = told("wish")
+        outcome.state = outcome.state._replace(status=np.int64(told("cause")), residual=told("residual"))
+
+
+def _fixed(engine, outcome: Outcome, span, step: float, stops, event, keep) -> None:
+    t, shortest = span[0], UNDERFLOW * (span[1] - span[0])
+    value = event(np.asarray(outcome.state.x)) if event else 0.0
+    for stop in map(float, stops):
+        table, since = Timetable((t, stop), step, None), int(outcome.state.step)
+        while t < table.end:
+            n, state = int(outcome.state.step) - since, outcome.state
+            h, reached = table.h if n < table.full else table.last, table.time(n + 1)
+            new = engine.step(state, h)
+            if int(new.status) != Code.COMPLETED:
+                outcome.state = new
+                return
+            after = event(np.asarray(new.x)) if event else 0.0
+            if event and event.happens(value, after):
+                _happened(engine, outcome, event, keep, t, h, shortest)
+                return
+            keep(t, reached, h, state, new)
+            t, outcome.state, value = reached, new, after
+
+
+def _happened(engine, outcome: Outcome, event: Event, keep, t: float, h: float, shortest: float) -> None:
+    """The step of at most h that ends where the event happens."""
+    state = outcome.state
+    whole = engine.step(state, h)
+
+    def value(shares: np.ndarray, places: np.ndarray) -> np.ndarray:
+        del places
+        end = engine.step(state, shares[0] * h)
+        found = event(np.asarray(end.x)) if int(end.status) == Code.COMPLETED else math.nan
+        if not math.isfinite(found):  # a part of the step that fails is replaced by the polynomial of the whole
+            weights = engine.method.weights(shares[0])
+            v = h * weights @ np.asarray(whole.k)
+            found = event(np.asarray(engine.method.along(engine.system, np.asarray(state.x), v)))
+        return np.array([found])
+
+    ends = (np.array([event(np.asarray(s.x))]) for s in (state, whole))
+    share = float(located(value, *ends)[0])
+    if share * h > shortest:
+        outcome.state = whole if share == 1.0 else engine.step(state, share * h)
+        keep(t, t + share * h, share * h, state, outcome.state)
+    outcome.event_time = t + share * h
 
 
 def stops_of(save_at, start: float, end: float) -> np.ndarray:

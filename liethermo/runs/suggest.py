@@ -10,10 +10,11 @@ from itertools import pairwise
 import numpy as np
 
 from ..engines.choice import Chosen
+from ..engines.pace import GROWTH
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, OneStepMethod
 from ..systems import DrivenSystem, System, driven
-from .adaptive import GROWTH, Adaptive
+from .adaptive import Adaptive
 from .stepwise import run
 
 
@@ -151,7 +152,7 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
     with contextlib.suppress(_EnoughError):
         engine = Chosen(system, used, "auto", 1)
         state = engine.begin(x)
-        run(system, used, engine.step, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+        run(engine, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
         raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < 0.9 * GROWTH * a), len(taken) - 1)

@@ -12,9 +12,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...integrators import OneStepMethod
-from ...systems import System
-
 
 @dataclass(frozen=True)
 class Form:
@@ -34,8 +31,8 @@ class Form:
     rebuild: Callable[[list], Any] = field(compare=False)
 
     @classmethod
-    def of(cls, system: System | OneStepMethod) -> Form:
-        """The form of a system or method, its parameters being the arrays among its leaves."""
+    def of(cls, system: eqx.Module) -> Form:
+        """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
         dynamic, static = eqx.partition(system, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         functions, outline = jax.tree_util.tree_flatten(static)
@@ -57,7 +54,7 @@ class Form:
         return self.rebuild(arrays)
 
 
-def numbers_of(tree: System | OneStepMethod) -> np.ndarray:
-    """The parameters of a system or a method, shape (p,)."""
+def numbers_of(tree: eqx.Module) -> np.ndarray:
+    """The parameters of a system, a method or a pacing, shape (p,)."""
     leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
     return np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])

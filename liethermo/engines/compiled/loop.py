@@ -137,7 +137,7 @@ class _Steps(Writer):
         """``begin(p, blocks, count)``: from the x of each trajectory the state of a run about to start there."""
         with self.counted(self.argument["count"]) as i:
             self.enter(i)
-            self.load(("x",))
+            self.load([name for name in self.pieces["begin"].arguments if name != "p"])
             self.run("begin")
             self.save([name for name in self.state if name in self.pieces["begin"].results])
         self.builder.ret_void()

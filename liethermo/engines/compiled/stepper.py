@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,14 @@ class CompiledEngine:
 
     def _state(self, blocks: np.ndarray) -> State:
         return State(*(value[0] for value in self._stepper.fields(blocks).values()))
+
+
+class Spec(NamedTuple):
+    """A function that becomes a program, and the names of its arguments and results."""
+
+    function: Callable
+    arguments: str
+    results: tuple[str, ...]
 
 
 class Stepper:
@@ -144,26 +152,37 @@ class Stepper:
         self._shapes |= dict.fromkeys(("k", "before", "guess", "old", "new", "direction", "changes"), (stages, n))
 
         after = ("converged", "going")
-        pieces = {
-            "prepare": self._piece(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
-            "iterate": self._piece(iterate, f"p dW x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
-            "conclude": self._piece(
-                conclude, f"p h guess update converged defined made newtons noise {' '.join(FIELDS)}", FIELDS
-            ),
+        solved = "h guess update converged defined made newtons noise"
+        programs = {
+            "begin": Spec(begin, "p x", FIELDS),
+            "prepare": Spec(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
+            "iterate": Spec(iterate, f"p dW x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
+            "conclude": Spec(conclude, f"p {solved} {' '.join(FIELDS)}", FIELDS),
         }
-        self._pieces = pieces
-        self._start = self._piece(begin, "p x", FIELDS)
+        self._pieces = {name: self._piece(*spec) for name, spec in self._programs(programs).items()}
         own_size = int(varies.sum())
         working = (*ITERATION, *after, "defined", "newtons", "noise")
-        shapes = {name: self._shapes.get(name, ()) for name in (*FIELDS, "h", "dW")} | {"p": (own_size,)}
+        shapes = {name: self._shapes.get(name, ()) for name in (*self.names, "h", "dW", *self.passed)} | {
+            "p": (own_size,)
+        }
         shapes |= {name: self._shapes.get(name, ()) for name in working}
         # Newton's method is handed these in the block; without it they stay in registers
         self._layout = Layout(shapes, working if method.explicit else ())
 
+    names: tuple[str, ...] = FIELDS
+    """The fields of a trajectory."""
+
+    passed: tuple[str, ...] = ()
+    """What its programs hand to each other besides."""
+
+    def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
+        """The programs of a step, for what makes more of them."""
+        return programs
+
     @property
     def operations(self) -> int:
         """Scalar operations of a step with one iteration."""
-        return sum(len(piece.program.instructions) for piece in self._pieces.values())
+        return sum(len(piece.program.instructions) for name, piece in self._pieces.items() if name != "begin")
 
     def _piece(self, function: Callable, arguments: str, results: tuple[str, ...]) -> Piece:
         names = arguments.split()
@@ -173,22 +192,30 @@ class Stepper:
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
-    def begin(self, parameters, x: np.ndarray) -> np.ndarray:
+    def begin(self, parameters, x: np.ndarray, **fields: np.ndarray) -> np.ndarray:
         """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
 
         ``parameters`` has shape (p,), or (trajectories, p) where some vary.
         """
-        blocks = self.blocks({"x": x}, parameters)
+        blocks = self.blocks({"x": x, **fields}, parameters)
         first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
-        status = self._part(blocks, "status").copy()
+        status = self.part(blocks, "status")
+        empty = status == EMPTY
         self._code()[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
-        self._part(blocks, "status")[...] = status  # empty lanes stay empty
+        status[empty] = EMPTY
         return blocks
 
-    def _part(self, blocks: np.ndarray, name: str) -> np.ndarray:
-        """A field of blocks, shape (blocks, entries, lanes)."""
-        first, size = self._layout.rows[name], self._layout.sizes[name]
-        return blocks.reshape(len(blocks), self._layout.height, self.lanes)[:, first : first + size]
+    def part(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
+        """A field of blocks, or all rows of them, shape (blocks, entries, lanes)."""
+        whole = blocks.reshape(len(blocks), self._layout.height, self.lanes)
+        if name is None:
+            return whole
+        first = self._layout.rows[name]
+        return whole[:, first : first + self._layout.sizes[name]]
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Of a field of one trajectory."""
+        return self._shapes.get(name, ())
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields of :class:`.array.State`, trajectories first."""
@@ -198,42 +225,44 @@ class Stepper:
                 first = self._layout.rows[name]
                 whole[0, first : first + self._layout.sizes[name]] = np.ravel(values[0])
             return whole
-        number, lanes, rows = len(fields["x"]), self.lanes, self._layout.rows
-        count = -(-number // lanes)
-        blocks = np.zeros((count, self._layout.height, lanes))
-
-        def fill(first, values):
-            values = np.asarray(values, dtype=np.float64).reshape(number, -1)
-            if number < count * lanes:  # some lanes stay empty
-                values = np.concatenate([values, np.repeat(values[-1:], count * lanes - number, axis=0)])
-            blocks[:, first : first + values.shape[1]] = values.reshape(count, lanes, -1).swapaxes(1, 2)
-
+        number, rows = len(fields["x"]), self._layout.rows
+        whole = np.zeros((number, self._layout.height))
         for name, values in fields.items():
-            fill(rows[name], values)
-        if self._varies.any():
-            fill(rows["p"], parameters[:, self._varies])
-        blocks[-1, rows["status"], lanes - (count * lanes - number) :] = EMPTY
-        return blocks.reshape(count, -1)
+            whole[:, rows[name] : rows[name] + self._layout.sizes[name]] = np.reshape(values, (number, -1))
+        if self._varies.any() and "p" not in fields:
+            whole[:, rows["p"] : rows["p"] + self._layout.sizes["p"]] = parameters[:, self._varies]
+        return self.of_rows(whole)
 
-    def fields(self, blocks: np.ndarray, names: Sequence[str] = FIELDS) -> dict[str, np.ndarray]:
-        """Fields of :class:`.array.State`, trajectories first, those of empty lanes among them."""
+    def of_rows(self, whole: np.ndarray) -> np.ndarray:
+        """Blocks of trajectories from all their rows, shape (trajectories, rows)."""
+        number, lanes = len(whole), self.lanes
+        count = -(-number // lanes)
+        if number < count * lanes:  # some lanes stay empty
+            whole = np.concatenate([whole, np.repeat(whole[-1:], count * lanes - number, axis=0)])
+            whole[number:, self._layout.rows["status"]] = EMPTY
+        return np.ascontiguousarray(whole.reshape(count, lanes, -1).swapaxes(1, 2)).reshape(count, -1)
+
+    def fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Fields of trajectories, trajectories first, those of empty lanes among them."""
         found = {}
-        for name in names:
-            values = self._part(blocks, name).swapaxes(1, 2)
+        for name in self.names if names is None else names:
+            values = self.part(blocks, name).swapaxes(1, 2)
             found[name] = values.reshape(len(blocks) * self.lanes, *self._shapes.get(name, ()))
         return found
 
-    def run(self, parameters, blocks: np.ndarray, h: float, saves: int, every: int, noise=None) -> np.ndarray:
+    def run(
+        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, every: int, noise=None
+    ) -> np.ndarray:
         """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
 
+        The size is one for all, or one for each lane, those of empty ones among them.
         ``noise`` has the increments, shape (trajectories, steps, increments), of a method that is driven by any.
 
         Returns, at each save, every trajectory's state, energy and entropy: shape (trajectories, saves, n + 2), with
         those of empty lanes, and undefined after a failure.
         """
         n, lanes, count = self._shapes["x"][0], self.lanes, len(blocks)
-        start = self._layout.rows["h"] * lanes
-        blocks[:, start : start + lanes] = h
+        self.part(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
         out, done = np.empty((count, saves, (n + 2) * lanes)), np.zeros(count, dtype=np.int64)
         saves, every = int(saves), int(every)
@@ -259,8 +288,8 @@ class Stepper:
         """The functions ``begin`` and ``advance``, compiled or found compiled."""
         with self._lock:
             if self._functions is None:
-                pieces = self._pieces | {"begin": self._start}
-                code = step_loop(pieces, self._layout, (*FIELDS, "h"), self._varies, self.lanes, self._explicit)
+                state = (*self.names, "h")
+                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self._explicit)
                 self._loaded = code  # unloaded with this object
                 self._functions = BEGIN(code.address("begin")), ADVANCE(code.address("advance"))
             return self._functions
@@ -288,7 +317,7 @@ EMPTY = 9.0
 STEPPERS = 128
 """Forms whose loops are held in memory."""
 
-_steppers: Latest[Stepper] = Latest(STEPPERS)
+_steppers: Latest[Any] = Latest(STEPPERS)
 
 
 def stepper_of(
@@ -309,9 +338,19 @@ def stepper_of(
         Of a system of that form, then of the method: see :func:`numbers_of`.
     """
     own, varies = Form.of(method), np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    key = key_of((form, own), parameters, varies, lanes, rules)
+    return remembered_stepper(key, lambda: Stepper(form, own, parameters, method, lanes, varies, rules))
+
+
+def key_of(forms: Sequence[Form], parameters: np.ndarray, varies: np.ndarray, lanes: int, rules: Rules) -> tuple:
+    """What tells a stepper from others."""
     known = (parameters == 0.0) & ~varies
-    key = (form.key, form.shapes, own.key, own.shapes, known.tobytes(), lanes, varies.tobytes(), rules)
-    return _steppers.find(key, lambda: Stepper(form, own, parameters, method, lanes, varies, rules))
+    return *((form.key, form.shapes) for form in forms), known.tobytes(), varies.tobytes(), lanes, rules
+
+
+def remembered_stepper(key: tuple, make: Callable[[], Any]) -> Any:
+    """The stepper with a key, made where there is none."""
+    return _steppers.find(key, make)
 
 
 @remembered

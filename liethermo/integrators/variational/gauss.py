@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
 from manifolds.matrices.linear import solve
 
 from ...systems import SimpleClosedSystem, System
-from ..base import GaussMethod, checked_stages, register
+from ..base import ONE_SIZE, GaussMethod, checked_stages, register
 from ..tableaus import gauss
 from .schemes import need_simple_closed, velocity_slope
 
@@ -36,6 +38,7 @@ class VariationalGauss(GaussMethod):
     """
 
     systems = "simple closed systems"
+    fixed: ClassVar[str] = ONE_SIZE
 
     def __init__(self, stages: int = 2):
         self.number = checked_stages(stages)

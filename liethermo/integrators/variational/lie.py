@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from manifolds.matrices.linear import solve
 from ...errors import InputError
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import program
-from ..base import OneStepMethod, register
+from ..base import ONE_SIZE, OneStepMethod, register
 
 NEWTON_STEPS = 20
 """For the velocities between the states of a finished run."""
@@ -37,6 +39,7 @@ class LieVariational(OneStepMethod):
     """
 
     systems = "Euler-Poincaré systems with entropy"
+    fixed: ClassVar[str] = ONE_SIZE
 
     @property
     def stages(self) -> int:

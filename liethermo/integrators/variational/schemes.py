@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from ...errors import InputError
 from ...systems import SimpleClosedSystem, System
 from ...tracing.interpret import polynomial_degree
 from ...tracing.programs import program
-from ..base import OneStepMethod, register
+from ..base import ONE_SIZE, OneStepMethod, register
 from .discrete import DiscreteSystem, FiniteDifference, Pair
 
 CONSTRAINT_TOLERANCE = 1e-10
@@ -58,6 +58,7 @@ class VariationalIntegrator(OneStepMethod):
     """
 
     systems = "simple closed systems"
+    fixed: ClassVar[str] = ONE_SIZE
 
     phi: tuple[FiniteDifference, ...]
     forces: tuple[FiniteDifference, ...]

@@ -10,7 +10,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.compiled import stepper as compiled
-from liethermo.runs.adaptive import Control
+from liethermo.engines.pace import after_bad, after_good
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -115,13 +115,15 @@ def test_steps_do_not_chatter():
 
 def test_control():
     """On an error that follows h^(order + 1) the step tends to the one with the error wanted, and stays."""
-    control = Control(lt.Adaptive(1e-6), order=4, first=1e-5)
+    wish, power = 1e-5, 1 / 5
     for _ in range(60):
-        h = control.h
+        h = wish
         error = (h / 0.1) ** 5
-        control.accept(error, h) if error <= 1.0 else control.reject(error, h)
-    assert 0.05 < control.h <= 0.1
-    assert control.h == h
+        wish = float(after_good(error, h, h, power, np.inf) if error <= 1.0 else after_bad(error, h, power))
+    assert 0.05 < wish <= 0.1
+    assert wish == h
+    assert float(after_good(1e-9, 0.01 * wish, wish, power, np.inf)) == wish  # cut short, it says nothing
+    assert float(after_bad(np.inf, wish, power)) == 0.25 * wish
 
 
 @pytest.mark.slow

@@ -1,0 +1,154 @@
+"""Steps of sizes of their own in the compiled engine: the loop of :mod:`.stepper`, a pass being an attempt."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...integrators import OneStepMethod
+from ...systems import System
+from .. import pace
+from ..array import State
+from ..pace import Pace, Pacing
+from ..rules import RULES, Rules
+from .form import Form, numbers_of
+from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper, stepper_for
+
+OWN = tuple(name for name in Pace._fields if name != "state")
+NAMES = (*FIELDS, *OWN)
+assert not {*NAMES} & {*ITERATION}
+
+
+class PacedStepper(Stepper):
+    """The loop of one method, with steps chosen in one way, on systems of one form.
+
+    Parameters
+    ----------
+    form, own, way : Form
+        Of the system, the method and the pacing; their parameters lie one after another.
+    seen : tuple of int
+        The shape of what a pace knows of the motion nearby.
+    others
+        As for :class:`.stepper.Stepper`.
+    """
+
+    names, passed = NAMES, ("reached", "length")
+
+    def __init__(self, form: Form, own: Form, way: Form, parameters, method, seen: tuple, lanes, varies, rules):
+        self._way, self._seen, self._skip = way, seen, form.size + own.size
+        super().__init__(form, own, parameters, method, lanes, varies, rules)
+
+    def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
+        self._shapes["seen"] = self._seen
+        both, way, skip = self._both, self._way, self._skip
+
+        def joined(fields) -> Pace:
+            named = dict(zip(NAMES, fields, strict=True))
+            return Pace(State(*(named[name] for name in FIELDS)), *(named[name] for name in OWN))
+
+        def split(found: Pace) -> tuple:
+            return *found.state, *found[1:]
+
+        def begin(p, x, t, stop, length):
+            return split(pace.begun(*both(p), way.build(p[skip:]), x, t, stop, length))
+
+        def prepare(p, k, before, *fields):
+            return *programs["prepare"].function(p, k, before), *pace.fitted(way.build(p[skip:]), joined(fields))
+
+        def conclude(p, reached, *rest):
+            given = rest[: -len(OWN)]
+            h, state = given[0], State(*given[-len(FIELDS) :])
+            before = Pace(state, *rest[-len(OWN) :])
+            new = State(*programs["conclude"].function(p, *given))
+            return split(pace.judged(*both(p), way.build(p[skip:]), before, h, reached, new))
+
+        fields, solved = " ".join(NAMES), programs["conclude"].arguments.removeprefix("p ")
+        return {
+            "begin": Spec(begin, "p x t stop length", NAMES),
+            "prepare": Spec(prepare, f"p k before {fields}", (*programs["prepare"].results, "h", "reached")),
+            "iterate": programs["iterate"],
+            "conclude": Spec(conclude, f"p reached {solved} {' '.join(OWN)}", NAMES),
+        }
+
+
+def paced_stepper_of(
+    form: Form,
+    parameters: np.ndarray,
+    method: OneStepMethod,
+    pacing: Pacing,
+    lanes: int = 1,
+    varies: np.ndarray | None = None,
+    rules: Rules = RULES,
+) -> tuple[PacedStepper, np.ndarray]:
+    """The stepper for systems of a form, a method and a pacing, and the parameters of all three.
+
+    ``parameters`` and ``varies`` are those of system and method.
+    """
+    own, way = Form.of(method), Form.of(pacing)
+    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    whole = np.append(parameters, numbers_of(pacing))
+    varies = np.append(varies, np.zeros(len(whole) - len(varies), dtype=bool))
+
+    def make() -> PacedStepper:
+        seen = pace.shape_seen(form.build(parameters), method, pacing)
+        return PacedStepper(form, own, way, whole, method, seen, lanes, varies, rules)
+
+    return remembered_stepper(key_of((form, own, way), whole, varies, lanes, rules), make), whole
+
+
+class LanePaces:
+    """Trajectories in lanes, each with a pace of its own: what :class:`..paces.Paces` asks for.
+
+    Parameters
+    ----------
+    stepper : PacedStepper
+    plain : Stepper
+        Takes steps of any size from their states.
+    first : array, shape (p,)
+        The parameters of one of them, those of the method and the pacing among them.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    t, stop, length : float
+        See :func:`..pace.begun`.
+    """
+
+    def __init__(self, stepper: PacedStepper, plain: Stepper, first, parameters, x: np.ndarray, t, stop, length):
+        self.stepper, self.plain, self.first, self.number = stepper, plain, first, len(x)
+        each = {name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop", stop), ("length", length))}
+        self.blocks = stepper.begin(parameters, x, **each)
+
+    def follow(self, most: int) -> None:
+        self.stepper.run(self.first, self.blocks, 0.0, 1, most)
+
+    def read(self, name: str, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
+        if isinstance(chosen, slice):
+            return self.stepper.fields(self.blocks, (name,))[name][: self.number][chosen].copy()
+        block, lane = np.divmod(chosen, self.stepper.lanes)
+        values = self.stepper.part(self.blocks, name)[block, :, lane]
+        return values if name == "p" else values.reshape(len(chosen), *self.stepper.shape(name))
+
+    def write(self, name: str, chosen: np.ndarray, values) -> None:
+        block, lane = np.divmod(chosen, self.stepper.lanes)
+        self.stepper.part(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
+
+    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+        """The fields of the states after steps of these sizes from those that some have."""
+        fields = {name: self.read(name, chosen) for name in FIELDS} | {"status": np.zeros(len(chosen))}
+        blocks = self.plain.blocks(fields | {"p": self.read("p", chosen)})
+        sizes = np.resize(h, len(blocks) * self.plain.lanes)
+        self.plain.run(self.first, blocks, sizes, 1, 1)
+        return {name: values[: len(chosen)] for name, values in self.plain.fields(blocks).items()}
+
+    def only(self, chosen: np.ndarray) -> None:
+        """Go on with some of them."""
+        block, lane = np.divmod(chosen, self.stepper.lanes)
+        rows = self.stepper.part(self.blocks)[block, :, lane]
+        self.blocks, self.number = self.stepper.of_rows(rows), len(chosen)
+
+
+def lane_pace(
+    system: System, method: OneStepMethod, pacing: Pacing, x, t: float, stop: float, length: float
+) -> LanePaces:
+    """One trajectory, a block by itself."""
+    plain, parameters = stepper_for(system, method)
+    stepper, whole = paced_stepper_of(Form.of(system), parameters, method, pacing)
+    return LanePaces(stepper, plain, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)

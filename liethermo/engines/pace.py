@@ -1,0 +1,330 @@
+"""Steps of sizes of their own: one attempt, how it is judged and what comes next, as functions that every engine runs.
+
+A run that looks at every step carries a :class:`Pace`. One attempt takes a step, judges it by its estimated error, and
+chooses the next. Where something is wanted that no engine does by itself, the run pauses: at a time where a state is
+kept, where what grows near the state has to be looked at, and where an event has happened on the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..integrators import OneStepMethod
+from ..systems import System
+from ..tracing.programs import program
+from . import array
+from .array import State
+from .codes import Code
+from .rules import RULES, Rules
+
+GROWTH = 3.0
+"""Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""
+
+SHRINKAGE = 0.2
+UNSOLVED = 0.25
+"""Smallest factor after a step of too large an error, and the factor after one that could not be solved."""
+
+SAFETY = 0.8
+
+DEADBAND = (0.9, 1.3)
+"""Factors for which the step is kept: changes that small are not worth a worse prediction, and would chatter."""
+
+GROWTH_ERROR = 2e-3
+"""Largest relative error of the rate at which a small deviation grows: what falls from an unstable rest does so in its
+time, to a few thousandths. The error of the state does not show it, as the deviation is no part of the state yet."""
+
+TURNING = 0.01
+"""Rate of growth of an oscillation, relative to its frequency, from which it counts: the derivative of a motion that
+goes on varies, and gives oscillations that nothing excites small rates of either sign."""
+
+CHANGED = 0.05
+"""Change of the derivative of the motion, relative to it, below which what grows is not looked for again."""
+
+ARRIVED, LOOKING, CAUGHT, FINISHED = 20, 21, 22, 23
+"""Why a run pauses, beside the :class:`Code` of how it ended: it is where steps had to end; what grows near its state
+is to be looked at; an event happens in the step that was tried; it is at its end."""
+
+
+class Pacing(eqx.Module):
+    """How steps are chosen and what is watched: parameters of a program, as those of a system are.
+
+    Attributes
+    ----------
+    rtol, atol, first, largest, shortest, most : array, shape ()
+        Tolerances; the first step to try, 0 where it is found; the longest and the shortest; how many are tried.
+    watched : pytree
+        The function ``(system, x)`` whose sign is watched, or None.
+    falling : bool
+        Whether it is watched for a fall alone.
+    adaptive : bool
+        Otherwise all steps are of the size ``first``, but for those that arrive where they have to.
+    """
+
+    rtol: jax.Array
+    atol: jax.Array
+    first: jax.Array
+    largest: jax.Array
+    shortest: jax.Array
+    most: jax.Array
+    watched: Any
+    falling: bool = eqx.field(static=True)
+    adaptive: bool = eqx.field(static=True)
+
+    def watch(self, system: System, x) -> jax.Array:
+        return jnp.zeros(()) if self.watched is None else self.watched(system, x)
+
+
+class Pace(NamedTuple):
+    """A run under way whose steps are looked at; its status is that of its state, or why it pauses."""
+
+    state: State
+    t: jax.Array
+    stop: jax.Array  # when a step has to end next
+    base: jax.Array  # when one had to last,
+    since: jax.Array  # and the steps taken until then
+    wish: jax.Array  # size of the next step, unless it has to end somewhere
+    taken: jax.Array  # size of the last one tried
+    tried: jax.Array
+    rejected: jax.Array
+    cause: jax.Array  # status of the last one tried
+    value: jax.Array  # of what is watched
+    growth: jax.Array  # rate of what grows fastest, when it was looked at last,
+    seen: jax.Array  # and how the motion stretched what lay near
+
+
+def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
+    """The pace of a run about to start at x; ``length`` is that of its whole span."""
+    state, zero = array.first_state(system, method, x), jnp.zeros(())
+    speed, size = jnp.max(jnp.abs(state.k)), jnp.max(jnp.abs(x))
+    moving = (speed > 0.0) & (size > 0.0)  # a hundredth of the time in which the state would change by its size
+    found = jnp.where(moving, jnp.minimum(length, 0.01 * size / jnp.where(moving, speed, 1.0)), 1e-3 * length)
+    wish = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
+    now = array.stretch(*method.judged(system, x)) if pacing.adaptive else jnp.zeros((1, 1))
+    pace = Pace(
+        state=state,
+        t=zero + t,
+        stop=zero + stop,
+        base=zero + t,
+        since=zero,
+        wish=wish,
+        taken=zero,
+        tried=zero,
+        rejected=zero,
+        cause=zero,
+        value=pacing.watch(system, x),
+        growth=zero,
+        seen=jnp.full_like(now, jnp.nan),
+    )
+    return held_back(method, pace, now) if pacing.adaptive else pace
+
+
+def shape_seen(system: System, method: OneStepMethod, pacing: Pacing) -> tuple[int, ...]:
+    """The shape of what a pace knows of the motion nearby."""
+    if not pacing.adaptive:
+        return 1, 1
+    x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
+    return jax.eval_shape(lambda x: array.stretch(*method.judged(system, x)), x).shape
+
+
+def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
+    """The size of the next step, so that none ends just short of where one has to end, and the time after it."""
+    if pacing.adaptive:
+        left = pace.stop - pace.t
+        arrives = left <= pace.wish * (1 + 1e-12)
+        h = jnp.where(arrives, left, jnp.where(left < 2.0 * pace.wish, 0.5 * left, pace.wish))
+        return h, jnp.where(arrives, pace.stop, pace.t + h)
+    # as a timetable has them
+    length, done = pace.stop - pace.base, pace.state.step - pace.since
+    full = jnp.floor(length / pace.wish * (1 + 1e-12))
+    last = pace.stop - (pace.base + full * pace.wish)
+    short = last > 1e-12 * length
+    arrives = done + 1.0 >= jnp.where(short, full + 1.0, full)
+    return jnp.where(done < full, pace.wish, last), jnp.where(arrives, pace.stop, pace.base + (done + 1.0) * pace.wish)
+
+
+def attempted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, rules: Rules = RULES) -> Pace:
+    """One attempt."""
+    h, reached = fitted(pacing, pace)
+    return judged(system, method, pacing, pace, h, reached, array.take_step(system, method, pace.state, h, rules))
+
+
+def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h, reached, new: State) -> Pace:
+    """The pace after an attempt: the step from it to the state ``new`` counts, or another is to be tried."""
+    old, solved, cause = pace.state, new.status == Code.COMPLETED, 1.0 * new.status
+    good, wish, code = solved, pace.wish, new.status
+    if pacing.adaptive:
+        size = jnp.maximum(jnp.max(jnp.abs(old.x)), jnp.max(jnp.abs(new.x)))
+        allowed = jnp.maximum(pacing.atol + pacing.rtol * size, RULES.vanished)
+        error = method.error(system, old.x, old.low, h, new.k) / allowed
+        error = jnp.where(solved, error, jnp.inf)
+        good = error <= 1.0
+        power = 1.0 / (method.order + 1)
+        wish = jnp.where(good, after_good(error, h, wish, power, pacing.largest), after_bad(error, h, power))
+        code = jnp.where(good | (wish >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
+    value = pacing.watch(system, new.x)
+    crosses = (pace.value > 0.0) & (value <= 0.0)
+    if not pacing.falling:
+        crosses = crosses | ((pace.value < 0.0) & (value >= 0.0))
+    caught = good & crosses & (pacing.watched is not None)
+    code = jnp.where(caught, CAUGHT, jnp.where(good & (reached >= pace.stop), ARRIVED, code))
+
+    def kept(after, before):
+        return jnp.where(good & ~caught, after, before)
+
+    state = jax.tree_util.tree_map(kept, new, old)
+    tried = pace.tried + 1.0
+    after = Pace(
+        state=state._replace(status=code.astype(old.status.dtype), residual=new.residual),
+        t=kept(reached, pace.t),
+        stop=pace.stop,
+        base=pace.base,
+        since=pace.since,
+        wish=jnp.where(caught, pace.wish, wish),
+        taken=h,
+        tried=tried,
+        rejected=pace.rejected + jnp.where(good, 0.0, 1.0),
+        cause=cause,
+        value=kept(value, pace.value),
+        growth=pace.growth,
+        seen=pace.seen,
+    )
+    if not pacing.adaptive:
+        return after
+    looked = held_back(method, after, array.stretch(*method.judged(system, new.x)))
+    after = jax.tree_util.tree_map(kept, looked, after)
+    spent = (tried >= pacing.most) & (after.state.status == Code.COMPLETED)
+    status = jnp.where(spent, Code.STEP_LIMIT, after.state.status).astype(old.status.dtype)
+    return after._replace(state=after.state._replace(status=status))
+
+
+# -- the size of the next step ----------------------------------------------------------------------------------------
+
+
+def after_good(error, h, wish, power: float, largest) -> jax.Array:
+    """The size of the next step, after one of size h whose error is this fraction of the allowed one, at most 1.
+
+    Small changes are left out, so that it does not chatter. A step that is cut short to end somewhere says little about
+    the next.
+    """
+    factor = jnp.clip(SAFETY * jnp.maximum(error, 1e-12) ** -power, SHRINKAGE, GROWTH)
+    proposed = jnp.minimum(h * factor, largest)
+    same = (DEADBAND[0] < factor) & (factor < DEADBAND[1])
+    return jnp.where(h < 0.99 * wish, jnp.maximum(wish, proposed), jnp.where(same, wish, proposed))
+
+
+def after_bad(error, h, power: float) -> jax.Array:
+    """The size of the next step after one with too large an error; infinity where its equations are not solved."""
+    finite = jnp.isfinite(error)
+    factor = jnp.maximum(SHRINKAGE, SAFETY * jnp.where(finite, jnp.maximum(error, 1.0), 1.0) ** -power)
+    return h * jnp.minimum(jnp.where(finite, factor, UNSOLVED), 0.9)
+
+
+# -- what grows -------------------------------------------------------------------------------------------------------
+
+
+def reach(method: OneStepMethod) -> float:
+    """Largest product of a step and a rate of growth: what grows near the state then does so to :data:`GROWTH_ERROR`.
+
+    A one-step method that solves a linear equation of rate r multiplies it by R(h r) in a step instead of exp(h r), and
+    one that damps or keeps what it does not resolve, as implicit ones do, sleeps through an instability in long steps.
+    R is taken to be the diagonal Padé approximation of the method's order.
+    """
+    s = max(1, method.order // 2)
+    constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
+    return (GROWTH_ERROR * constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / constant + ...
+
+
+def held_back(method: OneStepMethod, pace: Pace, now) -> Pace:
+    """No step longer than what grows near the state allows; a pause where that is not known.
+
+    ``now`` is how the motion stretches what lies near, as :func:`.array.stretch` finds it.
+    """
+    short = ~((reach(method) < size_of(now) * pace.wish) & jnp.isfinite(size_of(now)))
+    same = norm(now - pace.seen) <= CHANGED * norm(pace.seen)
+    limit = jnp.where(pace.growth > 0.0, reach(method) / jnp.where(pace.growth > 0.0, pace.growth, 1.0), jnp.inf)
+    unknown = ~short & ~same
+    paused = jnp.where(unknown & (pace.state.status == Code.COMPLETED), LOOKING, pace.state.status)
+    return pace._replace(
+        state=pace.state._replace(status=paused.astype(pace.state.status.dtype)),
+        wish=jnp.where(short | unknown, pace.wish, jnp.minimum(pace.wish, limit)),
+        seen=jnp.where(unknown, now, pace.seen),
+        growth=jnp.where(unknown, jnp.nan, pace.growth),
+    )
+
+
+def size_of(stretch) -> jax.Array:
+    """No eigenvalue of the linearised motion is larger: from its matrix, or about so from its powers."""
+    if stretch.shape[1] > array.FEW:
+        return jnp.sqrt(jnp.max(jnp.sum(stretch * stretch, axis=1)))
+    square = stretch @ stretch
+    return jnp.sqrt(jnp.sqrt(norm(square @ square)))
+
+
+def norm(matrix) -> jax.Array:
+    return jnp.sqrt(jnp.sum(matrix * matrix))
+
+
+def fastest(matrices: np.ndarray) -> np.ndarray:
+    """The sizes of the largest eigenvalues among those that grow, of matrices of shape (..., n, n)."""
+    finite = np.isfinite(matrices).all(axis=(-2, -1))
+    rates = np.linalg.eigvals(np.where(finite[..., None, None], matrices, 0.0))
+    return np.where(rates.real > TURNING * np.abs(rates), np.abs(rates), 0.0).max(axis=-1, initial=0.0)
+
+
+def rate_of(system: System, method: OneStepMethod, x, seen: np.ndarray) -> float:
+    """How fast what grows near a state does, ``seen`` being the stretch there."""
+    matrix = seen if seen.shape[1] <= array.FEW else np.asarray(array.growing(system, method, jnp.asarray(x)))
+    return float(fastest(matrix))
+
+
+# -- programs ---------------------------------------------------------------------------------------------------------
+
+
+@program
+def begin(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
+    return begun(system, method, pacing, x, t, stop, length)
+
+
+@program
+def follow(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules) -> Pace:
+    """The pace after so many attempts, or where it pauses."""
+    return followed(system, method, pacing, pace, most, rules)
+
+
+def followed(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules) -> Pace:
+    def goes_on(carry):
+        pace, made = carry
+        return (pace.state.status == Code.COMPLETED) & (made < most)
+
+    def again(carry):
+        pace, made = carry
+        return attempted(system, method, pacing, pace, rules), made + 1
+
+    return jax.lax.while_loop(goes_on, again, (pace, jnp.zeros((), dtype=jnp.int64)))[0]
+
+
+def follow_by(step: Callable, system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most: int) -> Pace:
+    """The same, by an engine whose steps are no program."""
+    for _ in range(most):
+        if int(pace.state.status) != Code.COMPLETED:
+            break
+        h, reached = _fitted(pacing, pace)
+        pace = _judged(system, method, pacing, pace, h, reached, step(pace.state, h))
+    return pace
+
+
+@program
+def _fitted(pacing, pace):
+    return fitted(pacing, pace)
+
+
+@program
+def _judged(system, method, pacing, pace, h, reached, new):
+    return judged(system, method, pacing, pace, h, reached, new)

@@ -1,0 +1,210 @@
+"""Trajectories with paces of their own, one or many, and what takes them on from pause to pause, for every engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..integrators import OneStepMethod
+from ..systems import System
+from ..tracing.programs import program
+from . import array, pace
+from .array import State
+from .codes import Code
+from .compiled.form import Form
+from .pace import ARRIVED, FINISHED, LOOKING, Pace, Pacing
+from .rules import RULES
+
+
+class Paces(Protocol):
+    """Trajectories that are followed together; each is what it would be alone."""
+
+    number: int
+
+    def follow(self, most: int) -> None:
+        """So many attempts of each, or as many as it takes until it pauses."""
+        ...
+
+    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
+        """A field of :class:`.array.State` or of :class:`.pace.Pace` of some of them, trajectories first."""
+        ...
+
+    def write(self, name: str, chosen: np.ndarray, values) -> None: ...
+
+    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+        """The fields of the states after steps of these sizes from those that some have."""
+        ...
+
+
+class _ArrayPaces:
+    """What the array engine's have in common; fields are read and written with trajectories first."""
+
+    number: int
+    pace: Pace
+
+    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
+        return self._field(name)[chosen]
+
+    def write(self, name: str, chosen: np.ndarray, values) -> None:
+        whole = self._field(name).copy()
+        whole[chosen] = values
+        self._put(name, whole)
+
+    def _field(self, name: str) -> np.ndarray:
+        state = self.pace.state
+        value = np.asarray(getattr(state if name in State._fields else self.pace, name))
+        return value.reshape(self.number, *value.shape[self._in_front :])
+
+    def _put(self, name: str, whole: np.ndarray) -> None:
+        value = jnp.asarray(whole if self._in_front else whole[0])
+        of_state = name in State._fields
+        changes: dict[str, Any] = {"state": self.pace.state._replace(**{name: value})} if of_state else {name: value}
+        self.pace = self.pace._replace(**changes)
+
+    _in_front = 1
+
+
+class SinglePaces(_ArrayPaces):
+    """One trajectory, by programs of its own; ``step`` takes a step of an engine whose steps are no program."""
+
+    _in_front = 0
+
+    def __init__(self, system: System, method: OneStepMethod, pacing: Pacing, step: Callable | None = None):
+        self.system, self.method, self.pacing, self._step, self.number = system, method, pacing, step, 1
+
+    def begin(self, x, t: float, stop: float, length: float) -> SinglePaces:
+        times = (jnp.asarray(float(time)) for time in (t, stop, length))
+        self.pace = pace.begin(self.system, self.method, self.pacing, jnp.asarray(x), *times)
+        return self
+
+    def continued(self, others: Paces) -> SinglePaces:
+        """From where another engine has come to."""
+        for name in (*State._fields, *Pace._fields[1:]):
+            whole = self._field(name)
+            self._put(name, np.asarray(others.read(name)).reshape(whole.shape).astype(whole.dtype))
+        return self
+
+    def follow(self, most: int) -> None:
+        if self._step is None:
+            number = jnp.asarray(most)
+            self.pace = pace.follow(self.system, self.method, self.pacing, self.pace, number, RULES)
+        else:
+            self.pace = pace.follow_by(self._step, self.system, self.method, self.pacing, self.pace, most)
+
+    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+        del chosen
+        state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))
+        step = self._step or (lambda state, h: _one(self.system, self.method, state, h))
+        return {name: np.asarray(value)[None] for name, value in step(state, jnp.asarray(h[0]))._asdict().items()}
+
+
+class VmapPaces(_ArrayPaces):
+    """All trajectories of a batch in one program."""
+
+    def __init__(self, form: Form, parameters, axes, method: OneStepMethod, pacing: Pacing, x, t, stop, length):
+        self.form, self.parameters, self.axes, self.method, self.pacing = form, parameters, axes, method, pacing
+        self.number = len(x)
+        times = (jnp.asarray(float(time)) for time in (t, stop, length))
+        self.pace = _begin_all(form, parameters, axes, method, pacing, jnp.asarray(x), *times)
+
+    def follow(self, most: int) -> None:
+        given = self.form, self.parameters, self.axes, self.method, self.pacing
+        self.pace = _follow_all(*given, self.pace, jnp.asarray(most))
+
+    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
+        sizes = np.ones(self.number)
+        sizes[chosen] = h
+        state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))
+        found = step_all(self.form, self.parameters, self.axes, self.method, state, jnp.asarray(sizes))
+        return {name: np.asarray(value)[chosen] for name, value in found._asdict().items()}
+
+
+@program
+def _one(system, method, state, h):
+    return array.take_step(system, method, state, h)
+
+
+@program
+def _begin_all(form, parameters, axes, method, pacing, x, t, stop, length):
+    def one(p, x):
+        return pace.begun(form.rebuild(p), method, pacing, x, t, stop, length)
+
+    return jax.vmap(one, in_axes=(axes, 0))(parameters, x)
+
+
+@program
+def _follow_all(form, parameters, axes, method, pacing, paces, most):
+    def one(p, own):
+        return pace.followed(form.rebuild(p), method, pacing, own, most, RULES)
+
+    return jax.vmap(one, in_axes=(axes, 0))(parameters, paces)
+
+
+@program
+def step_all(form, parameters, axes, method, state, h):
+    def one(p, state, h):
+        return array.take_step(form.rebuild(p), method, state, h)
+
+    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, h)
+
+
+# -- from pause to pause ----------------------------------------------------------------------------------------------
+
+
+class Guide:
+    """Takes trajectories on from their pauses.
+
+    Parameters
+    ----------
+    paces : Paces
+    pacing : Pacing
+    method : OneStepMethod
+    stops : array
+        Times at which steps have to end, increasing; the last is the end of the span.
+    member : function from a place to the system of that trajectory
+    """
+
+    def __init__(self, paces: Paces, pacing: Pacing, method: OneStepMethod, stops: np.ndarray, member: Callable):
+        self.paces, self.pacing, self.method, self.stops, self.member = paces, pacing, method, stops, member
+
+    def paused(self, why: int) -> np.ndarray:
+        """The places of those that pause for a reason."""
+        return np.flatnonzero(self.paces.read("status") == why)
+
+    def resume(self) -> None:
+        """Those at a stop are done or go on to the next, and what grows near a state is looked at."""
+        paces, status = self.paces, self.paces.read("status")
+        there = np.flatnonzero(status == ARRIVED)
+        if there.size:
+            t = paces.read("t", there)
+            done = t >= self.stops[-1]
+            paces.write("status", there[done], FINISHED)
+            there, t = there[~done], t[~done]
+        if there.size:
+            paces.write("base", there, t)
+            paces.write("since", there, paces.read("step", there))
+            paces.write("stop", there, self.stops[np.searchsorted(self.stops, t, side="right")])
+        waiting = np.concatenate([there, np.flatnonzero(status == LOOKING)])
+        if not waiting.size:
+            return
+        unknown = waiting[np.isnan(paces.read("growth", waiting))]
+        if unknown.size:
+            self._look(unknown)
+        spent = paces.read("tried", waiting) >= float(self.pacing.most)
+        paces.write("status", waiting, np.where(spent, Code.STEP_LIMIT, Code.COMPLETED))
+
+    def _look(self, chosen: np.ndarray) -> None:
+        seen, paces = self.paces.read("seen", chosen), self.paces
+        if seen.shape[2] <= array.FEW:
+            rates = pace.fastest(seen)
+        else:
+            x = paces.read("x", chosen)
+            found = [pace.rate_of(self.member(int(i)), self.method, x[j], seen[j]) for j, i in enumerate(chosen)]
+            rates = np.array(found)
+        longest = np.divide(pace.reach(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
+        paces.write("growth", chosen, rates)
+        paces.write("wish", chosen, np.minimum(paces.read("wish", chosen), longest))

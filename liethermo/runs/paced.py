@@ -1,0 +1,165 @@
+"""Many trajectories with steps of their own, or with events: from pause to pause, each as it would be alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from ..engines.codes import Code
+from ..engines.compiled.form import Form, numbers_of
+from ..engines.compiled.paced import LanePaces, paced_stepper_of
+from ..engines.pace import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
+from ..engines.paces import Guide, Paces, VmapPaces
+from ..integrators import OneStepMethod
+from ..tracing.interpret import at_points
+from .batches import ARRAY_BATCH, KEPT_AFTER, KEPT_BEFORE, LANES, Lanes, Tally, by_threads
+from .events import Event, located
+from .family import Family
+from .record import Record
+
+ATTEMPTS = (16, 2048)
+"""Attempts in a call of an engine, at least and at most: those that pause wait for the others' to be made."""
+
+WORK = 2**15
+"""Attempts in a call, of all trajectories together, between these: a few milliseconds."""
+
+
+class Many:
+    """The paces of an ensemble.
+
+    Parameters
+    ----------
+    family : Family
+    method : OneStepMethod
+    pacing : Pacing
+    event : Event, optional
+    record : Record
+    stops : array
+        Times at which steps have to end, increasing; the last is the end of the span.
+    tally : Tally
+    """
+
+    def __init__(
+        self, family: Family, method: OneStepMethod, pacing: Pacing, event, record: Record, stops, tally: Tally
+    ):
+        self.family, self.method, self.pacing, self.record, self.tally = family, method, pacing, record, tally
+        self.event: Event | None = event
+        self.interrupted = False
+        self.stops = stops[stops > record.course.start]
+
+    @property
+    def _times(self) -> tuple[float, float, float]:
+        course = self.record.course
+        return course.start, float(self.stops[0]), course.end - course.start
+
+    def run_compiled(self) -> None:
+        """In lanes over threads; those that are at their end leave their lanes to others."""
+        lanes, size = Lanes(self.family, self.method), len(self.record.x0)
+        stepper, whole = paced_stepper_of(self.family.form, lanes.first, self.method, self.pacing, LANES, lanes.varies)
+        added = numbers_of(self.pacing)
+
+        def work(chosen: slice, stop: threading.Event) -> None:
+            number = chosen.stop - chosen.start
+            own = lanes.parameters(chosen, number)
+            own = whole if own.ndim == 1 else np.hstack([own, np.broadcast_to(added, (number, len(added)))])
+            paces = LanePaces(stepper, lanes.stepper, whole, own, self.record.x0[chosen], *self._times)
+            self._follow(paces, np.arange(chosen.start, chosen.stop), paces.only, stop.is_set)
+
+        by_threads(work, size)
+
+    def run_array(self) -> None:
+        """All of a batch in one program."""
+        size = len(self.record.x0)
+        for start in range(0, size, ARRAY_BATCH):
+            chosen = slice(start, min(start + ARRAY_BATCH, size))
+            parameters, axes = self.family.batched(chosen)
+            given = self.family.form, parameters, axes, self.method, self.pacing
+            paces = VmapPaces(*given, self.record.x0[chosen], *self._times)
+            self._follow(paces, np.arange(chosen.start, chosen.stop), None, lambda: self.interrupted)
+
+    def _follow(self, paces: Paces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
+        """Trajectories with these places, to the ends of all."""
+        record = self.record
+        guide = Guide(paces, self.pacing, self.method, self.stops, lambda i: self.family.member(int(places[i])))
+        before = {name: paces.read(name).copy() for name in KEPT_BEFORE}
+        record.begin(places, before["x"], before["energy"], before["entropy"])
+        followed = np.ones(len(places), dtype=bool)
+        guide.resume()
+        record.rows["first_step"][places] = np.minimum(paces.read("wish"), self._times[2])
+
+        def finish(ended: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray) -> None:
+            at = {name: values[ended] for name, values in before.items()}
+            record.finish(places[ended], at, fields, status, end_time)
+            record.rejected[places[ended]] = paces.read("rejected", ended)
+
+        def fields_of(chosen: np.ndarray) -> dict[str, np.ndarray]:
+            return {name: paces.read(name, chosen) for name in KEPT_AFTER}
+
+        try:
+            while followed.any() and not stopped():
+                paces.follow(int(np.clip(WORK // len(places), *ATTEMPTS)))
+                there = guide.paused(ARRIVED)
+                if there.size:
+                    columns = [paces.read("x", there), *(paces.read(n, there)[:, None] for n in ("energy", "entropy"))]
+                    record.keep_at(places[there], paces.read("t", there), np.hstack(columns))
+                caught = np.setdiff1d(guide.paused(CAUGHT), np.flatnonzero(~followed))
+                if caught.size:
+                    fields, times = self._happened(paces, places, caught)
+                    finish(caught, np.full(caught.size, Code.EVENT), fields, times)
+                guide.resume()
+                status = paces.read("status")
+                ended = np.flatnonzero(followed & ~np.isin(status, (Code.COMPLETED, ARRIVED, CAUGHT, LOOKING)))
+                if ended.size:
+                    codes = np.where(status[ended] == FINISHED, Code.COMPLETED, status[ended])
+                    finish(ended, codes, fields_of(ended), paces.read("t", ended))
+                followed[ended] = followed[caught] = False
+                self.tally.add(ended.size + caught.size)
+                if only is not None and 2 * followed.sum() <= len(places) and followed.any():
+                    left = np.flatnonzero(followed)
+                    only(left)
+                    places, followed = places[left], followed[left]
+                    before = {name: values[left] for name, values in before.items()}
+        except KeyboardInterrupt:
+            self.interrupted = True
+        left = np.flatnonzero(followed)
+        if left.size:
+            finish(left, np.full(left.size, Code.INTERRUPTED), fields_of(left), paces.read("t", left))
+
+    def _happened(self, paces: Paces, places: np.ndarray, caught: np.ndarray):
+        """The fields of the states at events, and their times."""
+        assert self.event is not None
+        form, h = self.family.form, paces.read("taken", caught)
+        own = self.family.flat(places[caught], caught.size)
+        function, p = self.event.function, own.shape[1]
+        whole = paces.stepped(caught, h)
+        x = paces.read("x", caught)
+
+        def watched(x: np.ndarray, some: np.ndarray) -> np.ndarray:
+            """At as many states as a power of two: few shapes, where this is compiled."""
+            at = np.hstack([own[some], x])
+            rows = np.minimum(np.arange(1 << (len(at) - 1).bit_length()), len(at) - 1)
+            return np.asarray(at_points(_watched, (form, function, p), at[rows]))[: len(at)]
+
+        def value(shares: np.ndarray, some: np.ndarray) -> np.ndarray:
+            end = paces.stepped(caught[some], shares * h[some])
+            found = watched(end["x"], some)
+            failed = np.flatnonzero((end["status"] != Code.COMPLETED) | ~np.isfinite(found))
+            for j in failed:  # a part of the step that fails is replaced by the polynomial of the whole
+                i = some[j]
+                v = h[i] * self.method.weights(shares[j]) @ whole["k"][i]
+                along = self.method.along(self.family.member(int(places[caught[i]])), x[i], v)
+                found[j] = watched(np.asarray(along)[None], np.array([i]))[0]
+            return found
+
+        everyone = np.arange(caught.size)
+        shares = located(value, watched(x, everyone), watched(whole["x"], everyone))
+        end = paces.stepped(caught, shares * h)
+        fields = {name: end[name] for name in KEPT_AFTER}
+        return fields, paces.read("t", caught) + shares * h
+
+
+def _watched(model: tuple[Form, Callable, int], at):
+    form, function, p = model
+    return function(form.build(at[:p]), at[p:])

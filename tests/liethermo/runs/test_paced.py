@@ -1,0 +1,260 @@
+"""Ensembles with steps of their own: each trajectory as it would be alone, whoever is beside it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines.codes import Code
+from liethermo.runs import batches, paced
+
+BODY = lt.models.rigid_body()
+METHOD = lt.MetriplecticRungeKutta(6)
+ENGINES = ("compiled", pytest.param("array", marks=pytest.mark.slow))
+SPAN = (0.0, 10.0)
+
+
+def states(number, seed=0):
+    x = np.random.default_rng(seed).standard_normal((number, 3))
+    return x / np.linalg.norm(x, axis=1)[:, None]
+
+
+def nonlinear():
+    inertia = jnp.array([3.0, 2.0, 1.0])
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda p: 0.5 * jnp.sum(p * p / inertia) + 0.1 * p[0] ** 4 + 0.05 * jnp.cos(p[1]),
+        lambda p: jnp.log(1.0 + p @ p),
+        lt.ProjectedMetric(rate=0.3),
+    )
+
+
+def same(many, others, order=slice(None)):
+    """To the last bit."""
+    for name in (
+        "x",
+        "energy",
+        "entropy",
+        "status",
+        "steps",
+        "rejected",
+        "end_time",
+        "energy_drift",
+        "relaxation_time",
+    ):
+        assert np.array_equal(getattr(many, name)[order], getattr(others, name), equal_nan=True), name
+
+
+# -- each as alone ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [METHOD, pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)])
+def test_each_takes_the_steps_that_it_takes_alone(method):
+    """To the last bit in the compiled engine, which runs one program on a lane or on eight."""
+    x0s, system = states(21), nonlinear()
+    many = lt.ensemble(system, x0s, SPAN, lt.Adaptive(1e-8), method, engine="compiled")
+    assert many.ok.all(), str(many)
+    assert len(set(many.steps.tolist())) > 3
+    assert many.audit().passed, str(many.audit())
+    for i in (0, 7, 20):
+        one = lt.integrate(system, x0s[i], SPAN, lt.Adaptive(1e-8), method, engine="compiled")
+        assert np.array_equal(one.x[-1], many.x[i])
+        assert (one.stats.steps, one.stats.rejected) == (many.steps[i], many.rejected[i])
+        assert one.stats.energy_range == many[i].stats.energy_range
+        assert many[i].audit().passed
+
+
+@pytest.mark.slow
+def test_engines_take_the_same_steps():
+    """But for rounding, which the array engine's programs for one and for many do otherwise."""
+    x0s = states(12)
+    a, b = (lt.ensemble(BODY, x0s, SPAN, lt.Adaptive(1e-8), METHOD, engine=engine) for engine in ("array", "compiled"))
+    one = lt.integrate(BODY, x0s[3], SPAN, lt.Adaptive(1e-8), METHOD, engine="array")
+    assert np.array_equal(a.steps, b.steps)
+    assert np.abs(a.x - b.x).max() < 1e-11
+    assert one.stats.steps == a.steps[3]
+    assert np.abs(one.x[-1] - a.x[3]).max() < 1e-11
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
+    """Permuted, cut into other portions, in more threads, with fewer attempts in a call: the same to the last bit."""
+    x0s = np.concatenate([states(40), [[1e-9, 1.0, 1e-9]]])
+    rates = np.linspace(0.1, 1.0, 41)
+
+    def run(order):
+        parameters = {"dissipation.rate": rates[order]}
+        return lt.ensemble(
+            BODY, x0s[order], (0.0, 60.0), lt.Adaptive(1e-7), METHOD, parameters=parameters, engine=engine
+        )
+
+    plain, order = run(np.arange(41)), np.random.default_rng(1).permutation(41)
+    assert plain.ok.all()
+    same(plain, run(order), order)
+    same(plain, run(np.arange(5)), slice(5))
+    monkeypatch.setattr(batches, "BATCH", 8)
+    monkeypatch.setattr(paced, "ARRAY_BATCH", 16)
+    monkeypatch.setattr(paced, "ATTEMPTS", (1, 3))
+    same(plain, run(np.arange(41)))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_stiff_failing_and_early_ones_together(engine):
+    """One needs Newton's method, one leaves its domain, one rests, one starts beside a saddle, one cannot start."""
+    inertia = jnp.array([10.0, 5.0, 1.0])
+
+    def build(p):
+        energy = lambda m: 0.5 * jnp.sum(m * m / inertia) + 1e-3 * jnp.sqrt(p["edge"] - m[0])  # noqa: E731
+        entropy, friction = lt.Quadratic(np.ones(3)), lt.KillingDissipation(p["rate"])
+        return lt.LiePoissonSystem(mf.so(3), energy, entropy, friction, validate=False)
+
+    x0s = np.array([[0.1, 1, 0.1], [0.001, 1, 0.001], [1, 0, 0], [1e-9, 1, 1e-9], [0.3, 0.2, 0.9], [0.3, 0.4, 0.5]])
+    parameters = {"rate": np.array([50.0, 0.5, 0.5, 0.5, -1.0, 0.5]), "edge": np.array([9, 1.1, 9, 9, 9, 9])}
+    step, method = lt.Adaptive(1e-6), lt.MetriplecticGauss(2)
+    many = lt.ensemble(build, x0s, (0.0, 120.0), step, method, parameters=parameters, engine=engine)
+    assert many.status[[0, 2, 3, 4, 5]].tolist() == [0, 0, 0, Code.INADMISSIBLE, 0]
+    for i in (0, 1, 2, 3, 5):
+        system = build({name: value[i] for name, value in parameters.items()})
+        one = lt.integrate(system, x0s[i], (0.0, 120.0), step, method, engine=engine, on_failure="return")
+        assert (one.status.code, one.stats.steps) == (many[i].status.code, many.steps[i])
+        assert one.status.time == pytest.approx(many.end_time[i], rel=1e-9)
+        assert np.abs(one.x[-1] - many.x[i]).max() < 1e-9
+    assert many[1].status.code == "step_underflow"
+    assert many.message(1).startswith("trajectory 1: no step from t = ")
+    assert len(set(many.steps.tolist())) == 6
+    assert many.x[3, 0] > 0.5  # it has fallen in its time
+    rows = {row.law: row.passed for row in many.audit().rows}
+    assert rows.pop("trajectories that failed") is False
+    assert all(passed is not False for law, passed in rows.items() if law != "accuracy")
+
+
+def test_limits():
+    x0s = np.array([[0.1, 1.0, 0.1], [1.0, 0.0, 0.0]])
+    many = lt.ensemble(BODY, x0s, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), METHOD)
+    assert many.status.tolist() == [Code.STEP_LIMIT, Code.COMPLETED]
+    one = lt.integrate(BODY, x0s[0], (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), METHOD, on_failure="return")
+    assert many.end_time[0] == one.status.time
+    assert "most_steps" in many.message(0)
+    steps = lt.ensemble(BODY, x0s, (0.0, 5.0), lt.Adaptive(1e-4, first=0.01, largest=0.25), METHOD).steps
+    assert (steps >= 20).all()
+
+
+# -- times and events -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_save_at(engine):
+    times, x0s = [0.0, 0.37, 1.0, 1.05, 7.3], states(11)
+    many = lt.ensemble(BODY, x0s, SPAN, lt.Adaptive(1e-8), METHOD, save_at=times, engine=engine)
+    assert many.t.tolist() == [*times, 10.0]
+    assert many.x.shape == (11, 6, 3)
+    for i in (0, 10):
+        one = lt.integrate(BODY, x0s[i], SPAN, lt.Adaptive(1e-8), METHOD, save_at=times, engine=engine)
+        assert np.array_equal(one.t, many[i].t)
+        assert np.abs(one.x - many.x[i]).max() < 1e-12
+        assert one.stats.steps == many.steps[i]
+
+
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_events_happen_when_they_do_alone(engine, step):
+    """The production of entropy falls below a limit; in some that does not happen."""
+    x0s = np.concatenate([states(9), [[1.0, 0.0, 0.0]]])
+    options = {"until": lt.Relaxed(1e-4), "engine": engine}
+    many = lt.ensemble(BODY, x0s, (0.0, 40.05), step, METHOD, **options)
+    assert set(many.status.tolist()) == {Code.COMPLETED, Code.EVENT}
+    assert many.end_time[9] == 40.05
+    assert np.isnan(many.event_time[9])
+    for i in (0, 4, 8, 9):
+        one = lt.integrate(BODY, x0s[i], (0.0, 40.05), step, METHOD, **options)
+        assert (one.status.code, one.stats.steps) == (many[i].status.code, many.steps[i])
+        assert one.t[-1] == pytest.approx(many.end_time[i], rel=1e-13)
+        assert one.event_time == (None if i == 9 else pytest.approx(many.event_time[i], rel=1e-13))
+        assert np.abs(one.x[-1] - many.x[i]).max() < 1e-12
+    produced = [float(BODY.entropy_production(x)) for x in many.x[many.status == Code.EVENT]]
+    assert produced == pytest.approx([1e-4] * len(produced), rel=1e-9)
+    assert many.audit().passed
+
+
+def test_an_event_of_ones_own_in_a_family():
+    """Parameters differ, and so do the systems that the function is of."""
+    level, x0s = 0.3, states(6, 4)
+    rates = np.linspace(0.2, 1.0, 6)
+    options = {"until": lambda x: x[0] - level}
+    given = {"parameters": {"dissipation.rate": rates}}
+    many = lt.ensemble(BODY, x0s, (0.0, 30.0), lt.Adaptive(1e-9), METHOD, **given, **options)
+    happened = many.status == Code.EVENT
+    assert happened.sum() >= 2
+    i = int(np.flatnonzero(happened)[-1])
+    assert np.abs(many.x[happened, 0] - level).max() < 1e-13
+    one = lt.integrate(
+        lt.models.rigid_body(rate=2 * rates[i]), x0s[i], (0.0, 30.0), lt.Adaptive(1e-9), METHOD, **options
+    )
+    assert one.event_time == pytest.approx(many.event_time[i], rel=1e-12)
+    assert many[i].status.message.startswith(f"trajectory {i}: the event happened at t = ")
+
+
+@pytest.mark.slow
+def test_large_systems_look_for_what_grows():
+    """Twenty wells in a row, more components than a whole Jacobian matrix is looked at of."""
+
+    def energy(x):
+        q, p = x[:6], x[6:]
+        return 0.5 * p @ p + jnp.sum(0.25 * q**4 - 0.5 * q**2) + 0.3 * jnp.sum((q[1:] - q[:-1]) ** 2)
+
+    wells = lt.MetriplecticSystem(mf.Canonical(6), energy)
+    x0s = np.zeros((3, 12))
+    x0s[[0, 1, 2], [3, 1, 0]] = 1e-11, 1e-9, 0.4
+    options = {"until": lambda x: jnp.max(jnp.abs(x[:6])) - 0.5}
+    many = lt.ensemble(wells, x0s, (0.0, 100.0), lt.Adaptive(1e-6), lt.MetriplecticGauss(2), **options)
+    for i in range(3):
+        one = lt.integrate(wells, x0s[i], (0.0, 100.0), lt.Adaptive(1e-6), lt.MetriplecticGauss(2), **options)
+        assert one.event_time == pytest.approx(many.event_time[i], rel=1e-10)
+
+
+@pytest.mark.slow
+def test_on_a_manifold_with_attitudes_and_with_a_clock():
+    inertia = jnp.array([3.0, 2.0, 1.0])
+    top = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / inertia), None, group=mf.SO(3))
+    driven = lt.MetriplecticSystem(mf.Canonical(1), lambda x, t: 0.5 * x @ x * (1.0 + 0.3 * jnp.sin(t)))
+    sphere = lt.models.rigid_body()
+    cases = [(top, states(3), lt.MetriplecticGauss(2)), (driven, states(3)[:, :2], METHOD), (sphere, states(3), METHOD)]
+    for system, x0s, method in cases:
+        many = lt.ensemble(system, x0s, (0.5, 4.0), lt.Adaptive(1e-8), method)
+        one = lt.integrate(system, x0s[1], (0.5, 4.0), lt.Adaptive(1e-8), method)
+        assert np.abs(one.x[-1] - many.x[1]).max() < 1e-12
+        assert many.steps[1] == one.stats.steps
+        assert many.audit().passed
+
+
+def test_interrupted(monkeypatch):
+    """Ctrl-C returns what there is."""
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("liethermo.engines.paces._follow_all", interrupt)
+    many = lt.ensemble(BODY, states(3), SPAN, lt.Adaptive(1e-6), METHOD, engine="array")
+    assert many.status.tolist() == [Code.INTERRUPTED] * 3
+    assert not many.steps.any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"outputs": "trajectory"}, "give save_at"),
+        (
+            {"system": lt.models.mass_spring_gas(), "x0s": np.full(3, 0.5), "method": lt.VariationalGauss(2)},
+            "cannot be adaptive: what a variational scheme keeps",
+        ),
+        ({"until": 3.0}, "until must be"),
+        ({"until": lambda x: x}, "one number"),
+        ({"system": lt.models.free_rigid_body(), "until": lt.Relaxed(1e-3)}, "produces no entropy"),
+        ({"save_at": [11.0]}, "outside"),
+    ],
+)
+def test_bad_input(arguments, message):
+    default = {"system": BODY, "x0s": states(2), "t_span": SPAN, "step": lt.Adaptive(1e-6)}
+    with pytest.raises(lt.LiethermoError, match=message):
+        lt.ensemble(**(default | arguments))
