@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo test test-slow docs docs-check bench lock format clean
+.PHONY: help .venv demo test test-slow docs docs-check wheel bench lock format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -19,6 +19,7 @@ help:
 	@echo "make test-slow  the slow tests"
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
+	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
 	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/reference/benchmarks.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for both locks (needs Python 3.11)"
@@ -65,6 +66,17 @@ docs: .venv
 docs-check: docs
 	$(BIN)/python docs/check_site.py
 
+# Installed with what it needs and nothing else, and run away from the sources.
+wheel: .venv
+	rm -rf dist build
+	$(BIN)/python -m pip wheel --disable-pip-version-check --no-deps --no-build-isolation -w dist .
+	@set -e; folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
+	"$(PYTHON)" -m venv "$$folder/venv"; \
+	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check -q -c requirements.lock dist/*.whl; \
+	cp examples/relaxed_rigid_body.toml "$$folder"; cd "$$folder"; \
+	venv/bin/liethermo --version; \
+	venv/bin/liethermo run relaxed_rigid_body.toml --out out
+
 bench: .venv .venv/bench
 	$(BIN)/python -m benchmarks --page docs/reference/benchmarks.md
 
@@ -91,6 +103,6 @@ lock:
 	cp "$$folder/lock-bench" requirements-bench.lock
 
 clean:
-	rm -rf .venv build *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/reference/generated
+	rm -rf .venv build dist *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/reference/generated
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

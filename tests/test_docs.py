@@ -37,7 +37,10 @@ def scratch(tmp_path, monkeypatch):
     plt.close("all")
 
 
-COSTLY = ("on_manifolds", "own_space", "friction_heat_work")
+COSTLY = (
+    *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
+    *("own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
+)
 """Pages that compile much: in the slow tier."""
 
 

@@ -34,7 +34,9 @@ back, and the most that one takes back: far below what its rounding is."""
 
 
 class MetriplecticRungeKutta(OneStepMethod):
-    """``X_i = x + h sum_{j<i} A_ij f(X_j)``, ``y = x + h sum_i b_i f(X_i)``, and x' the point near y where
+    """Explicit Runge-Kutta steps with both laws exact, of order 4, 6 or 8.
+
+    ``X_i = x + h sum_{j<i} A_ij f(X_j)``, ``y = x + h sum_i b_i f(X_i)``, and x' the point near y where
 
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X_i),    sigma = grad S . K grad S >= 0,
 

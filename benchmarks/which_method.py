@@ -1,0 +1,151 @@
+"""Work against precision of the methods on four problems: the picture of the page on choosing a method.
+
+``python -m benchmarks.which_method`` writes ``docs/howto/which_method.svg``. Work is the time of the processor for a
+run with steps of one size, the best of several; precision is the error at the end against collocation of order 12.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+import liethermo as lt
+import manifolds as mf
+
+from .timing import race
+
+FIGURE = Path(__file__).resolve().parent.parent / "docs" / "howto" / "which_method.svg"
+STEPS = tuple(0.8 / 2**k for k in range(7))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A system, where it starts, and how long it runs."""
+
+    title: str
+    system: Callable[[], lt.System]
+    start: tuple[float, ...]
+    end: float
+    step: float  # of the reference
+
+
+def _body() -> lt.System:
+    return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+
+
+def _body_in_four() -> lt.System:
+    g = mf.so(4)
+    inertia = jnp.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
+    return lt.LiePoissonSystem(
+        g,
+        lambda mu: 0.5 * jnp.sum(mu**2 / inertia) + 0.02 * jnp.sum(mu**4),
+        lt.Quadratic(np.ones(6)),
+        lt.ProjectedMetric(rate=0.1),
+    )
+
+
+def _oscillator() -> lt.System:
+    return lt.EvolutionSystem(
+        lt.Kinetic([1.0]) + lt.Potential(lambda q, S: 0.5 * q @ q + 0.1 * jnp.sum(q**4) + jnp.exp(S / 2.0)), dim=3
+    )
+
+
+def _stiff() -> lt.System:
+    def moving(x):
+        return 0.5 * x[1] ** 2 + jnp.exp(x[2])
+
+    return lt.ComposedSystem(
+        {
+            "block": lt.Subsystem(moving, 3, friction=0.3),
+            "bed": lt.Subsystem(lambda x: 2.0 * jnp.exp(x[0] / 2.0), 1),
+        },
+        coupling=lambda q: 0.5 * jnp.sum(q**2),
+        conductance=400.0,
+    )
+
+
+PROBLEMS = (
+    Problem("relaxing body, so(3)", _body, (0.06, 0.1, 1.0), 40.0, 0.05),
+    Problem("body in four dimensions, so(4)", _body_in_four, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
+    Problem("oscillator and its heat", _oscillator, (1.0, 0.0, -2.0), 20.0, 0.05),
+    Problem("stiff exchange of heat", _stiff, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
+)
+
+METHODS = (
+    lt.MetriplecticRungeKutta(4),
+    lt.MetriplecticRungeKutta(6),
+    lt.MetriplecticRungeKutta(8),
+    lt.MetriplecticGauss(1),
+    lt.MetriplecticGauss(2),
+    lt.MetriplecticGauss(3),
+)
+
+
+def measured(problem: Problem, rounds: int) -> dict[str, list[tuple[float, float]]]:
+    """For each method points (error, seconds); a step that a method cannot take has none."""
+    system, span = problem.system(), (0.0, problem.end)
+    exact = lt.integrate(system, problem.start, span, problem.step, lt.MetriplecticGauss(6), progress=False).x[-1]
+    works = {}
+    for method in METHODS:
+        for step in STEPS:
+
+            def work(method=method, step=step):
+                return lt.integrate(
+                    system, problem.start, span, step, method, save_every=10**6, on_failure="return", progress=False
+                )
+
+            works[method, step] = work
+    found: dict[str, list[tuple[float, float]]] = {str(method): [] for method in METHODS}
+    for (method, _), outcome in race(works, rounds=rounds, patience=2.0).items():
+        if outcome.result.status.ok:
+            error = float(np.abs(outcome.result.x[-1] - exact).max() / np.abs(exact).max())
+            found[str(method)].append((max(error, 1e-15), outcome.processor))
+    return found
+
+
+def draw(results: dict[str, dict[str, list[tuple[float, float]]]], path: Path) -> None:
+    """One frame for each problem."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
+        figure, axes = plt.subplots(2, 2, figsize=(8.4, 6.2), layout="constrained")
+        for frame, (title, curves) in zip(axes.flat, results.items(), strict=True):
+            for i, (name, points) in enumerate(curves.items()):
+                if points:
+                    explicit = name.startswith("MetriplecticRungeKutta")
+                    style = {"marker": "o" if explicit else "s", "linestyle": "-" if explicit else "--"}
+                    frame.loglog(
+                        *np.transpose(points), color=f"C{i}", markersize=3.5, linewidth=1.2, label=name, **style
+                    )
+            frame.invert_xaxis()
+            frame.set(title=title, xlabel="relative error at the end", ylabel="seconds")
+            frame.grid(True, which="major", linewidth=0.4, alpha=0.5)
+            frame.spines[["top", "right"]].set_visible(False)
+        figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncol=3, frameon=False)
+        figure.savefig(path, metadata={"Date": None})
+        plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--figure", type=Path, default=FIGURE)
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    results = {}
+    for problem in PROBLEMS:
+        results[problem.title] = measured(problem, arguments.rounds)
+        print(problem.title)
+        for name, points in results[problem.title].items():
+            print(f"  {name:<36}", "  ".join(f"{error:.0e}: {1e3 * seconds:.3g} ms" for error, seconds in points))
+    draw(results, arguments.figure)
+
+
+if __name__ == "__main__":
+    main()
