@@ -42,7 +42,7 @@ def flow(
     method : OneStepMethod
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int, optional
-        Return every so-manieth state, the first and the last too.
+        Return every n-th state, n this number, and the first and the last one.
 
     Returns
     -------

@@ -54,7 +54,7 @@ def integrate(
     method : OneStepMethod or Reference
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int
-        Keep every so-manieth state, and the last; the laws are followed at every step all the same.
+        Keep every n-th state, n this number, and the last; the laws are followed at every step all the same.
     save_at : array of times, optional
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional

@@ -25,7 +25,7 @@ class Timetable:
     span : (float, float)
     step : float
     every : int or None
-        Keep every so-manieth state, and the last; None keeps the last alone.
+        Keep every n-th state, n this number, and the last; None keeps the last alone.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Course:
     span, step, every
         As for :class:`Timetable`.
     stops : array, optional
-        Times at which steps end and states are kept, the end of the span the last; every so-manieth otherwise.
+        Times at which steps end and states are kept, the end of the span the last; without them, every n-th state.
 
     Attributes
     ----------

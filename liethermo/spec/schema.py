@@ -97,7 +97,7 @@ class Run(Section):
         description="start and end, for example [0.0, 100.0]"
     )
     step: Step = Field(description="the step size, a number greater than 0, or {adaptive = 1e-8}")
-    save_every: int = Field(1, ge=1, description="every so-manieth state is kept")
+    save_every: int = Field(1, ge=1, description="every n-th state is kept, n this number")
     until: Until | None = Field(None, description="where the run ends before its time, for example {relaxed = 1e-8}")
     attitude: list[list[FiniteFloat]] | None = Field(
         None, description="the element of the group at the start, a matrix, where the system has a group"
