@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..errors import InputError
 from .base import Dissipation, portions
 from .factor import Factor
 from .geometry import Geometry
+
+SQUARE, KERNEL, DIVERGENCE = "B B^T = K", "B^T grad H = 0", "div B = 0, as stated"
+"""The rows of a check on noise."""
 
 
 def factors(dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence) -> list[tuple[Dissipation, Factor]]:
@@ -39,20 +43,49 @@ def divergence(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
 
     By differentiation, except where the construction makes it vanish.
     """
+    parts = factors_at(dissipation, system, x)
+    found = [
+        jnp.zeros(B.size) if B.solenoidal else jnp.sum(_changes(dissipation, system, x, i), axis=0)
+        for i, (_, B) in enumerate(parts)
+    ]
+    return jnp.concatenate([jnp.zeros(0), *found])
 
-    def at(y) -> list[tuple[Dissipation, Factor]]:
-        dL = [L.gradient(y) for L in dissipation.preserve]
-        return factors(dissipation, system, y, system.energy.gradient(y), dL)
 
-    def of(i: int) -> jax.Array:
-        def row(y, axis):
-            return at(y)[i][1].transposed(axis)
+def factors_at(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
+    """Those at the gradients of the functions."""
+    dL = [L.gradient(x) for L in dissipation.preserve]
+    return factors(dissipation, system, x, system.energy.gradient(x), dL)
 
-        def changes(axis):
-            return jax.jvp(lambda y: row(y, axis), (x,), (axis,))[1]
 
-        return jnp.sum(jax.vmap(changes)(jnp.eye(x.shape[0])), axis=0)
+def _changes(dissipation: Dissipation, system: Geometry, x, i: int) -> jax.Array:
+    """``dB_ja / dx_j`` of the factor of summand i, shape (n, columns)."""
 
-    here = at(x)
-    parts = [jnp.zeros(B.size) if B.solenoidal else of(i) for i, (_, B) in enumerate(here)]
-    return jnp.concatenate([jnp.zeros(0), *parts])
+    def change(axis):
+        row = lambda y: factors_at(dissipation, system, y)[i][1].transposed(axis)  # noqa: E731
+        return jax.jvp(row, (x,), (axis,))[1]
+
+    return jax.vmap(change)(jnp.eye(x.shape[0]))
+
+
+def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
+    """What the factors miss of what they are to be, at a state and relative to what cancels: the largest of each."""
+    dH = system.energy.gradient(x)
+    away = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape[0]))
+    found: dict[str, list[jax.Array]] = {SQUARE: [], KERNEL: [], DIVERGENCE: []}
+    parts = factors_at(dissipation, system, x)
+    for i, ((part, B), (_, own)) in enumerate(zip(parts, portions(dissipation, dissipation.preserve), strict=True)):
+        dL, keeps = tuple(L.gradient(x) for L in own), part.energy_law == "conserved"
+        force = part.force(system, x, dH, away, dL)
+        square = B.times(B.transposed(away)) if keeps else -B.times(B.transposed(dH))
+        found[SQUARE].append(_relative(square - force, jnp.max(jnp.abs(force))))
+        size = jnp.linalg.norm(B.transposed(away))
+        kernel = [_relative(B.transposed(v), size * jnp.linalg.norm(v)) for v in ((dH, *dL) if keeps else dL)]
+        found[KERNEL] += kernel
+        if B.solenoidal:
+            changes = _changes(dissipation, system, x, i)
+            found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), jnp.max(jnp.abs(changes))))
+    return {name: jnp.max(jnp.stack(values)) for name, values in found.items() if values}
+
+
+def _relative(missed, size) -> jax.Array:
+    return jnp.max(jnp.abs(missed), initial=0.0) / jnp.where(size > 0.0, size, 1.0)

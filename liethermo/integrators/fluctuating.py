@@ -8,7 +8,7 @@ import numpy as np
 
 from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor, beside
-from ..dissipation.noise import divergence, factors
+from ..dissipation.noise import SQUARE, divergence, factors, factors_at, residuals
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..systems import System
@@ -106,7 +106,7 @@ class Fluctuating(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError where there is no noise that belongs to the dissipation."""
         self.method.check(system)
-        misfit = np.nanmax(_at_some(_misfit, system, system), initial=0.0)
+        misfit = np.nanmax(at_points(_misfit, system, system.samples(4)), initial=0.0)
         if not misfit <= MISFIT:
             raise InputError(
                 f"the factor B that a dissipation gives is none of its friction matrix K: B B^T dS misses K dS "
@@ -141,47 +141,26 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
         )
     if temperature is not None and not lowers:
         raise InputError("the dissipation keeps the energy, so there is no bath that could have a temperature")
-    size = sum(B.size for _, B in _at(system, jnp.zeros(system.dim)))
+    size = sum(B.size for _, B in factors_at(system.dissipation, system, jnp.zeros(system.dim)))
     T = 1.0 if temperature is None else temperature
     return Fluctuating(method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(size))
 
 
 def undisturbed(system: System, function: Energy) -> bool:
     """Whether no noise changes a function: ``B^T grad f = 0`` at random points."""
-    moved, size = _at_some(_moved, (system, function), system).T
+    moved, size = at_points(_moved, (system, function), system.samples(4)).T
     inside = np.isfinite(moved)
     return bool(inside.any() and (moved[inside] <= MISFIT * size[inside]).all())
 
 
-def _at_some(measure, model, system: System) -> np.ndarray:
-    return np.asarray(at_points(measure, model, system.samples(4)))
-
-
-def _at(system: System, x) -> list[tuple[Dissipation, Factor]]:
-    assert system.dissipation is not None
-    dL = [L.gradient(x) for L in system.preserved]
-    return factors(system.dissipation, system, x, system.energy.gradient(x), dL)
-
-
 def _misfit(system: System, x):
-    """What ``B B^T`` misses of K, on a vector, relative to its image."""
     assert system.dissipation is not None
-    parts = _at(system, x)
-    dH, dL = system.energy.gradient(x), [L.gradient(x) for L in system.preserved]
-    away = jnp.asarray(np.random.default_rng(0).standard_normal(system.dim))
-    missed = [jnp.zeros(())]
-    start = 0
-    for part, B in parts:
-        own, start = tuple(dL[start : start + len(part.preserve)]), start + len(part.preserve)
-        sign, along = (1.0, away) if part.energy_law == "conserved" else (-1.0, dH)
-        force = part.force(system, x, dH, away, own)
-        size = jnp.max(jnp.abs(force))
-        missed.append(jnp.max(jnp.abs(sign * B.times(B.transposed(along)) - force)) / jnp.where(size > 0.0, size, 1.0))
-    return jnp.max(jnp.stack(missed))
+    return residuals(system.dissipation, system, x)[SQUARE]
 
 
 def _moved(model: tuple[System, Energy], x):
     system, function = model
-    B, gradient = beside([B for _, B in _at(system, x)]), function.gradient(x)
+    assert system.dissipation is not None
+    B, gradient = beside([B for _, B in factors_at(system.dissipation, system, x)]), function.gradient(x)
     columns = jax.vmap(B.times)(jnp.eye(B.size))
     return jnp.stack([jnp.max(jnp.abs(columns @ gradient)), jnp.max(jnp.abs(columns)) * jnp.linalg.norm(gradient)])

@@ -6,13 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.noise import residuals
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy
 from ..integrators import MetriplecticMidpoint, OneStepMethod
 from ..integrators.fluctuating import with_noise
 from ..systems import System
+from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
+from ..tracing.interpret import at_points
 from .threefry import normal
 
 BOUND = 6.0
@@ -80,6 +85,28 @@ class Fluctuations:
         """The noise of one trajectory of an ensemble."""
         return replace(self, first=self.first + i) if len(self.seeds) == 1 else replace(self, seed=self.seeds[i])
 
+    def check(self, system: System, samples: int = 8, seed: int = 0, scale: float = 1.0) -> CheckReport:
+        """Test at random points that there is such noise, and that the motion keeps the measure; prints as a table.
+
+        The rows are ``B B^T = K``; ``B^T grad H = 0``; of columns that are stated to have no divergence that they have
+        none; and, without a verdict, how far the motion is from keeping volume, or the ``density``: where it does not,
+        the measure of the class's description is not the one that the states tend to.
+        """
+        self.on(system, DEFAULT_WITH_NOISE)
+        points = system.samples(samples, seed, scale)
+        density = None if self.density is None else as_energy(self.density, "the density")
+        measured = at_points(_residuals, (system, density), points)
+        inside = np.isfinite(measured[MEASURE])
+        if not inside.any():
+            raise InputError(f"energy or dissipation is not finite at any of the {len(points)} test points")
+        rows = []
+        for name, values in measured.items():
+            worst = float(values[inside].max())
+            judged = name != MEASURE
+            note = "" if judged or worst <= AXIOM_TOLERANCE else "no: what the states tend to is not known"
+            rows.append(CheckRow(name, worst, AXIOM_TOLERANCE, worst <= AXIOM_TOLERANCE if judged else None, note))
+        return CheckReport(tuple(rows), int(inside.sum()))
+
     def listed(self) -> dict[str, Any]:
         """For the provenance of a run."""
         density = None if self.density is None else getattr(self.density, "__name__", str(self.density))
@@ -99,6 +126,24 @@ class Fluctuations:
         else:
             seeds, numbers = np.asarray(self.seeds)[members], np.full(len(members), self.first)
         return np.sqrt(h) * np.clip(normal(seeds, numbers, first, steps, increments), -BOUND, BOUND)
+
+
+MEASURE = "the motion keeps the measure"
+
+
+def _residuals(model: tuple[System, Energy | None], x):
+    system, density = model
+    assert system.dissipation is not None
+
+    def motion(y):
+        return system.poisson.sharp(y, system.energy.gradient(y))
+
+    parts = jnp.diagonal(jax.jacfwd(motion)(x))
+    if density is not None:
+        parts = jnp.append(parts, jnp.dot(density.gradient(x), motion(x)))
+    size = jnp.max(jnp.abs(parts)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
+    own = {MEASURE: jnp.abs(jnp.sum(parts)) / jnp.where(size > 0.0, size, 1.0)}
+    return residuals(system.dissipation, system, x) | own
 
 
 @dataclass(frozen=True)

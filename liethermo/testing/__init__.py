@@ -8,7 +8,8 @@ Each ``check_*`` puts an object through what every registered one goes through. 
 from manifolds.testing import PropertyError, Report
 
 from .dissipations import check_dissipation
+from .equilibrium import check_equilibrium
 from .methods import check_method
 from .systems import check_system
 
-__all__ = ["PropertyError", "Report", "check_dissipation", "check_method", "check_system"]
+__all__ = ["PropertyError", "Report", "check_dissipation", "check_equilibrium", "check_method", "check_system"]
