@@ -83,7 +83,8 @@ def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Ar
         found[KERNEL] += kernel
         if B.solenoidal:
             changes = _changes(dissipation, system, x, i)
-            found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), jnp.max(jnp.abs(changes))))
+            varies = jnp.max(jnp.abs(changes)) + size / (1.0 + jnp.linalg.norm(x))  # the former may be rounding alone
+            found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), varies))
     return {name: jnp.max(jnp.stack(values)) for name, values in found.items() if values}
 
 
