@@ -21,8 +21,10 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE / "_ext")]
 
 from rooms import draw  # noqa: E402
+from spec_keys import write_table  # noqa: E402
 
 draw(HERE / "generated" / "rooms.svg")
+write_table(HERE / "generated" / "spec_keys.md")
 
 project = "liethermo"
 author = "The liethermo authors"

@@ -39,7 +39,7 @@ def scratch(tmp_path, monkeypatch):
 
 COSTLY = (
     *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
-    *("own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
+    *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
 )
 """Pages that compile much: in the slow tier."""
 
