@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..engines.codes import Code
 from ..errors import InputError
 from ..results.ensemble import Ensemble
 from ..runs.events import Relaxed
@@ -118,7 +117,7 @@ class EventTime:
     final: bool = False
 
     def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
-        return np.where(ensemble.status == Code.EVENT, ensemble.end_time, np.nan), {}
+        return ensemble.event_time, {}
 
     def told(self) -> str:
         return f"time of {self.event}"

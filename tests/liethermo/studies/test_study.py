@@ -356,6 +356,48 @@ def test_ctrl_c_leaves_a_store_to_go_on_from(done, tmp_path, monkeypatch):
     assert content(store) == content(done[0])
 
 
+def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path):
+    def turned(solution):
+        return np.abs(solution.x).max(axis=0)
+
+    measure = {
+        "relaxed": lt.Relaxed(1e-3),
+        "at": lt.At([0.25, 1.0]),
+        "entropy": lt.At([1.0], "entropy"),
+        "end": "end_time",
+    }
+    span, times = (0.0, 90.0), [0.25, 1.0]
+    axes = {"rate": [0.5, -1.0, 2.0, 1e-9], "ratio": [0.3]}
+    found = study(tmp_path / "s.zarr", axes, t_span=span, step=lt.Adaptive(1e-9), measure=measure)
+    assert found.run().counts == {"event": 2, "inadmissible": 1, "completed": 1}
+    results = found.results
+    for rate in (0.5, 2.0):
+        system = body({"rate": rate, "ratio": 0.3})
+        alone = lt.integrate(system, X0, span, lt.Adaptive(1e-9), until=lt.Relaxed(1e-3), save_at=times)
+        point = results.sel(rate=rate, ratio=0.3)
+        assert point.relaxed == pytest.approx(alone.event_time, rel=1e-12)
+        assert point.end == point.relaxed
+        np.testing.assert_allclose(point["at"], alone.x[[list(alone.t).index(t) for t in times]], rtol=0, atol=1e-13)
+        assert point.entropy.item() == pytest.approx(alone.entropy[list(alone.t).index(1.0)], rel=1e-13)
+    assert np.isnan(results.relaxed.sel(rate=1e-9))
+    assert results.end.sel(rate=1e-9) == 90.0
+    assert results.relaxed.long_name == "time of entropy production below 0.001"
+
+    shaped = study(tmp_path / "f.zarr", {"rate": [0.5, 2.0], "ratio": [0.3]}, measure={"turned": turned})
+    assert shaped.run().ok
+    wanted = turned(lt.integrate(body({"rate": 2.0, "ratio": 0.3}), X0, (0.0, 4.0), 0.1))
+    np.testing.assert_allclose(shaped.results.turned[1, 0], wanted, rtol=0, atol=1e-14)
+
+
+def test_what_the_array_engine_runs_does_not_depend_on_chunks_either(tmp_path):
+    results = []
+    for chunk in (1, 7):
+        found = study(tmp_path / f"{chunk}.zarr", chunk=chunk, engine="array", t_span=(0.0, 1.0))
+        found.run()
+        results.append(found.results.load().drop_attrs())
+    assert results[0].identical(results[1])
+
+
 VICTIM = """
 import sys
 sys.path.insert(0, {root!r})
