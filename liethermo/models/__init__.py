@@ -11,12 +11,15 @@ from .gas_piston import gas_piston
 from .heat_grid import heat_grid
 from .mass_spring_gas import mass_spring_gas
 from .oscillator import damped_oscillator
+from .quantised_sphere import QuantisedSphere
 from .rigid_body import free_rigid_body, rigid_body
 from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
+from .zeitlin import zeitlin
 
 __all__ = [
+    "QuantisedSphere",
     "body_with_wheels",
     "cylinder",
     "damped_oscillator",
@@ -31,4 +34,5 @@ __all__ = [
     "thermo_particles",
     "thermo_springs",
     "thermoelastic_chain",
+    "zeitlin",
 ]

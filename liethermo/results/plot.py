@@ -24,9 +24,10 @@ from ..systems import System
 from .audit import EPS, LAW_FAILS, Audit
 from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, finished, writable
 from .solution import Solution
+from .sphere_plot import sphere_field
 from .study_plot import study
 
-__all__ = ["laws", "momentum_sphere", "study"]
+__all__ = ["laws", "momentum_sphere", "sphere_field", "study"]
 
 MOST_SEGMENTS = 20_000
 """A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""

@@ -4,7 +4,8 @@ Every entry registers the instances on which the shared property suite runs (:fu
 here, with ``@register(...)``, and it is tested.
 
 The classical algebras of a dimension above 120 are :class:`manifolds.MatrixAlgebra`: the same bases, normalised alike,
-but brackets are products of matrices and no constants are made. su(512) takes some megabytes.
+but brackets are products of matrices and no constants are made. su(512) takes some megabytes. ``by_matrices=True``
+asks for this form at any size, False for constants.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def abelian(n: int) -> LieAlgebra:
 
 
 @register((2,), (3,), (4,), (5,), (2, 1), (3, 1))
-def so(p: int, q: int = 0) -> LieAlgebra:
+def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Rotations so(p), or so(p, q) of the form diag(1, …, 1, -1, …, -1).
 
     so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
@@ -75,30 +76,30 @@ def so(p: int, q: int = 0) -> LieAlgebra:
     even = tuple(range(2, n, 2))
     pfaffian = n // 2 if n % 2 == 0 else None
     known = Classical(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, even, pfaffian)
-    return _classical(f"so({p},{q})" if q else f"so({n})", n, known, lambda: matrix_bases.orthogonal(p, q))
+    return _classical(f"so({p},{q})" if q else f"so({n})", n, known, by_matrices, lambda: matrix_bases.orthogonal(p, q))
 
 
 @register((2,), (3,), (4,))
-def su(n: int) -> LieAlgebra:
+def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Anti-Hermitian traceless matrices ``-i lambda_a / 2``, lambda the (generalised) Gell-Mann matrices.
 
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
     """
     n = checked_size(n, 2, "su(n)")
     known = Classical(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
-    return _classical(f"su({n})", n, known, lambda: matrix_bases.unitary(n, centre=False))
+    return _classical(f"su({n})", n, known, by_matrices, lambda: matrix_bases.unitary(n, centre=False))
 
 
 @register((2,))
-def u(n: int) -> LieAlgebra:
+def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
     n = checked_size(n, 1, "u(n)")
     known = Classical(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
-    return _classical(f"u({n})", n, known, lambda: matrix_bases.unitary(n, centre=True))
+    return _classical(f"u({n})", n, known, by_matrices, lambda: matrix_bases.unitary(n, centre=True))
 
 
 @register((2,), (3,))
-def sl(n: int) -> LieAlgebra:
+def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Traceless real matrices: ``E_ii - E_(i+1)(i+1)`` first, then the E_ij of the upper and of the lower triangle.
 
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
@@ -106,15 +107,15 @@ def sl(n: int) -> LieAlgebra:
     n = checked_size(n, 2, "sl(n)")
     rotations = n * (n - 1) // 2
     known = Classical(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
-    return _classical(f"sl({n})", n, known, lambda: matrix_bases.special_linear(n))
+    return _classical(f"sl({n})", n, known, by_matrices, lambda: matrix_bases.special_linear(n))
 
 
 @register((1,), (2,))
-def sp(n: int) -> LieAlgebra:
+def sp(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
     n = checked_size(n, 1, "sp(n)")
     known = Classical(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
-    return _classical(f"sp({n})", 2 * n, known, lambda: matrix_bases.symplectic(n))
+    return _classical(f"sp({n})", 2 * n, known, by_matrices, lambda: matrix_bases.symplectic(n))
 
 
 @register(())
@@ -147,12 +148,12 @@ _OCTONIONS = (
 
 
 @register((1,), (2,))
-def gl(n: int) -> LieAlgebra:
+def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """All real matrices, basis E_ij row by row."""
     n = checked_size(n, 1, "gl(n)")
     rotations = n * (n - 1) // 2
     known = Classical(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
-    return _classical(f"gl({n})", n, known, lambda: matrix_bases.general_linear(n))
+    return _classical(f"gl({n})", n, known, by_matrices, lambda: matrix_bases.general_linear(n))
 
 
 @register((2,), (3,))
@@ -272,10 +273,12 @@ def _unit(n: int, i: int, j: int) -> np.ndarray:
     return matrix
 
 
-def _classical(name: str, size: int, known: Classical, tables: Callable[[], MatrixBasis]) -> LieAlgebra:
-    """By constants up to LARGEST_BY_CONSTANTS, by products of matrices beyond; the basis is the same."""
+def _classical(
+    name: str, size: int, known: Classical, by_matrices: bool | None, tables: Callable[[], MatrixBasis]
+) -> LieAlgebra:
+    """By constants up to LARGEST_BY_CONSTANTS, by products of matrices beyond, or as asked; the basis is the same."""
     check_memory(WORKING_MATRICES * float(size) ** 2, f"one step with matrices of {name}", "take smaller ones")
-    if sum(known.signature) <= LARGEST_BY_CONSTANTS:
+    if not (sum(known.signature) > LARGEST_BY_CONSTANTS if by_matrices is None else by_matrices):
         return _named(tables().matrices(), name)
     return MatrixAlgebra(name, tables(), known)
 

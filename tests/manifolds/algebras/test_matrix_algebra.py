@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import manifolds as mf
-from manifolds.algebras import catalogue
 
 LONG = [("u", 3), ("so", 5), ("sp", 2), ("gl", 3)]
 PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark.slow) for p in LONG)]
@@ -15,9 +14,7 @@ PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark
 def pair(request):
     name, *sizes = request.param
     constructor = getattr(mf, name)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalogue, "LARGEST_BY_CONSTANTS", 0)
-        by_matrices = constructor(*sizes)
+    by_matrices = constructor(*sizes, by_matrices=True)
     by_constants = constructor(*sizes)
     assert isinstance(by_matrices, mf.MatrixAlgebra)
     assert not isinstance(by_constants, mf.MatrixAlgebra)

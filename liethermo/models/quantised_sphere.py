@@ -1,0 +1,260 @@
+"""Functions on the sphere as matrices: the quantised Laplacian, spherical harmonics, values on a grid.
+
+A real function ``omega = sum a_lm Y_lm`` of degree below N is the anti-Hermitian matrix ``W = i sum a_lm T_lm``, where
+T_lm, with entries on the m-th diagonal alone, are orthonormal in ``tr(A^H B)`` [Hoppe 1989]. So norms agree,
+``tr(W^H W) = integral of omega**2``, and the constant, l = 0, is the trace, which vorticity does not have. With
+``gamma = sqrt(N (N**2 - 1) / (16 pi))`` the commutator ``-gamma [A, B]`` is that of ``{a, b} = n . (grad a x grad b)``
+up to O(1 / N**2) [Zeitlin 1991; Modin & Viviani 2020].
+
+The Laplacian is ``Delta P = -sum_a [S_a, [S_a, P]]``, S_a the spin matrices of size N, [Hoppe & Yau 1998]. Its
+eigenvalues are ``-l (l + 1)`` exactly, its eigenvectors are the T_lm, and it maps each diagonal to itself by a
+tridiagonal matrix: it is inverted in O(N^2).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+import manifolds as mf
+
+from ..errors import InputError
+from .parameters import whole
+
+MOST_TRACE = 1e-12
+"""Trace of a vorticity, relative to its norm, that counts as rounding."""
+
+
+@jax.tree_util.register_static
+class QuantisedSphere:
+    """The N by N matrices that stand for functions on the sphere, as states on the dual of su(N).
+
+    A state mu is the vorticity matrix W by ``mu_a = Re tr(W^H e_a)``, e_a the basis of :func:`manifolds.su`.
+
+    Parameters
+    ----------
+    N : int, >= 2
+
+    Attributes
+    ----------
+    algebra : manifolds.MatrixAlgebra
+        su(N).
+    gamma : float
+        Of the bracket.
+    """
+
+    def __init__(self, N: int):
+        self.N = whole(N, "N", 2)
+        algebra = mf.su(self.N, by_matrices=True)
+        assert isinstance(algebra, mf.MatrixAlgebra)
+        self.algebra = algebra
+        self.gamma = math.sqrt(self.N * (self.N**2 - 1) / (16.0 * math.pi))
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, QuantisedSphere) and self.N == other.N
+
+    def __hash__(self) -> int:
+        return hash((QuantisedSphere, self.N))
+
+    # -- the Laplacian ------------------------------------------------------------------------------------------------
+
+    def laplacian(self, mu) -> jax.Array:
+        """The state of ``Delta W``, shape (..., N^2 - 1)."""
+        return self._on_diagonals(mu, self._applied)
+
+    def inverse_laplacian(self, mu) -> jax.Array:
+        """The state of P with ``Delta P = W`` and no trace, shape (..., N^2 - 1)."""
+        return self._on_diagonals(mu, self._solved)
+
+    def _on_diagonals(self, mu, function) -> jax.Array:
+        """A map of the diagonals above and with the main one, shape (N, 2, N): entry i of the m-th at [i, :, m]."""
+        tables, N = self.algebra.tables, self.N
+        parts = jnp.stack(tables.matrix(tables.raised(mu)), axis=-3)
+        rows = jnp.pad(parts.reshape(*parts.shape[:-2], N * N), [(0, 0)] * (parts.ndim - 2) + [(0, N)])
+        rows = rows.reshape(*parts.shape[:-2], N, N + 1)[..., :N] * self._inside  # row i begins at its diagonal
+        rows = jnp.swapaxes(function(jnp.swapaxes(rows, -3, -2)), -3, -2)
+        flat = jnp.pad(rows * self._inside, [(0, 0)] * (rows.ndim - 1) + [(0, 1)])
+        upper = flat.reshape(*parts.shape[:-2], N * (N + 1))[..., : N * N].reshape(parts.shape)
+        lower = jnp.swapaxes(jnp.triu(upper, 1), -1, -2)
+        return tables.products((upper[..., 0, :, :] - lower[..., 0, :, :], upper[..., 1, :, :] + lower[..., 1, :, :]))
+
+    def _applied(self, rows) -> jax.Array:
+        main, beside = self._tridiagonal
+        up = jnp.pad(rows[..., 1:, :, :], [(0, 0)] * (rows.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
+        down = jnp.pad(rows[..., :-1, :, :], [(0, 0)] * (rows.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
+        before = np.pad(beside[:-1], [(1, 0), (0, 0)])
+        return -(main[:, None] * rows + beside[:, None] * up + before[:, None] * down)
+
+    def _solved(self, rows) -> jax.Array:
+        ratio, inverse = self._factors
+        rows = jnp.moveaxis(-rows, -3, 0)  # along each diagonal step by step, all of them together
+
+        def eliminate(before, given):
+            row, factor = given
+            found = row - factor * before
+            return found, found
+
+        def substitute(after, given):
+            row, factor = given
+            found = row - factor * after
+            return found, found
+
+        start = jnp.zeros(rows.shape[1:])
+        _, rows = jax.lax.scan(eliminate, start, (rows, np.pad(ratio[:-1], [(1, 0), (0, 0)])))
+        scaled = rows * inverse.reshape(self.N, *[1] * (rows.ndim - 2), self.N)
+        _, rows = jax.lax.scan(substitute, start, (scaled, ratio), reverse=True)
+        rows = jnp.moveaxis(rows, 0, -3)
+        mean = jnp.mean(rows[..., 0], axis=-2, keepdims=True)  # the main diagonal is known up to a multiple of 1
+        return rows.at[..., 0].add(-mean)
+
+    @cached_property
+    def _inside(self) -> np.ndarray:
+        """Which entries [i, m] there are: ``i + m < N``."""
+        i, m = np.indices((self.N, self.N))
+        return (i + m < self.N).astype(np.float64)
+
+    @cached_property
+    def _tridiagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of minus the Laplacian: its main diagonals, and what couples entry i to i + 1, shapes (N, N) as [i, m]."""
+        N, s = self.N, (self.N - 1) / 2.0
+        i, m = np.indices((N, N))
+        z = s - np.arange(N)  # of S_z
+        step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))  # of S_+, the last one zero
+        j = np.minimum(i + m, N - 1)
+        main = (2.0 * s * (s + 1.0) - 2.0 * z[i] * z[j]) * self._inside
+        beside = -step[i] * step[j] * (i + m + 1 < N)
+        return main, beside
+
+    @cached_property
+    def _factors(self) -> tuple[np.ndarray, np.ndarray]:
+        """``L D L^T``: the entries below the diagonal of L, and those of 1 / D; zero outside."""
+        main, beside = self._tridiagonal
+        inverse, ratio = np.zeros(main.shape), np.zeros(main.shape)
+        pivot = main[0].copy()
+        for i in range(self.N):
+            there = self._inside[i] > 0.0
+            if i == self.N - 1:
+                there = there & (np.arange(self.N) > 0)  # of the main diagonal, the last pivot is zero
+            inverse[i, there] = 1.0 / pivot[there]
+            ratio[i] = beside[i] * inverse[i]
+            if i + 1 < self.N:
+                pivot = main[i + 1] - beside[i] * ratio[i]
+        return ratio, inverse
+
+    # -- matrices and spherical harmonics -----------------------------------------------------------------------------
+
+    def state(self, vorticity) -> jax.Array:
+        """The state of a vorticity matrix, shape (N, N), anti-Hermitian and without trace.
+
+        Raises
+        ------
+        InputError
+            If it is not anti-Hermitian, or has a trace: the integral of vorticity over the sphere vanishes.
+        """
+        W = np.asarray(vorticity)
+        if W.shape != (self.N, self.N):
+            raise InputError(f"a vorticity matrix has shape ({self.N}, {self.N}), not {W.shape}")
+        size = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
+        skew, trace = float(np.linalg.norm(W + W.conj().T)) / size, float(abs(np.trace(W))) / size
+        if not skew <= MOST_TRACE:
+            raise InputError(f"a vorticity matrix is anti-Hermitian, and this one is not, by {skew:.3g} of its norm")
+        if not trace <= MOST_TRACE:
+            raise InputError(
+                f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere has to vanish. "
+                "Subtract np.trace(W) / N from its diagonal"
+            )
+        return self.algebra.from_dual_matrix(W)
+
+    def matrix(self, mu) -> jax.Array:
+        """The vorticity matrix W of a state, shape (..., N, N)."""
+        return self.algebra.dual_matrix(mu)
+
+    def from_coefficients(self, a) -> jax.Array:
+        """The state of ``omega = sum_l a_l0 Y_l0 + sum_{m > 0} 2 Re(a_lm Y_lm)``, shape (N^2 - 1,).
+
+        Parameters
+        ----------
+        a : array of complex, shape (L + 1, L + 1), L < N
+            ``a[l, m]`` for m >= 0; entries with m > l count as nothing. Y_lm are orthonormal and have the phase of
+            Condon and Shortley, as those of SciPy.
+
+        Raises
+        ------
+        InputError
+            If l reaches N, ``a[0, 0]`` is not zero or an ``a[l, 0]`` is not real.
+        """
+        a = np.asarray(a, dtype=np.complex128)
+        if a.ndim != 2 or a.shape[0] != a.shape[1] or not 1 <= len(a) <= self.N:
+            raise InputError(f"coefficients a[l, m] have shape (L + 1, L + 1) with L < {self.N}, not {a.shape}")
+        if a[0, 0] != 0.0:
+            raise InputError(f"the mean of a vorticity is zero, and so is a[0, 0], not {a[0, 0]}")
+        if a[:, 0].imag.any():
+            raise InputError("the coefficients a[l, 0] of a real function are real")
+        W = np.zeros((self.N, self.N), dtype=np.complex128)
+        for m in range(len(a)):
+            vectors = self.harmonics(m, len(a) - 1)
+            on = np.arange(self.N - m)
+            W[on, on + m] = 1j * (vectors @ a[m:, m])
+        return self.algebra.from_dual_matrix(W - np.triu(W, 1).conj().T)
+
+    def coefficients(self, mu, most: int | None = None) -> np.ndarray:
+        """The coefficients of a state up to degree ``most``, shape (most + 1, most + 1): see the inverse above."""
+        L = self.N - 1 if most is None else min(whole(most, "the largest degree"), self.N - 1)
+        W, a = np.asarray(self.matrix(mu)), np.zeros((L + 1, L + 1), dtype=np.complex128)
+        for m in range(L + 1):
+            a[m:, m] = self.harmonics(m, L).T @ (-1j * np.diagonal(W, m))
+        return a
+
+    def harmonics(self, m: int, most: int) -> np.ndarray:
+        """The m-th diagonals of T_lm for l = m, …, most: orthonormal columns, shape (N - m, most - m + 1)."""
+        main, beside = self._tridiagonal
+        size = self.N - m
+        _, vectors = scipy.linalg.eigh_tridiagonal(
+            main[:size, m], beside[: size - 1, m], select="i", select_range=(0, most - m)
+        )
+        return (
+            (-1.0) ** m * vectors * np.sign(vectors[np.argmax(np.abs(vectors) > 1e-8, axis=0), np.arange(most - m + 1)])
+        )
+
+    def on_grid(self, mu, shape: tuple[int, int] = (128, 256), most: int | None = None) -> np.ndarray:
+        """The function on a grid of colatitudes ``pi (i + 1/2) / shape[0]`` and longitudes ``2 pi j / shape[1]``."""
+        a = self.coefficients(mu, most)
+        theta = math.pi * (np.arange(shape[0]) + 0.5) / shape[0]
+        waves = np.zeros((shape[0], shape[1]), dtype=np.complex128)
+        for m in range(len(a)):
+            along = legendre(m, len(a) - 1, theta) @ a[m:, m]
+            waves[:, m % shape[1]] += along * (1.0 if m == 0 else 2.0)
+        return np.fft.ifft(waves, axis=1).real * shape[1]
+
+    def random(self, seed: int, degrees: tuple[int, int], enstrophy: float = 1.0) -> jax.Array:
+        """A random vorticity of degrees l from the first to the last, of equal expected size, with that enstrophy."""
+        low, high = degrees
+        if not 1 <= low <= high < self.N:
+            raise InputError(f"degrees are from 1 to {self.N - 1}, not {degrees}")
+        random = np.random.default_rng(seed)
+        a = random.standard_normal((high + 1, high + 1)) + 1j * random.standard_normal((high + 1, high + 1))
+        l, m = np.indices(a.shape)
+        a = np.where((l >= low) & (m <= l), a, 0.0)
+        a[:, 0] = math.sqrt(2.0) * a[:, 0].real
+        mu = self.from_coefficients(a)
+        return mu * math.sqrt(enstrophy / float(jnp.sum(mu * mu)))
+
+
+def legendre(m: int, most: int, theta: np.ndarray) -> np.ndarray:
+    """``Y_lm(theta, 0)`` for l = m, …, most, shape (thetas, most - m + 1), by the recurrence in l."""
+    x, sine = np.cos(theta), np.sin(theta)
+    k = np.arange(1, m + 1)
+    size = 0.5 * np.log((2.0 * k + 1.0) / (2.0 * k)).sum() - 0.5 * math.log(4.0 * math.pi)
+    found = [(-1.0) ** m * np.exp(size + m * np.log(sine))]
+    before = np.zeros_like(x)
+    for l in range(m + 1, most + 1):
+        a = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
+        b = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0)) if l > m + 1 else 0.0
+        before, new = found[-1], a * (x * found[-1] - b * before)
+        found.append(new)
+    return np.stack(found, axis=1)
