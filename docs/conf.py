@@ -48,7 +48,7 @@ extensions = [
 ]
 
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "_ext", "generated/executed"]
+exclude_patterns = ["_build", "_ext", "generated/executed", "generated/spec_keys.md"]
 nitpicky = False  # types in the docstrings are prose
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
@@ -70,7 +70,7 @@ copybutton_selector = "div:not(.output) > div.highlight > pre"
 sphinx_gallery_conf = {
     "examples_dirs": ["../examples"],
     "gallery_dirs": ["gallery"],
-    "subsection_order": [f"../examples/{name}" for name in ("bodies", "algebras", "spins", "heat", "methods")] + ["*"],
+    "subsection_order": [f"../examples/{name}" for name in ("bodies", "algebras", "spins", "heat", "studies", "methods")] + ["*"],
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"/(?!plot_)[^/]*\.py$",
     "download_all_examples": False,
