@@ -67,6 +67,7 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     assert "there is no Dask scheduler" in call("study", "spec.toml", "--cluster", "nonsense://here").stderr
 
 
+@pytest.mark.slow
 def test_points_that_fail_make_the_exit_status_one(folder):
     result = call("study", spec(folder, MODEL, RUN, STUDY), "--set", "study.axes.rate=[0.5, -1.0]")
     assert result.exit_code == 1, result.output
@@ -114,6 +115,7 @@ def test_what_a_section_must_not_say(folder, study, problem):
     assert any(line.startswith(problem) for line in problems), problems
 
 
+@pytest.mark.slow
 def test_adaptive_steps_an_event_and_changes(folder):
     path = spec(folder, MODEL, RUN.replace("0.1\n", "{adaptive = 1e-9, largest = 0.5}\n").replace("4.0]", "400.0]"))
     plan = read(path, ["run.until.relaxed=1e-4", "model.parameters.rate=0.5", "outputs.figures=[]"])

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from .members import plain
 from .solve import Columns, Solver
 
 CLOSE = 1e-10
@@ -42,7 +41,6 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
         "system": f"{type(system).__name__}, {system.dim} components",
-        "example": plain(dict(task.example)),
         "motion": probe,
         "energy": energies,
         "operations": _operations(solver),

@@ -7,7 +7,7 @@ import math
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -46,7 +46,7 @@ CHUNK = 16_384
 ALONE = 64
 """Points of a chunk at most where each is built by itself."""
 
-TRIED = 12
+TRIED = 256
 """Points that are tried until one can be run, spread over all."""
 
 HOPELESS = 2
@@ -132,13 +132,16 @@ class Study:
             raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
         times = sorted({t for m in self._measures.values() if isinstance(m, AtTimes) for t in m.at.times})
         path = any(measure.path for measure in self._measures.values())
-        start, end = (float(t) for t in t_span)
-        table = Timetable((start, end), end - start if isinstance(step, Adaptive) else step, 1)
+        adaptive = isinstance(step, Adaptive)
+        table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, 1)
         if times and not (table.start <= times[0] and times[-1] <= table.end):
             raise InputError(
-                f"the times of measures lie within t_span = {(start, end)}, and {times[0]:g} to {times[-1]:g} do not"
+                f"the times of measures lie within t_span = {tuple(t_span)}, and {times[0]:g} to {times[-1]:g} do not"
             )
         every = any(m.path and not isinstance(m, AtTimes) for m in self._measures.values())
+        off = [t for t in times if every and np.abs(table.times - t).min() > 1e-9 * table.h]
+        if off:
+            raise InputError(f"beside a function of a solution lt.At takes times at which steps end, not {off[0]:g}")
         save_at = tuple(times) if times and not every else None
         saves = (len(times) if save_at else table.steps + 1) if path else 0
         self._chunk, self._steps, self._saves = chunk, table.steps, saves
@@ -159,10 +162,11 @@ class Study:
         self.store = Path(store)
         parameters = self._axes.parameters
         self._task = Task(
-            builder(build, parameters), parameters, x0, attitude, (start, end), step, method, until, engine,
+            builder(build, parameters), parameters, x0, attitude, (table.start, table.end), step, method, until, engine,
             self._measures, {}, save_at, saves,
         )  # fmt: skip
         self._solved: tuple[Solver, Columns, np.ndarray] | None = None
+        self._place: tuple[int, ...] = ()
 
     # -- running --------------------------------------------------------------------------------------------------
 
@@ -207,7 +211,7 @@ class Study:
     def _work(self, store: Store, axes: Axes, survey: Survey, bar: Bar, client: Any) -> None:
         if not survey.todo:
             return
-        solver = self._prepared(store.study["example"])[0]
+        solver = self._prepared(axes, tuple(store.study["place"]))[0]
         if client is None:
             here(solver, store, axes, survey, bar)
         else:
@@ -269,7 +273,7 @@ class Study:
         """The store, made where there is none, and the axes in its order; refused where it is of another study."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
             solver, columns, x0 = self._prepared()
-            described = identity.description(solver, columns, x0)
+            described = {**identity.description(solver, columns, x0), "place": list(self._place)}
             about: dict[str, dict[str, Any]] = {
                 **self._about,
                 "status": {
@@ -300,7 +304,7 @@ class Study:
         store = Store.open(self.store)
         try:
             axes = matched(self._axes, store.axes())
-            solver, columns, x0 = self._prepared(store.study["example"])
+            solver, columns, x0 = self._prepared(axes, tuple(store.study["place"]))
             lines = identity.differences(identity.description(solver, columns, x0), store.study)
         except InputError as error:
             lines = [str(error)]
@@ -316,35 +320,35 @@ class Study:
         most = ALONE if solver.members.family is None else CHUNK
         return max(1, min(most, max(64, WORK // max(self._steps, 100))))
 
-    def _prepared(self, example: Mapping[str, Any] | None = None) -> tuple[Solver, Columns, np.ndarray]:
-        """The solver, and its example solved: a point given, or the first that can be run."""
-        if self._solved is not None and (example is None or plain(dict(self._solved[0].task.example)) == example):
+    def _prepared(self, axes: Axes | None = None, place: tuple[int, ...] = ()) -> tuple[Solver, Columns, np.ndarray]:
+        """The solver, and its example solved: the point at a place of some axes, or the first that can be run."""
+        if self._solved is not None and (axes is None or self._solved[0].task.example == _at(axes, place)[0]):
             return self._solved
-        size, first, failed = self._axes.size, "", 0
-        numbers: Sequence[int] = range(size)
-        if example is None:
-            numbers = list(dict.fromkeys(int(size * _spread(k)) for k in range(TRIED)))
-        for number in numbers:
-            place = tuple(np.array([i]) for i in np.unravel_index(number, self._axes.shape))
-            points = {name: values[0] for name, values in self._axes.points(place).items()}
-            if example is not None and plain(points) != dict(example):
-                continue
-            why, built = self._tried(points, self._axes.states(place))
+        axes, places = (self._axes, self._candidates()) if axes is None else (axes, [place])
+        first, failed = "", 0
+        for place in places:
+            why, built = self._tried(*_at(axes, place))
             if self._solved is not None and not why:
+                self._place = place
                 return self._solved
+            first = first or f"{axes.told(place)}: {why}"
             failed += built
-            first = first or f"{self._axes.told(tuple(int(p[0]) for p in place))}: {why}"
             if failed == HOPELESS:
                 break
         raise InputError(f"no point of the study can be run; the first: {first}")
 
+    def _candidates(self) -> list[tuple[int, ...]]:
+        """Places spread over the axes, the first point first."""
+        size, shape = self._axes.size, self._axes.shape
+        numbers = dict.fromkeys(int(size * _spread(k)) for k in range(TRIED))
+        return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
+
     def _tried(self, point: dict[str, Any], states: np.ndarray | None) -> tuple[str, bool]:
         """Solve a point by itself; why it cannot be, or nothing, and whether its system was built."""
+        self._solved = None
         self._check_axes(point)
         try:
             solver = Solver(dataclasses.replace(self._task, example=point))
-        except (KeyboardInterrupt, SystemExit):
-            raise
         except Exception as error:  # the builder may be anyone's, and may raise at some points
             return told(error), False
         columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1)
@@ -384,6 +388,12 @@ class Study:
             )
 
 
+def _at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
+    """The point at a place, and its initial state, shape (1, n), where an axis brings one."""
+    rows = tuple(np.array([i]) for i in place)
+    return plain({name: values[0] for name, values in axes.points(rows).items()}), axes.states(rows)
+
+
 def _spread(k: int) -> float:
     """The k-th number of van der Corput's sequence: 0, 1/2, 1/4, 3/4, ..."""
     return sum((k >> bit & 1) / 2 ** (bit + 1) for bit in range(k.bit_length()))
@@ -419,9 +429,7 @@ def load_study(path: Any) -> xarray.Dataset:
         found = xarray.open_zarr(store.root, consolidated=True, chunks=None)
     except Exception as error:  # of a dozen kinds
         raise FileError(f"{path} cannot be read: {error}") from error
-    coordinates = [name for name, array in store.arrays.items() if name not in store.chunked]
-    found = found.set_coords(coordinates)
-    return found.drop_vars([name for name in found.coords if name in store.attributes["axes"] and not len(found[name])])
+    return found.set_coords([name for name in store.arrays if name not in store.chunked])
 
 
 def audit(path: Any, **tolerances: float) -> Audit:

@@ -175,6 +175,7 @@ def test_another_study_is_refused_and_the_difference_named(done):
     assert same.run().complete  # another function that does the same
 
 
+@pytest.mark.slow
 def test_a_builder_that_looks_at_values_is_called_for_each_point(tmp_path):
     def chain(p):
         if p["rate"] > 1.0:
@@ -191,6 +192,7 @@ def test_a_builder_that_looks_at_values_is_called_for_each_point(tmp_path):
     np.testing.assert_allclose(results.final.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_failures_broken_laws_and_measures_that_raise_are_statuses(tmp_path):
     def gains(p):  # a friction whose sign the library is not told
         energy = lt.Quadratic([1.0, 0.5, 0.25])
@@ -274,6 +276,7 @@ def test_what_cannot_be_run_is_said_before_anything_is_written(changes, message,
         ({"measure": {"m": lt.At([1.0, 9.0])}}, "and 1 to 9 do not"),
         ({"measure": {"a": lt.Relaxed(1e-3), "b": lt.Relaxed(1e-4)}}, "is to end it too"),
         ({"chunk": 0}, "chunk must be a positive integer"),
+        ({"measure": {"a": lt.At([0.25]), "f": len}}, "lt.At takes times at which steps end, not 0.25"),
         ({"x0": None}, "x0 is missing"),
         ({"method": "midpoint"}, "the method must be an integrator"),
         ({"units": {"speed": "m/s"}}, "no axis, parameter or measure 'speed'"),
@@ -389,6 +392,7 @@ def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path)
     np.testing.assert_allclose(shaped.results.turned[1, 0], wanted, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_what_the_array_engine_runs_does_not_depend_on_chunks_either(tmp_path):
     results = []
     for chunk in (1, 7):
