@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import real_array
-from manifolds.structures.spins import Spins, cross
+from manifolds.structures.spins import Planes, Spins, cross_planes, planes
 
 from ..errors import InputError
 from ..functions.indices import Indices
@@ -102,36 +102,57 @@ class LandauLifshitz(Dissipation):
         return LandauLifshitz(self.rate, self.bath, spins.others)
 
     def force(self, system, x, dH, dS, dL):
-        spins = system.poisson
-        s, a, rate = spins.spins(x), spins.spins(dH), self.rate.reshape(-1, 1)
-        torque = cross(s, a)
         if not self.baths:
-            return spins.joined(rate * cross(s, torque), jnp.zeros(0))
-        T, e = dH[3 * spins.count :], dS[3 * spins.count :]
-        pull = cross(s, spins.spins(dS)) - self._of_sites(e / T) * torque
-        pull = rate * self._of_sites(jnp.abs(T)) * pull
-        return spins.joined(cross(pull, s), self._of_baths(-torque * pull) / T)
+            return system.poisson.joined(*self.parts(system, x, dH, None, None))
+        spins = system.poisson
+        return spins.joined(*self.parts(system, x, dH, spins.spins(dS), dS[3 * spins.count :]))
+
+    def parts(self, system, x, dH, dS: Planes | None, e) -> tuple[Planes, jax.Array]:
+        """The components of the force on the spins, and the force on the baths, shape (m,).
+
+        ``dS`` are those of the gradient of the entropy by the spins, None where it is known to vanish, and ``e`` is
+        that by the entropies of the baths.
+        """
+        spins = system.poisson
+        s, rate = spins.spins(x), self.rate.reshape(-1)
+        torque = cross_planes(s, spins.spins(dH))
+        if not self.baths:
+            return _scaled(rate, cross_planes(s, torque)), jnp.zeros(0)
+        T = dH[3 * spins.count :]
+        share, size = self._of_sites(e / T), rate * self._of_sites(jnp.abs(T))
+        if dS is None:
+            pull = _scaled(-size * share, torque)
+        else:
+            a, b, c = cross_planes(s, dS)
+            pull = _scaled(size, (a - share * torque[0], b - share * torque[1], c - share * torque[2]))
+        return cross_planes(pull, s), self._warmed(torque, pull) / T
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
-        s, a, rate = spins.spins(x), spins.spins(dH), self.rate.reshape(-1, 1)
-        torque = cross(s, a)
-        T = dH[3 * spins.count :]
-
-        def times(w):
-            w = w.reshape(spins.count, 3)
-            return spins.joined(cross(w, s), self._of_baths(-torque * w) / T if self.baths else jnp.zeros(0))
-
+        s, rate, T = spins.spins(x), self.rate.reshape(-1), dH[3 * spins.count :]
+        torque = cross_planes(s, spins.spins(dH))
         size = rate * self._of_sites(jnp.abs(T)) if self.baths else rate
         root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
-        return Factor(3 * spins.count, lambda w: times(root * w.reshape(spins.count, 3)))
+
+        def times(w):
+            pull = _scaled(root, planes(w.reshape(spins.count, 3)))
+            warmed = self._warmed(torque, pull) / T if self.baths else jnp.zeros(0)
+            return spins.joined(cross_planes(pull, s), warmed)
+
+        return Factor(3 * spins.count, times)
 
     def _of_sites(self, values) -> jax.Array:
-        """Values of baths, shape (m,), at the sites that heat them, shape (count, 1) or (1, 1)."""
-        return values[:1, None] if self.bath is None else values[np.asarray(self.bath).ravel()][:, None]
+        """Values of baths, shape (m,), at the sites that heat them, shape (count,) or (1,)."""
+        return values[:1] if self.bath is None else values[np.asarray(self.bath).ravel()]
 
-    def _of_baths(self, values) -> jax.Array:
-        """The sums of values at sites, shape (count, 3), for each bath."""
+    def _warmed(self, torque: Planes, pull: Planes) -> jax.Array:
+        """``-sum t . pull`` over the sites of each bath, shape (m,)."""
         if self.bath is None:
-            return jnp.zeros(self.baths).at[0].set(jnp.sum(values))
-        return jax.ops.segment_sum(jnp.sum(values, axis=1), np.asarray(self.bath).ravel(), self.baths)
+            heat = sum(jnp.dot(t, p) for t, p in zip(torque, pull, strict=True))
+            return jnp.zeros(self.baths).at[0].set(-heat)
+        heat = -(torque[0] * pull[0] + torque[1] * pull[1] + torque[2] * pull[2])
+        return jax.ops.segment_sum(heat, np.asarray(self.bath).ravel(), self.baths)
+
+
+def _scaled(factor, vectors: Planes) -> Planes:
+    return factor * vectors[0], factor * vectors[1], factor * vectors[2]

@@ -307,7 +307,10 @@ def equations(
     def slopes(k):
         return method.slopes(system, state.x, state.low, h, k)
 
-    return slopes, method.predict(state.k, state.before), lambda k: scale_of(state.x, h, k, rules)
+    measure = rules.size(state.x.size)
+    whole = measure(state.x) / h  # once a step
+
+    return slopes, method.predict(state.k, state.before), lambda k: whole + measure(k) + rules.vanished
 
 
 def scale_of(x, h, k, rules: Rules = RULES):

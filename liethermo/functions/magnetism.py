@@ -90,7 +90,9 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     shape = checked_sites(sites)
     K = _of_sites(strength, shape, (), "an anisotropy constant")
     n = _of_sites(axis, shape, (3,), "an axis")
-    return OnSites(shape, -2.0 * K[..., None, None] * n[..., :, None] * n[..., None, :], None)
+    if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # along axes of space
+        return OnSites(shape, -2.0 * K[..., None] * n**2, None, None)
+    return OnSites(shape, -2.0 * K, None, n)
 
 
 def zeeman(sites, field, moment=1.0) -> Energy:
@@ -108,21 +110,23 @@ def zeeman(sites, field, moment=1.0) -> Energy:
     """
     shape = checked_sites(sites)
     B, moment = _of_sites(field, shape, (3,), "a field"), _of_sites(moment, shape, (), "a moment")
-    return OnSites(shape, None, -moment[..., None] * B)
+    return OnSites(shape, None, -moment[..., None] * B, None)
 
 
 class OnSites(Energy):
-    """``sum_i s_i . A_i s_i / 2 + b_i . s_i``.
+    """``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n ``sum_ic A_ic s_ic^2 / 2``, c a component.
 
     Attributes
     ----------
     sites : tuple of int
-    A, b : array, shapes (3, 3) and (3,), the same at all sites, or with the axes of the sites before; or None
+    A : array, shape () or that of the sites, (3,) or ``(*sites, 3)`` without n, or None
+    b, n : array, shape (3,) or ``(*sites, 3)``, or None
     """
 
     sites: tuple[int, ...] = eqx.field(static=True)
     A: jax.Array | None
     b: jax.Array | None
+    n: jax.Array | None
 
     @property
     def is_quadratic(self) -> bool:
@@ -130,19 +134,21 @@ class OnSites(Energy):
 
     def value(self, x) -> jax.Array:
         s = spins_of(x, self.sites)
-        linear = 0.0 if self.b is None else jnp.sum(self.b * s)
-        return linear + (jnp.zeros(()) if self.A is None else 0.5 * jnp.sum(s * self._turned(s)))
+        linear = jnp.zeros(()) if self.b is None else _product(jnp.broadcast_to(self.b, s.shape), s)
+        return linear + (0.0 if self.A is None else 0.5 * _product(s, self._drawn(s)))
 
     def gradient(self, x) -> jax.Array:
         s = spins_of(x, self.sites)
-        found = jnp.zeros_like(s) if self.A is None else self._turned(s)
+        found = jnp.zeros_like(s) if self.A is None else self._drawn(s)
         return placed(found if self.b is None else found + self.b, x)
 
-    def _turned(self, s) -> jax.Array:
-        """``A_i s_i``, by components: a matrix product of order three is no work for a library."""
+    def _drawn(self, s) -> jax.Array:
+        """``A_i (n_i . s_i) n_i``."""
         assert self.A is not None
-        parts = [self.A[..., i] * s[..., i, None] for i in range(3)]
-        return parts[0] + parts[1] + parts[2]
+        if self.n is None:
+            return self.A * s
+        a, b, c = (self.n[..., i] * s[..., i] for i in range(3))
+        return (self.A * (a + b + c))[..., None] * self.n
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
@@ -172,7 +178,7 @@ class Bonds(Energy):
 
     def value(self, x) -> jax.Array:
         s = spins_of(x, self.sites)
-        return jnp.sum(s * self._from_ahead(s))
+        return _product(s, self._from_ahead(s))
 
     def gradient(self, x) -> jax.Array:
         s = spins_of(x, self.sites)
@@ -214,6 +220,11 @@ def placed(covectors, x) -> jax.Array:
     """Covectors of the spins, shape ``(*sites, 3)``, as one of the state x."""
     flat = covectors.reshape(-1)
     return flat if flat.size == x.size else jnp.concatenate([flat, jnp.zeros(x.size - flat.size)])
+
+
+def _product(u, v) -> jax.Array:
+    """``sum u_i . v_i``; as the product of two vectors it is ten times as fast as a sum over what v is made of."""
+    return jnp.dot(u.reshape(-1), v.reshape(-1))
 
 
 def checked_sites(sites) -> tuple[int, ...]:

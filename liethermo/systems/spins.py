@@ -14,11 +14,14 @@ import manifolds as mf
 from manifolds._arrays import real_array
 
 from ..dissipation.base import Dissipation
+from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
+from ..functions.checks import check_scalar, recognised
 from ..functions.each import Each
 from ..functions.energy import Energy, Function, Negative, Sum, TimeDependent, as_energy, is_traced
 from ..functions.magnetism import checked_sites, spins_of
 from ..functions.spheres import Spheres, Squares
+from ..functions.spins_and_baths import SpinsAndBaths
 from .base import System
 
 LENGTHS = "sum |s|^2 / 2"
@@ -65,14 +68,26 @@ class SpinSystem(System):
         self.lattice = checked_sites(sites)
         poisson = mf.Spins(self.lattice, 0 if baths is None else baths.number, ratio)
         terms = [_of_spins(term, self.lattice) for term in as_energy(energy, "the energy").terms]
-        entropy = None
+        whole = terms[0] if len(terms) == 1 else Sum(tuple(terms))
+        entropy = None if baths is None else _LastSum(baths.number)
         if baths is not None:
-            terms.append(baths.at(3 * poisson.count))
-            entropy = _LastSum(baths.number)
+            whole = check_scalar(whole, self._size, "the energy", timed=True)
+            if whole.depends_on_time:
+                whole = Sum((*whole.terms, baths.at(self._size)))
+            else:
+                whole = SpinsAndBaths(recognised(whole, self._size), baths.at(0), self._size)
         named = momentum_maps if isinstance(momentum_maps, Mapping) else {J.__name__: J for J in momentum_maps}
         maps = {name: _of_spins(as_energy(J, f"momentum map {name!r}"), self.lattice) for name, J in named.items()}
-        whole = terms[0] if len(terms) == 1 else Sum(tuple(terms))
         self._build(poisson, poisson.dim, whole, entropy, dissipation, maps, validate)
+
+    def field(self, x, dH, dS, dL=()):
+        """As for every system, the motion and the damping of the spins joined before they become a state's."""
+        if not isinstance(self.dissipation, LandauLifshitz) or not isinstance(self.poisson, mf.Spins):
+            return super().field(x, dH, dS, dL)
+        heating = None if self.entropy is None else dS[self._size :]  # the entropy is that of the baths
+        damped, warmed = self.dissipation.parts(self, x, dH, None, heating)
+        a, b, c = self.poisson.turned(x, dH)
+        return self.poisson.joined((a + damped[0], b + damped[1], c + damped[2]), warmed)
 
     def state(self, x, batch: bool = False) -> jax.Array:
         """A state in one row; also from spins of shape ``(*sites, 3)`` alone, with every bath at entropy zero."""

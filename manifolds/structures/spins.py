@@ -14,6 +14,9 @@ from .._sizes import checked_size
 from ..errors import ParameterError
 from .poisson import PoissonStructure
 
+Planes = tuple[jax.Array, jax.Array, jax.Array]
+"""Vectors in space by components: three arrays of one shape. What is computed from these is put together once."""
+
 
 class Spins(PoissonStructure):
     """``Pi(x) alpha = (gamma_i s_i x alpha_i, 0)`` for states ``x = (s_1, s_2, …, y)``, s_i in R^3 at each site.
@@ -60,26 +63,47 @@ class Spins(PoissonStructure):
     def dim(self) -> int:
         return 3 * self.count + self.others
 
-    def spins(self, x) -> jax.Array:
-        """The spins of a state, shape (..., n) to (..., count, 3)."""
-        return x[..., : 3 * self.count].reshape(*x.shape[:-1], self.count, 3)
+    def spins(self, x) -> Planes:
+        """The components of the spins of a state, shape (n,): three arrays, shape (count,)."""
+        return planes(x[: 3 * self.count].reshape(self.count, 3))
 
-    def joined(self, spins, others) -> jax.Array:
-        """A state, shape (n,), from its spins, shape (count, 3), and the other components."""
-        flat = spins.reshape(3 * self.count)
+    def joined(self, spins: Planes, others) -> jax.Array:
+        """A state, shape (n,), from the components of its spins and the other components, shape (others,)."""
+        flat = interleaved(spins).reshape(3 * self.count)
         return flat if self.others == 0 else jnp.concatenate([flat, others])
 
+    def turned(self, x, alpha) -> Planes:
+        """The components of ``gamma_i s_i x alpha_i``."""
+        ratio, (a, b, c) = self.ratio.reshape(-1), cross_planes(self.spins(x), self.spins(alpha))
+        return ratio * a, ratio * b, ratio * c
+
     def sharp(self, x, alpha) -> jax.Array:
-        turned = self.ratio.reshape(-1, 1) * cross(self.spins(x), self.spins(alpha))
-        return self.joined(turned, jnp.zeros(self.others))
+        return self.joined(self.turned(x, alpha), jnp.zeros(self.others))
 
     def tensor(self, x) -> jax.Array:
         """The matrix Pi(x), shape (n, n): for few spins alone."""
         return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
 
 
+def planes(v) -> Planes:
+    """The components of vectors in space, shape (..., 3)."""
+    return v[..., 0], v[..., 1], v[..., 2]
+
+
+def interleaved(spins: Planes) -> jax.Array:
+    """The vectors of some components, shape (..., 3).
+
+    By selection: the loop of a concatenation has a branch for every entry, and takes three times as long.
+    """
+    a, b, c = (component[..., None] for component in spins)
+    return jnp.where(np.array([True, False, False]), a, jnp.where(np.array([False, True, False]), b, c))
+
+
+def cross_planes(u: Planes, v: Planes) -> Planes:
+    """``u x v``, by components."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
 def cross(u, v) -> jax.Array:
-    """``u x v`` of vectors in space, shape (..., 3): by rotations of the axis, which fuse with what is around them."""
-    a, b, c = (u[..., i] for i in range(3))
-    d, e, f = (v[..., i] for i in range(3))
-    return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
+    """``u x v`` of vectors in space, shape (..., 3)."""
+    return interleaved(cross_planes(planes(u), planes(v)))

@@ -85,6 +85,10 @@ ENERGIES = {
         mag.anisotropy(SITES, JS, DS),
         lambda s: -jnp.sum(JS * jnp.sum(DS * s, axis=-1) ** 2),
     ),
+    "along axes": (
+        mag.anisotropy(SITES, JS, (0.0, 2.0, 0.0)),
+        lambda s: -jnp.sum(JS * (2.0 * s[..., 1]) ** 2),
+    ),
     "Zeeman": (mag.zeeman(SITES, (0.1, 0.2, 0.3), JS), lambda s: -jnp.sum(JS * (s @ jnp.array([0.1, 0.2, 0.3])))),
 }
 
@@ -292,7 +296,7 @@ def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
     system = small()
     monkeypatch.setattr(lt.SpinSystem, "spheres", None)
     solution = lt.integrate(
-        system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(4), engine="compiled"
+        system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(6), engine="compiled"
     )
     assert np.abs(np.linalg.norm(system.spins(solution.x), axis=-1) - 1.0).max() > 1e-6
 
