@@ -8,6 +8,7 @@ from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
 from .runge_kutta import MetriplecticRungeKutta
+from .taylor import MetriplecticTaylor
 from .variational.discrete import DiscreteSystem, FiniteDifference
 from .variational.gauss import VariationalGauss
 from .variational.lie import LieVariational
@@ -32,6 +33,7 @@ __all__ = [
     "MetriplecticGauss",
     "MetriplecticMidpoint",
     "MetriplecticRungeKutta",
+    "MetriplecticTaylor",
     "OneStepMethod",
     "Reference",
     "VariationalGauss",

@@ -123,6 +123,11 @@ class OneStepMethod(eqx.Module):
         """The gradients of the energy that the step uses at its stages, shape (stages, n)."""
         raise InputError(f"{self} does not say which velocities it moves with, so attitudes cannot be reconstructed")
 
+    def suited(self, tolerance: float | None) -> OneStepMethod:
+        """The method for adaptive steps of a relative tolerance, or None for steps of given sizes: itself, mostly."""
+        del tolerance
+        return self
+
     def pulled(self, local) -> OneStepMethod:
         """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
         return self

@@ -33,6 +33,24 @@ ORDERS = (4, 6, 8)
 
 
 @functools.cache
+def lobatto_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes, both ends among them, and weights on [0, 1]: exact to the degree ``2 nodes - 3``, all weights positive."""
+    m = nodes - 1  # the inner ones are the roots of P_m'
+    x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)
+    for _ in range(3):  # Newton's method from double precision
+        values, before = _legendre(m, x), _legendre(m - 1, x)
+        slope = m * (before - x * values) / (1 - x * x)
+        x = x - slope * (1 - x * x) / (2 * x * slope - m * nodes * values)
+    x = np.concatenate([[-1], np.sort(x), [1]])
+    b = 1 / (m * nodes * _legendre(m, x) ** 2)
+    return ((1 + x) / 2).astype(np.float64), b.astype(np.float64)
+
+
+def _legendre(m: int, x) -> np.ndarray:
+    return np.polynomial.legendre.Legendre.basis(m)(x)
+
+
+@functools.cache
 def lobatto(order: int) -> ExplicitTableau:
     """The tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
     A, b = {4: _kutta, 6: _butcher, 8: _cooper_verner}[order]()

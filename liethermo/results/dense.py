@@ -12,9 +12,10 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Dense:
-    """``x(t)`` anywhere: to O(h^(s+1)) by the polynomial of collocation with s stages, to O(h^4) by explicit methods.
+    """``x(t)`` anywhere: to O(h^(s+1)) by the polynomial of collocation with s stages, to O(h^4) by Runge-Kutta steps.
 
-    That is less than the order of the states at the ends of steps, where alone the laws are exact.
+    That is less than the order of the states at the ends of steps; Taylor steps have theirs between too. The laws are
+    exact at the ends alone.
 
     Attributes
     ----------

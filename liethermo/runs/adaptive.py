@@ -59,6 +59,11 @@ class Adaptive:
         if isinstance(self.most_steps, bool) or not isinstance(self.most_steps, int) or self.most_steps < 1:
             raise InputError(f"most_steps must be a positive integer, not {self.most_steps!r}")
 
+    @property
+    def tolerance(self) -> float:
+        """What a method of any order takes its order from."""
+        return self.rtol or self.atol
+
 
 def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, event: Event | None) -> Pacing:
     """How the steps of a run over a span of some length are chosen, and what is watched.

@@ -121,7 +121,7 @@ def ensemble(
     run = np.setdiff1d(np.arange(len(states)), list(reasons))
     family, states = family.select(run), states[run]
     told = member = family.representative
-    member, method = as_run(member, method, noise)
+    member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
     if isinstance(member, AttitudeSystem):
         attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude

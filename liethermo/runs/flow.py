@@ -57,7 +57,7 @@ def flow(
     x, table = system.state(x0), Timetable(t_span, step, save_every)
     n, shown, system = system.dim, system, driven(system)
     x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
-    method = (DEFAULT_METHOD if method is None else method).pulled(system).on(system)
+    method = (DEFAULT_METHOD if method is None else method).suited(None).pulled(system).on(system)
     method = traced_energies(method, system.dim)
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])

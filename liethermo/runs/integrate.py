@@ -106,7 +106,7 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    system, method = as_run(system, method, noise)
+    system, method = as_run(system, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     prepared(system, method)  # refuses what the method cannot run
     if attitude is not None and not isinstance(system, AttitudeSystem):
         raise InputError(NO_GROUP)

@@ -22,8 +22,10 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
 
 
 @remembered
-def as_run(system: System, method, noise: Fluctuations | None = None) -> tuple[System, Any]:
-    """The system and the method as they are run.
+def as_run(
+    system: System, method, noise: Fluctuations | None = None, tolerance: float | None = None
+) -> tuple[System, Any]:
+    """The system and the method as they are run, with adaptive steps of a tolerance or with given ones.
 
     With clock and work where the energy depends on time, with noise, with attitudes where there is a group, in charts
     on a manifold.
@@ -34,7 +36,7 @@ def as_run(system: System, method, noise: Fluctuations | None = None) -> tuple[S
         return driven(system, unit=1.0), method  # its errors are measured component by component
     system = driven(system)
     method = method if noise is None else noise.on(system, method)
-    method = traced_energies(method.pulled(system).on(system), system.dim)
+    method = traced_energies(method.suited(tolerance).pulled(system).on(system), system.dim)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
         return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
     return system, method

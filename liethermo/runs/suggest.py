@@ -12,7 +12,7 @@ import numpy as np
 from ..engines.choice import Chosen
 from ..engines.pace import GROWTH
 from ..errors import InputError, LiethermoError
-from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, OneStepMethod
+from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven
 from .adaptive import Adaptive
 from .stepwise import run
@@ -90,7 +90,7 @@ class MethodSuggestion:
         return "\n".join([*lines, self.reason])
 
 
-CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
+CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), MetriplecticTaylor(), *map(MetriplecticGauss, (1, 2, 3, 4)))
 
 
 def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
@@ -133,6 +133,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
 
 def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
     system = driven(system)
+    method = method.suited(rtol)
     used = method.pulled(system).on(system)
     used.check(system)
     x = np.asarray(system.begin(x0, t0) if isinstance(system, DrivenSystem) else system.state(x0))

@@ -215,14 +215,14 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
             results = found if isinstance(found, list) else [found]
             _check_results(eqn, results)
         except NotImplementedError as error:
-            raise UnsupportedPrimitive(name, _where(eqn), str(error)) from None
+            raise UnsupportedPrimitive(name, origin(eqn), str(error)) from None
         except UnsupportedPrimitive as inside:
             if inside.where != UNKNOWN:
                 raise
-            raise UnsupportedPrimitive(inside.primitive, _where(eqn), inside.reason, inside.too_large) from None
+            raise UnsupportedPrimitive(inside.primitive, origin(eqn), inside.reason, inside.too_large) from None
         except LimitExceededError:
             reason = f"within the size limit: the program exceeds {b.limit} scalar instructions"
-            raise UnsupportedPrimitive(name, _where(eqn), reason, too_large=True) from None
+            raise UnsupportedPrimitive(name, origin(eqn), reason, too_large=True) from None
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
@@ -357,7 +357,7 @@ def _live(
     return tuple(order), renamed
 
 
-def _where(eqn) -> str:
+def origin(eqn) -> str:
     """The innermost line outside JAX that led to an equation."""
     for frame in getattr(eqn.source_info.traceback, "frames", ()):
         if not {"jax", "jaxlib", "equinox"} & set(Path(frame.file_name).parts):

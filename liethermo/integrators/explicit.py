@@ -1,0 +1,261 @@
+"""What explicit methods with both laws share: a step is brought back onto the levels that it has to end on."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import manifolds as mf
+
+from ..dissipation.base import portions
+from ..errors import InputError
+from ..functions.energy import Energy
+from ..functions.frames import towards
+from ..functions.gradients import EPS, Gonzalez
+from ..systems import ChartSystem, System
+from .base import OneStepMethod
+from .charts import InCharts, in_charts
+from .preserved import check_preserved, preserved_functions, seen_on
+
+SLOPE, ERROR, MISSED, LEVELS, OWN = range(5)
+"""What stands in the vectors that a step hands on: its mean slope, the estimate of its local error; in each component,
+what is missed of the levels after the corrections; the levels that the run has begun on; from OWN on what a method adds
+for the states between. Error and what is missed are over h."""
+
+NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
+"""What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
+back, and the most that one takes back: far below what its rounding is."""
+
+
+class Law(NamedTuple):
+    """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
+
+    function: Energy
+    sign: float
+
+
+LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
+
+
+class Unlawful(NamedTuple):
+    """A step before its corrections.
+
+    Attributes
+    ----------
+    d : array, shape (n,)
+        The displacement.
+    changes : array, shape (laws,)
+        What the functions of the laws have to change by, by a quadrature of their rates with nonnegative weights.
+    error : array, shape (n,)
+        Of the size of the local error, over h.
+    between : array, shape (rows, n)
+        Further rows to hand on.
+    """
+
+    d: jax.Array
+    changes: jax.Array
+    error: jax.Array
+    between: jax.Array
+
+
+class ExplicitMethod(OneStepMethod):
+    """A step y of some explicit method, and x' the point near y where
+
+        H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + what it has produced,
+
+    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. What the entropy has produced
+    is a quadrature of ``sigma = grad S . K grad S >= 0`` with nonnegative weights, of the order of the method.
+
+    The point x' is found by Newton's method along the gradients of H and the C, and that of S as far as it is
+    independent of these. What a function changes by is taken from a discrete gradient along the step, whose rounding
+    vanishes with the step. So a state that relaxes is not held off its equilibrium by rounding.
+
+    Vectors of constant length, such as many spins, are held one by one, in work and memory that grow with their number:
+    each is brought back to its sphere along its radius, and the corrections above are made along the spheres.
+
+    Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
+    by its own quadrature.
+
+    A subclass says what the step is before it is corrected: :meth:`uncorrected`.
+
+    Parameters
+    ----------
+    number : int or None
+        The order; None until :meth:`suited` has chosen one.
+    preserve, retraction, held
+        As of :class:`.MetriplecticRungeKutta`.
+    """
+
+    corrections: ClassVar[int] = 4
+    """Newton corrections of a step: a relative error of a twentieth is one of rounding after them."""
+
+    number: int | None = eqx.field(static=True)
+    functions: tuple[Energy, ...]
+    retraction: str | mf.Retraction | None = eqx.field(static=True)
+    held: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self, number: int | None, preserve: Sequence, retraction: str | mf.Retraction | None, held: tuple[str, ...]
+    ):
+        self.number, self.functions = number, preserved_functions(preserve)
+        self.retraction, self.held = retraction, held
+
+    @abstractmethod
+    def uncorrected(self, system: System, laws: list[Law], x, low, h) -> Unlawful:
+        """The step from x + low, which ends near the levels."""
+
+    @property
+    def order(self) -> int:
+        assert self.number is not None
+        return self.number
+
+    @property
+    def explicit(self) -> bool:
+        return True
+
+    @property
+    def preserves(self) -> frozenset[str]:
+        return frozenset({"energy", "entropy_law", "casimirs"})
+
+    def keeps(self, system: System, name: str) -> bool:
+        return name in system.first_integrals()
+
+    def on(self, system: System) -> OneStepMethod:
+        seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
+        method = in_charts(seen, system, self.retraction, "exp")
+        if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
+            raise InputError(
+                f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
+            )
+        return method
+
+    def pulled(self, local: ChartSystem) -> OneStepMethod:
+        return self._with(local.pulled, self.held)
+
+    def _with(self, change: Callable, held: tuple[str, ...]) -> Self:
+        """The method with its preserved functions changed, holding these of the system."""
+        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
+
+    def check(self, system: System) -> None:
+        """Raise InputError unless the system has a law to hold and conserves what is to be preserved."""
+        if not self._laws(system):
+            raise InputError(f"{self} holds the laws of a system, and this one claims none: take lt.Reference")
+        check_preserved(system, self.functions)
+
+    def start(self, system: System, x) -> jax.Array:
+        levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: x.shape[0]]
+        levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
+        return jnp.zeros((self.stages, x.shape[0])).at[SLOPE].set(system.vector_field(x)).at[LEVELS].set(levels)
+
+    # -- the step -----------------------------------------------------------------------------------------------------
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        """The vectors that the step hands on; of those before it the levels alone are needed."""
+        laws = self._laws(system)
+        d, changes, error, between = self.uncorrected(system, laws, x, low, h)
+        if not isinstance(
+            system, ChartSystem
+        ):  # whose coordinates, and with them the levels' row, are new at every step
+            changes = changes + self._steering(laws, x, low, k[LEVELS])
+        d, missed = self._corrected(system, laws, x, low, d, changes)
+        return jnp.stack([d / h, error, jnp.broadcast_to(missed / h, x.shape), k[LEVELS], *between])
+
+    def _steering(self, laws: list[Law], x, low, levels) -> jax.Array:
+        """What functions that are conserved are to change by, back to the levels that the run has begun on.
+
+        Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
+        """
+
+        def back(law: Law, level) -> jax.Array:
+            gradient = law.function.gradient(x)
+            size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
+            off = (level - law.function.value(x)) - jnp.dot(gradient, low)
+            return jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -STEERED * size, STEERED * size), 0.0)
+
+        found = [
+            back(law, levels[i]) if law.sign == 0.0 and i < x.shape[0] else jnp.zeros(()) for i, law in enumerate(laws)
+        ]
+        return jax.lax.stop_gradient(jnp.stack(found))
+
+    def rates(self, system: System, laws: list[Law], x) -> tuple[jax.Array, jax.Array]:
+        """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants."""
+        system = system.here(x)
+        dH = system.energy.gradient(x)
+        dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
+        dL = tuple(L.gradient(x) for L in system.preserved)
+        if system.dissipation is None:
+            return system.field(x, dH, dS, dL), jnp.zeros(len(laws))
+        names, force = tuple(system.preserved_by_name()), jnp.zeros_like(x)
+        gradients = dict(zip(names, dL, strict=True))
+        for part, own in portions(system.dissipation, names):
+            force = force + part.force(system, x, dH, dS, tuple(gradients[name] for name in own))
+        # apart from the motion, along which H and S do not change: near rest that is rounding noise
+        rates = [law.sign * jnp.maximum(law.sign * jnp.dot(law.function.gradient(x), force), 0.0) for law in laws]
+        return system.field(x, dH, dS, dL), jnp.stack(rates)
+
+    def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
+        """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
+        change = Gonzalez()
+
+        def misses(d) -> jax.Array:
+            return changes - jnp.stack([jnp.dot(change(law.function, x, d, low), d) for law in laws])
+
+        spheres = system.spheres
+
+        def directions(d):
+            end = x + (low + d)
+            found = [system.raised(end, law.function.gradient(end)) for law in laws]
+            return found if spheres is None else [spheres.along(end, v) for v in found]
+
+        def landed(d):
+            return d if spheres is None else spheres.reached(x, low, d)
+
+        d = landed(d)
+        found = directions(d)
+        for i in range(self.corrections):
+            found = directions(d) if 0 < i < 3 else found  # the last time they are as good as they get
+            d = landed(d + towards(found, misses(d)))
+        squares = jnp.stack([jnp.dot(v, v) for v in found])
+        left = misses(d) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
+        return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
+
+    def _laws(self, system: System) -> list[Law]:
+        """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
+        functions = system.functions()
+        laws = [Law(system.energy, LAWS[system.energy_law])] if system.energy_law in LAWS else []
+        local = set() if system.spheres is None else {system.spheres.name}
+        laws += [Law(functions[name], 0.0) for name in self.held if name not in local]
+        laws += [Law(C, 0.0) for C in self.functions]
+        if system.entropy_law in LAWS:
+            assert system.entropy is not None
+            laws.append(Law(system.entropy, LAWS[system.entropy_law]))
+        return sorted(laws, key=lambda law: law.sign != 0.0)
+
+    def missed(self, system: System, x, low, h, k) -> jax.Array:
+        del system, x, low, h
+        return jnp.max(jnp.abs(k[MISSED]))
+
+    def increment(self, h, k) -> jax.Array:
+        return h * k[SLOPE]
+
+    def predict(self, k, before) -> jax.Array:
+        del before
+        return k
+
+    def explain(self, system: System, x, k, h) -> str:
+        del k
+        if not bool(jnp.isfinite(system.vector_field(jnp.asarray(x))).all()):
+            return ""
+        return (
+            f"the stages of a step of {h:g} run away, or leave the domain of the functions: it is too long for an "
+            "explicit method; lt.MetriplecticGauss takes longer ones of a stiff system"
+        )
+
+    def __str__(self) -> str:
+        kept = f", preserve={len(self.functions)} functions" if self.functions else ""
+        return f"{type(self).__name__}(order={self.number}{kept})"

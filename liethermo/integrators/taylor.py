@@ -1,0 +1,131 @@
+"""Taylor steps: explicit, of any order, with a polynomial between the states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..errors import InputError
+from ..systems import System
+from ..tracing.taylor import NoSeriesError, check_series, solution
+from .base import register
+from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Law, Unlawful
+from .lobatto import lobatto_rule
+
+LOWEST, HIGHEST = 2, 24
+"""Orders: beyond the highest, double precision has no use for more."""
+
+
+class MetriplecticTaylor(ExplicitMethod):
+    """Taylor steps with both laws exact, explicit, of any order from 2 to 24.
+
+    ``X(s) = x + c_1 s + ... + c_p s^p``, the Taylor polynomial of the solution over the step, and x' near X(1) where
+
+        H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X(s_i)),    sigma = grad S . K grad S >= 0,
+
+    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. The s_i and b_i are those of
+    Lobatto's quadrature, with ``p / 2 + 1`` nodes: it is of order p, and nothing that it produces is negative. How x'
+    is found: :class:`.explicit.ExplicitMethod`.
+
+    The coefficients come one after another from the recurrences of Taylor arithmetic [Hairer, Nørsett & Wanner 1993,
+    I.8], which are read off the functions of the system: see :mod:`liethermo.tracing.taylor`. All have to be smooth.
+    What they decide by ``jnp.where`` or ``lax.cond`` they decide at the start of each step.
+
+    A step costs about ``p^2 / 2`` times the products of the field, ``p / 2`` evaluations of the entropy production, and
+    four corrections. Steps are long: in double precision no method takes fewer. It is for accuracies from 1e-8 on, and
+    for states between the steps: ``solution(t)`` is of the order of the method.
+
+    Parameters
+    ----------
+    order : int or None
+        From 2 to 24. None: for adaptive steps, what their tolerance asks for, ``1 - log(rtol) / 2`` [Jorba & Zou 2005].
+    preserve : sequence of functions or energies
+        Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
+    retraction : str or manifolds.Retraction, optional
+        On a manifold, with its base point where the step starts: ``"exp"`` by default.
+    held : tuple of str
+        Names of the functions of the system to hold. A run fills it in with what the system conserves.
+    """
+
+    def __init__(
+        self,
+        order: int | None = None,
+        preserve: Sequence = (),
+        retraction: str | mf.Retraction | None = None,
+        held: tuple[str, ...] = (),
+    ):
+        if order is not None and (type(order) is not int or not LOWEST <= order <= HIGHEST):
+            raise InputError(f"the order is an integer from {LOWEST} to {HIGHEST}, or None, not {order!r}")
+        super().__init__(order, preserve, retraction, held)
+
+    def suited(self, tolerance: float | None) -> MetriplecticTaylor:
+        if self.number is not None:
+            return self
+        if tolerance is None:
+            raise InputError(f"{self} takes its order from a tolerance: give an order, or adaptive steps")
+        order = min(max(LOWEST, math.ceil(1.0 - 0.5 * math.log(tolerance))), HIGHEST)
+        return type(self)(order, self.functions, self.retraction, self.held)
+
+    @property
+    def stages(self) -> int:
+        return OWN + self.order
+
+    @property
+    def evaluations(self) -> int:
+        """Products of two series take as many multiplications as there are pairs; and the production at the nodes."""
+        return self.order * (self.order + 1) // 2 + len(self._rule[0])
+
+    @property
+    def _rule(self) -> tuple[np.ndarray, np.ndarray]:
+        return lobatto_rule((self.order + 1) // 2 + 1)
+
+    def check(self, system: System) -> None:
+        """Raise InputError unless there is a law to hold, what is to be preserved is, and all functions are smooth."""
+        super().check(system)
+        x = jnp.asarray(system.samples(1)[0])
+        functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
+        if system.entropy is not None:
+            functions["the entropy"] = system.entropy.value
+        for name, function in functions.items():
+            try:
+                check_series(function, x)
+            except NoSeriesError as error:
+                raise error.about(
+                    f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
+                ) from None
+
+    def uncorrected(self, system: System, laws: list[Law], x, low, h) -> Unlawful:
+        nodes, b = self._rule
+        numbers = np.arange(1.0, self.order + 1.0)
+        c = solution(lambda y: self.rates(system, laws, y)[0], x, h, self.order)  # from the centre of a chart, exactly
+        points = jnp.concatenate([x[None], x + (low + nodes[1:, None] ** numbers @ c)])
+        fields, rates = jax.vmap(lambda y: self.rates(system, laws, y))(points)
+        defect = fields[-1] - (numbers @ c) / h
+        return Unlawful(jnp.sum(c, axis=0), h * (b @ rates), defect / (self.order + 1), c / h)
+
+    def weights(self, theta) -> np.ndarray:
+        """Of the polynomial, and of what brings its end to the state there, which grows as its first term left out."""
+        theta = np.asarray(theta, dtype=np.float64)[..., None]
+        last = theta ** (self.order + 1)
+        found = np.zeros((*theta.shape[:-1], self.stages))
+        found[..., OWN:] = theta ** np.arange(1, self.order + 1) - last
+        found[..., SLOPE] = last[..., 0]
+        return found
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        """From how far the polynomial X misses the field at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
+
+        Of X' the first term left out is p + 1 times that of X. So it is right to a factor that tends to 1; and it sees
+        too where a test has been decided otherwise on the way.
+        """
+        del system, x, low
+        return h * jnp.max(jnp.abs(k[ERROR]))
+
+
+register(*map(MetriplecticTaylor, (6, 12, 20)))

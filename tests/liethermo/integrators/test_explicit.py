@@ -1,0 +1,278 @@
+"""Explicit methods with both laws: laws from rest to instability, engines, derivatives, and what must fail."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from tests.liethermo import random_systems
+from tests.liethermo.integrators.test_convergence import PROBLEMS, SYSTEMS
+
+RK, Taylor = lt.MetriplecticRungeKutta, lt.MetriplecticTaylor
+EPS = float(np.finfo(np.float64).eps)
+BODY = lt.models.rigid_body((5.0, 4.0, 2.0), rate=0.5)
+X0 = np.array([0.2, 1.0, 0.3])
+each_method = pytest.mark.parametrize("method", [*map(RK, (4, 6, 8)), *map(Taylor, (6, 12, 20))], ids=str)
+
+
+# -- laws -------------------------------------------------------------------------------------------------------------
+
+
+def random_run(g, number, steps, method, h=0.002, engine="compiled"):
+    p, x0s = random_systems.parameters(g, number, 1), random_systems.states(g, number, 1)
+    build = random_systems.family(g)
+    return lt.ensemble(build, x0s, (0.0, h * steps), h, method, parameters=p, outputs="summary", engine=engine)
+
+
+def assert_laws(many):
+    assert many.ok.all(), str(many)
+    assert many.energy_drift.max() <= 1e-14
+    assert (many.least_entropy_increment >= -4 * EPS * np.maximum(many.entropy_scale, many.entropy_sensitivity)).all()
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_laws_of_random_systems(method):
+    assert_laws(random_run(mf.so(3), 24, 500, method))
+
+
+@pytest.mark.slow
+@each_method
+@pytest.mark.parametrize("g", random_systems.ALGEBRAS, ids=lambda g: g.name)
+def test_laws_of_a_thousand_systems(g, method):
+    """143 on each of seven algebras."""
+    assert_laws(random_run(g, 143, 1000, method))
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_drift_over_a_hundred_thousand_steps(method):
+    assert_no_drift(method, 100_000)
+
+
+@pytest.mark.slow
+@each_method
+def test_drift_over_a_million_steps(method):
+    assert_no_drift(method, 1_000_000)
+
+
+def assert_no_drift(method, steps):
+    """Of the energy, and of a Casimir that is conserved, for energies that are not quadratic."""
+    quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4 + jnp.cos(m[2])  # noqa: E731
+    for friction in (None, lt.KillingDissipation(1e-4)):
+        system = lt.LiePoissonSystem(mf.so(3), quartic, lt.Quadratic(np.ones(3)), friction)
+        run = lt.integrate(system, X0, (0.0, 0.1 * steps), 0.1, method, save_every=steps // 100)
+        assert run.audit().energy_drift <= 2e-14
+        assert run.stats.least_entropy_increment >= -4 * EPS * np.abs(run.entropy).max()
+        if friction is None:
+            assert np.abs(run.entropy / run.entropy[0] - 1.0).max() <= 2e-14
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_a_state_that_relaxes_goes_on_at_its_rate(method):
+    """No rounding holds it off the equilibrium: the deviation decays by 1e-45, at the rate of the linear motion."""
+    inertia, rate = np.array([5.0, 4.0, 2.0]), 1.0
+    system = lt.models.rigid_body(tuple(inertia), rate=rate)
+    jacobian = np.asarray(jax.jacfwd(system.vector_field)(jnp.array([1.0, 0.0, 0.0])))[1:, 1:]
+    slowest = np.linalg.eigvals(jacobian).real.max()
+    run = lt.integrate(system, [1.0, 1e-9, 2e-9], (0.0, 2500.0), 0.5, method, save_every=10)
+    size = np.linalg.norm(run.x[:, 1:], axis=1)
+    assert size[-1] < 1e-40
+    assert np.log(size[-1] / size[100]) / (run.t[-1] - run.t[100]) == pytest.approx(slowest, rel=0.02)
+    assert run.audit().passed
+
+
+@pytest.mark.sampled(2)
+@each_method
+@pytest.mark.parametrize("rate", [0.0, 1e-6, 1.0])
+def test_saddles_and_weak_friction(method, rate):
+    system = lt.models.rigid_body((5.0, 4.0, 2.0), rate=rate)
+    for x0 in ([1e-3, 1.0, 1e-3], [1e-9, 1.0, 1e-9], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1e-160, 0.0, 1e-160]):
+        run = lt.integrate(system, x0, (0.0, 600.0), 0.3, method)
+        assert run.audit(energy=2e-15).passed, str(run.audit())
+        if not rate:
+            assert np.ptp(run.entropy) <= 2e-15 * max(run.entropy[0], 1e-300)
+
+
+def angular_momentum(x):
+    return x[0] * x[3] - x[1] * x[2]
+
+
+def kepler():
+    def energy(x):
+        return 0.5 * jnp.dot(x[2:], x[2:]) - 1.0 / jnp.sqrt(jnp.dot(x[:2], x[:2]))
+
+    return lt.MetriplecticSystem(
+        mf.Canonical(2), energy, dim=4, momentum_maps={"J": lambda x: x[0] * x[3] - x[1] * x[2]}
+    )
+
+
+@pytest.mark.sampled(4)
+@each_method
+@pytest.mark.parametrize("excess", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
+def test_dependent_gradients(method, excess):
+    """Those of energy and angular momentum are near a circular orbit: the laws hold, or a status tells of a step."""
+    run = lt.integrate(kepler(), [1.0, 0.0, 0.0, np.sqrt(1.0 + excess)], (0.0, 20.0), 0.1, method, on_failure="return")
+    assert run.status.code in ("completed", "not_converged")
+    assert run.audit().energy_drift <= 2e-14
+    assert np.abs(run.casimirs["J"] / run.casimirs["J"][0] - 1.0).max() <= 1e-13
+    if excess >= 1e-6:
+        assert run.status.ok
+
+
+def test_what_is_preserved_on_request():
+    system = lt.MetriplecticSystem(mf.Canonical(2), kepler().energy, dim=4)
+    x0 = [1.0, 0.0, 0.0, 1.2]
+    runs = [lt.integrate(system, x0, (0.0, 10.0), 0.2, RK(6, kept)) for kept in ((), (angular_momentum,))]
+    values = [np.array([angular_momentum(x) for x in run.x]) for run in runs]
+    drifts = [np.abs(v / v[0] - 1.0).max() for v in values]
+    assert drifts[0] > 1e-9
+    assert drifts[1] <= 2e-15
+
+
+def test_a_driven_body():
+    """The energy changes by the work done, exactly."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m, t: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.2 * jnp.sin(t) * m[0] ** 3,
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.1),
+    )
+    run = lt.integrate(system, X0, (0.0, 20.0), 0.1, RK(6))
+    assert run.audit(energy=1e-14).passed
+    assert np.ptp(run.energy) > 1e-2
+
+
+# -- stiffness, adaptive steps, derivatives, engines ------------------------------------------------------------------
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_stiffness_ends_with_advice(method):
+    stiff = lt.models.rigid_body(rate=200.0)
+    run = lt.integrate(stiff, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, method, on_failure="return")
+    assert not run.status.ok
+    assert "MetriplecticGauss" in run.status.message
+    assert np.array_equal(run.x, [[0.1, 1.0, 0.1]])
+    adaptive = lt.integrate(stiff, [0.1, 1.0, 0.1], (0.0, 1.0), lt.Adaptive(1e-6), method)
+    assert adaptive.status.ok
+    assert adaptive.audit().passed
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_adaptive_steps_events_and_output_between(method):
+    exact = lt.integrate(BODY, X0, (0.0, 10.0), 10.0, lt.Reference(rtol=1e-13)).x[-1]
+    errors = []
+    for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
+        run = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(rtol), method, dense=True)
+        errors.append(np.abs(run.x[-1] - exact).max() / rtol)
+        assert run.audit().passed
+    assert 0.01 < np.median(errors) < 10.0, errors
+    middle = 0.5 * (run.t[5] + run.t[6])
+    between = lt.integrate(BODY, X0, (0.0, middle), middle, lt.Reference(rtol=1e-13)).x[-1]
+    assert np.abs(run(middle) - between).max() < (run.t[6] - run.t[5]) ** 4
+    event = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(1e-9), method, until=lambda m: m[1] - 0.5)
+    assert event.status.code == "event"
+    assert event.x[-1][1] == pytest.approx(0.5, abs=1e-12)
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_engines_take_the_same_steps(method):
+    quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4  # noqa: E731
+    entropy = lambda m: jnp.log(1.0 + jnp.dot(m, m))  # noqa: E731
+    system = lt.LiePoissonSystem(mf.so(3), quartic, entropy, lt.ProjectedMetric(rate=0.3))
+    a, b = (lt.integrate(system, X0, (0.0, 10.0), 0.2, method, engine=e) for e in ("array", "compiled"))
+    assert np.abs(a.x - b.x).max() <= 1e-14
+    assert a.stats.fixed_point_iterations == b.stats.fixed_point_iterations == a.stats.steps
+    x0s = np.random.default_rng(0).standard_normal((11, 3))
+    many = lt.ensemble(system, x0s, (0.0, 5.0), 0.2, method, engine="compiled").x
+    alone = [lt.integrate(system, x, (0.0, 5.0), 0.2, method, engine="compiled").x[-1] for x in x0s]
+    assert np.abs(many - alone).max() <= 1e-15 * np.abs(many).max()
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_derivatives(method):
+    """Against differences of fourth order, by the state and by a parameter."""
+
+    def end(x, rate):
+        return lt.flow(lt.models.rigid_body((5.0, 4.0, 2.0), rate=rate), x, (0.0, 3.0), 0.25, method)
+
+    forwards = jax.jacfwd(end, (0, 1))(jnp.asarray(X0), 0.5)
+    backwards = jax.jacrev(end, (0, 1))(jnp.asarray(X0), 0.5)
+
+    def difference(f, h=1e-3):
+        return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
+
+    by_state = np.stack([difference(lambda e, v=v: np.asarray(end(X0 + e * v, 0.5))) for v in np.eye(3)], axis=1)
+    by_rate = difference(lambda e: np.asarray(end(X0, 0.5 + e)))
+    for found in (forwards, backwards):
+        assert np.abs(found[0] - by_state).max() < 1e-10
+        assert np.abs(found[1] - by_rate).max() < 1e-10
+
+
+@pytest.mark.slow
+@each_method
+def test_errors_are_what_was_asked_for(method):
+    """Over nine problems with references of their own, at tolerances from 1e-4 on: the median ratio is near one."""
+    ratios = []
+    for name, problem in PROBLEMS.items():
+        for rtol in (1e-4, 1e-6, 1e-8, *(() if method.order == 4 else (1e-10, 1e-12))):
+            run = lt.integrate(
+                SYSTEMS[name](), problem.start, (0.0, problem.time), lt.Adaptive(rtol), method, engine="compiled"
+            )
+            ratios.append(np.abs(run.x[-1] - problem.end).max() / (rtol * np.abs(run.x).max()))
+    assert 0.1 < np.median(ratios) < 10.0, ratios
+    assert max(ratios) < 30.0
+
+
+# -- controls ---------------------------------------------------------------------------------------------------------
+
+
+def uncorrected(method):
+    """The method without its corrections, and blind to what it misses of the levels."""
+
+    class Uncorrected(type(method)):
+        corrections: ClassVar[int] = 0
+
+        def missed(self, system, x, low, h, k):
+            return 0.0 * super().missed(system, x, low, h, k)
+
+    return Uncorrected(method.order)
+
+
+STEPS_TO_DRIFT = {
+    RK: {4: [20, 30, 45], 6: [14, 20, 28], 8: [10, 14, 20]},
+    Taylor: {6: [14, 20, 28], 12: [11, 13, 16], 20: [11, 12, 13]},
+}
+
+
+@pytest.mark.sampled(1)
+@each_method
+def test_without_corrections_the_energy_drifts_at_the_order_of_the_method(method):
+    steps, x0 = np.array(STEPS_TO_DRIFT[type(method)][method.order]), 6.0 * X0
+    runs = [lt.integrate(BODY, x0, (0.0, 5.0), 5.0 / n, uncorrected(method)) for n in steps]
+    drifts = [run.audit().energy_drift for run in runs]
+    slope = -np.polyfit(np.log(steps), np.log(drifts), 1)[0]
+    assert min(drifts) > 1e-13
+    assert slope > 0.9 * method.order - 0.3, (drifts, slope)
+    assert lt.integrate(BODY, x0, (0.0, 5.0), 5.0 / steps[-1], method).audit().energy_drift < 1e-15
+
+
+class Unchecked(RK):
+    """Corrections are left out, and what the step misses of the levels is not."""
+
+    corrections: ClassVar[int] = 0
+
+
+def test_a_step_that_misses_its_levels_fails():
+    run = lt.integrate(BODY, X0, (0.0, 1.0), 0.5, Unchecked(4), on_failure="return")
+    assert run.status.code == "not_converged"
+    assert run.status.residual > 1e-10

@@ -1,0 +1,161 @@
+"""Taylor steps: orders on R^n and on manifolds, tolerances, states between the steps, events, and refusals."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.integrators.lobatto import lobatto_rule
+from tests.liethermo.integrators.test_on_manifolds import CASES, starts
+from tests.liethermo.integrators.test_orders import nonlinear_systems
+
+Taylor = lt.MetriplecticTaylor
+BODY = lt.models.rigid_body((5.0, 4.0, 2.0), rate=0.5)
+X0 = np.array([0.2, 1.0, 0.3])
+MULTIPLES = np.array([4, 5, 6, 7, 8])
+
+
+def reference(system, x, time, pieces=1):
+    return lt.integrate(system, x, (0.0, time), time / pieces, lt.Reference(rtol=3e-14)).x
+
+
+@pytest.mark.parametrize("nodes", range(2, 14))
+def test_quadrature(nodes):
+    c, b = lobatto_rule(nodes)
+    assert (b > 0.0).all()
+    assert np.array_equal(c, np.sort(c))
+    assert (c[0], c[-1]) == (0.0, 1.0)
+    for n in range(2 * nodes - 2):
+        assert b @ c**n == pytest.approx(1.0 / (n + 1), rel=3e-15)
+    assert abs(b @ c ** (2 * nodes - 2) - 1.0 / (2 * nodes - 1)) > 1e-16 * 10.0 ** (14 - nodes)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("order", "length"), [(2, 0.1), (5, 0.2), (6, 0.2), (12, 0.3), (20, 0.6)])
+@pytest.mark.parametrize(("system", "x0"), nonlinear_systems())
+def test_observed_order(system, x0, order, length):
+    """Of the error of a step, one more: the mean over eight states, for five lengths."""
+    x0s = 1.5 * x0 * (1.0 + 0.3 * np.random.default_rng(1).standard_normal((8, len(x0))))
+    length = length if len(x0) == 3 else min(length, 0.4)
+    exact = np.array([reference(system, x, length, 8) for x in x0s])
+    errors = []
+    for m in MULTIPLES:
+        h = m * length / 8
+        many = lt.ensemble(system, x0s, (0.0, h), h, Taylor(order))
+        errors.append(np.sqrt(np.mean((many.x - exact[:, m]) ** 2)))
+        assert many.energy_drift.max() <= 2e-15
+        assert many.least_entropy_increment.min() >= -1e-15
+    assert_slope(errors, order)
+
+
+def assert_slope(errors, order):
+    clear = np.array(errors) > 3e-13
+    assert clear.sum() >= 3, errors
+    slope = np.polyfit(np.log(MULTIPLES[clear]), np.log(np.array(errors)[clear]), 1)[0]
+    assert abs(slope - (order + 1)) < 0.1 * order, (errors, slope)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("order", "length"), [(6, 0.6), (12, 1.0), (20, 1.4)])
+@pytest.mark.parametrize("name", ["spin", "bath", "frame"])
+def test_observed_order_on_manifolds(name, order, length):
+    system, x0 = CASES[name](), starts(name)
+    length = 0.6 * length if name == "frame" else length
+    exact, errors = reference(system, x0, length, 8), []
+    for m in MULTIPLES:
+        h = m * length / 8
+        run = lt.integrate(system, x0, (0.0, h), h, Taylor(order), engine="array")
+        errors.append(np.abs(run.x[-1] - exact[m]).max())
+        assert run.audit(energy=4e-15).passed
+    assert_slope(errors, order)
+
+
+def test_orders_from_tolerances_and_states_between():
+    """By default the order is what the tolerance asks for; the error is less than asked, and so it is between."""
+    exact = reference(BODY, X0, 10.0)[-1]
+    for rtol, order in ((1e-6, 8), (1e-12, 15)):
+        run = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(rtol), Taylor(), dense=True)
+        assert run.provenance["method"] == f"MetriplecticTaylor(order={order})"
+        assert run.stats.steps < 20
+        assert np.abs(run.x[-1] - exact).max() < 3.0 * rtol
+        assert run.audit().passed
+        assert np.abs(run(run.t) - run.x).max() < 1e-15
+        times = 10.0 * np.arange(21) / 20
+        assert np.abs(run(times) - reference(BODY, X0, 10.0, 20)).max() < 10.0 * rtol
+
+
+def test_events_that_happen_twice_in_a_step():
+    """Two crossings within one step: the first is found, and ends the run to rounding."""
+    touch = lambda m: m[1] - 0.9  # noqa: E731
+    start = np.array([1.2, 0.5, -0.9])
+    free = lt.models.free_rigid_body((5.0, 4.0, 2.0))
+    path = lt.integrate(free, start, (0.0, 40.0), 0.01, Taylor(8))
+    values = path.x[:, 1] - 0.9
+    crossings = path.t[1:][np.diff(np.sign(values)) != 0]
+    first, second = crossings[:2]
+    step = 1.2 * second
+    assert touch(path.x[0]) * np.interp(step, path.t, values) > 0.0
+    run = lt.integrate(free, start, (0.0, step), step / 2, Taylor(24), until=touch)
+    assert run.status.code == "event"
+    assert run.event_time == pytest.approx(first, abs=0.02)
+    assert run.x[-1][1] == pytest.approx(0.9, abs=1e-14)
+
+
+@pytest.mark.slow
+def test_a_kink_is_seen_by_the_estimate():
+    """A choice that is made at the start of a step: adaptive steps end where it is made otherwise."""
+
+    def energy(m):
+        return 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + jnp.where(m[0] > 0.0, 0.3 * m[0] ** 4, 0.0)
+
+    system = lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.05))
+    run = lt.integrate(system, [0.3, 1.0, 0.6], (0.0, 12.0), lt.Adaptive(1e-8), Taylor(12))
+    assert np.ptp(np.sign(run.x[:, 0])) == 2.0
+    assert np.abs(run.x[-1] - reference(system, [0.3, 1.0, 0.6], 12.0)[-1]).max() < 1e-6
+    assert run.audit().passed
+
+
+@pytest.mark.slow
+def test_double_bracket_dissipation():
+    """The energy falls, by a quadrature that is exact to the order; the Casimir is held."""
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(1.0 / np.array([5.0, 4.0, 2.0])), lt.Quadratic(np.ones(3)), lt.DoubleBracket(0.3)
+    )
+    run = lt.integrate(system, X0, (0.0, 10.0), 0.5, Taylor(16))
+    assert run.stats.largest_energy_increment < 0.0
+    assert np.ptp(run.entropy) < 1e-15
+    assert np.abs(run.x[-1] - reference(system, X0, 10.0)[-1]).max() < 1e-12
+
+
+@pytest.mark.parametrize("order", [1, 25, 2.5, True, "6"])
+def test_orders_that_there_are_not(order):
+    with pytest.raises(lt.errors.InputError, match="the order is an integer from 2 to 24, or None"):
+        Taylor(order)
+
+
+class Unpromised(lt.FrictionOperator):
+    """A dissipation that promises nothing."""
+
+    energy_law = entropy_law = None
+
+
+def test_bad_input():
+    def attempt(energy, order=8):
+        system = lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.1))
+        return lt.integrate(system, X0, (0.0, 1.0), 0.1, Taylor(order))
+
+    for energy, name in ((lambda m: jnp.sum(jnp.abs(m)), "abs"), (lambda m: jnp.sum(jnp.maximum(m, 0.0)), "max")):
+        with pytest.raises(lt.errors.InputError, match=f"of the energy the JAX primitive '{name}' is not smooth") as e:
+            attempt(energy)
+        assert "MetriplecticRungeKutta" in str(e.value)
+    with pytest.raises(lt.errors.InputError, match="takes its order from a tolerance"):
+        attempt(lambda m: jnp.sum(m * m), None)
+    with pytest.raises(lt.errors.InputError, match="takes its order from a tolerance"):
+        lt.flow(BODY, X0, (0.0, 1.0), 0.1, Taylor())
+    with pytest.raises(lt.errors.InputError, match="does not conserve"):
+        lt.integrate(BODY, X0, (0.0, 1.0), 0.1, Taylor(8, preserve=lambda m: m[0]))
+    friction = Unpromised(lambda x: jnp.eye(2))
+    lawless = lt.MetriplecticSystem(None, lambda x: x[0], lambda x: x[1], friction, dim=2, validate=False)
+    with pytest.raises(lt.errors.InputError, match="claims none"):
+        lt.integrate(lawless, [1.0, 2.0], (0.0, 1.0), 0.1, Taylor(8))
