@@ -205,12 +205,14 @@ class Given:
     parameters : tuple of str
     what : str
         For messages.
+    example : dict
+        A point: where one of its entries is a text, or there are none, the function is not traced.
     """
 
-    def __init__(self, given: Any, parameters: tuple[str, ...], what: str):
+    def __init__(self, given: Any, parameters: tuple[str, ...], what: str, example: Mapping[str, Any]):
         self.given, self._parameters, self._what = given, parameters, what
         self._evaluate = None
-        if callable(given):
+        if callable(given) and parameters and not any(isinstance(value, str) for value in example.values()):
             scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters}
             try:
                 jax.eval_shape(self._at, scalar)

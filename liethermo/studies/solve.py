@@ -122,8 +122,10 @@ class Solver:
     def __init__(self, task: Task):
         self.task = task
         self.members = Members(task.build, task.parameters, task.example)
-        self._x0 = None if task.x0 is None else Given(task.x0, task.parameters, "x0")
-        self._attitude = None if task.attitude is None else Given(task.attitude, task.parameters, "attitude")
+        self._x0 = None if task.x0 is None else Given(task.x0, task.parameters, "x0", task.example)
+        self._attitude = (
+            None if task.attitude is None else Given(task.attitude, task.parameters, "attitude", task.example)
+        )
         path = any(measure.path for measure in task.measures.values())
         final = any(measure.final for measure in task.measures.values())
         self._outputs: Any = "trajectory" if path else "final" if final else "summary"

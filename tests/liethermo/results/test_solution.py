@@ -200,7 +200,7 @@ def test_zero_energy_is_measured_absolutely():
 
 def test_import_is_light():
     """What is not needed to integrate is not imported; the time itself is measured in benchmarks, not here."""
-    heavy = ("geomstats", "matplotlib", "xarray", "pandas", "rich")
+    heavy = ("geomstats", "matplotlib", "xarray", "pandas", "rich", "dask", "distributed", "zarr")
     script = f"import sys, liethermo; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -244,6 +244,15 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
     seeded.run()
     assert np.array_equal(found.results.final.values, seeded.results.final.values)
     assert np.array_equal(found.results.replica_state, states)
+    named = study(
+        tmp_path / "c.zarr",
+        {"place": ["pole", "equator"]},
+        x0=lambda p: [0.0, 0.0, 1.0] if p["place"] == "pole" else [1.0, 0.0, 0.0],
+        build=lambda p: body({"ratio": 0.2, "rate": 0.3}),
+    )
+    named.run()
+    assert np.array_equal(named.results.final.sel(place="pole"), [0.0, 0.0, 1.0])  # both are equilibria
+    assert np.array_equal(named.results.final.sel(place="equator"), [1.0, 0.0, 0.0])
     with pytest.raises(lt.InputError, match="x0 and replica"):
         study(axes=axes, build=body)
 
@@ -437,9 +446,3 @@ def test_a_process_that_is_killed_loses_what_it_was_at(repetitions, done, tmp_pa
         assert study(store).run().complete
         assert content(store) == content(done[0])
     assert repetitions == 1 or partly > repetitions // 3, "kills fell too early or too late to mean much"
-
-
-def test_nothing_that_studies_need_is_imported_before_it_is_used():
-    code = "import sys, liethermo; print([m for m in ('dask', 'distributed', 'zarr', 'xarray') if m in sys.modules])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert told.stdout.strip() == "[]"
