@@ -19,6 +19,7 @@ import tempfile
 import urllib.parse
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -197,10 +198,11 @@ def browser() -> Iterator[Browser]:
             chromium.close()
 
 
-def check_pages(chromium: Browser, html: Path) -> list[str]:
+def check_pages(chromium: Browser, html: Path, match: str = "*") -> list[str]:
     """Everything that is wrong with the pages, as lines to print."""
     wrong, anchors, links = [], {}, []
     pages = sorted(page for page in html.rglob("*.html") if "_static" not in page.parts)
+    pages = [page for page in pages if fnmatch(str(page.relative_to(html)), match)]
     for page in pages:
         name = str(page.relative_to(html))
         chromium.resize(1280)
@@ -263,12 +265,14 @@ def take_pictures(chromium: Browser, html: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--html", type=Path, default=HTML, help="the built site")
-    html = parser.parse_args().html.resolve()
+    parser.add_argument("--match", default="*", help="pages to walk, such as 'tutorials/*'; all by default")
+    arguments = parser.parse_args()
+    html = arguments.html.resolve()
     if not (html / "index.html").is_file():
         sys.exit(f"{html} holds no site; run `make docs` first")
     with browser() as chromium:
         take_pictures(chromium, html)
-        wrong = check_pages(chromium, html) + check_search(chromium, html)
+        wrong = check_pages(chromium, html, arguments.match) + check_search(chromium, html)
     print("\n".join(wrong))
     print(f"{len(wrong)} findings; screenshots in {PICTURES}")
     sys.exit(bool(wrong))

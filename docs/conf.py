@@ -1,5 +1,6 @@
 """Sphinx configuration."""
 
+import inspect
 import os
 import re
 import sys
@@ -13,9 +14,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import liethermo
 import manifolds
 
-for package, names in ((liethermo, ("plot", "scipy", "sympy", "diffrax")), (manifolds, ("sympy",))):
-    for name in names:  # imported on demand as attributes; autodoc asks for modules
-        sys.modules[f"{package.__name__}.{name}"] = getattr(package, name)
+for package in (liethermo, manifolds):  # what is imported on demand as an attribute autodoc imports as a module
+    on_demand = ("plot", "scipy", "sympy", "diffrax") if package is liethermo else ("sympy",)
+    for name in (*package.__all__, *on_demand):
+        if inspect.ismodule(value := getattr(package, name)):
+            sys.modules.setdefault(f"{package.__name__}.{name}", value)
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE / "_ext")]
@@ -116,6 +119,18 @@ def _say_what_thumbnails_show(app, pagename, templatename, context, doctree):
         context["body"] = re.sub(thumbnail, r'<img alt="Figure of: \2"\1\2<', context["body"], flags=re.DOTALL)
 
 
+LITERAL = re.compile(r"(``.*?``|:math:`.*?`)", re.DOTALL)
+
+
+def _read_as_meant(app, what, name, value, options, lines):
+    """Keep a full stop in a formula from ending the summary, and bars around a length from being markup."""
+    parts = LITERAL.split("\n".join(lines))
+    parts[1::2] = [part.replace(". ", ".\u2060 ") for part in parts[1::2]]  # a word joiner, which nobody sees
+    parts[::2] = [re.sub(r"\|(?=[A-Za-z])([^|\n]*)\|", r"\\|\1\\|", part) for part in parts[::2]]
+    lines[:] = "".join(parts).split("\n")
+
+
 def setup(app):
+    app.connect("autodoc-process-docstring", _read_as_meant)
     app.connect("autodoc-skip-member", _is_bare_value)
     app.connect("html-page-context", _say_what_thumbnails_show)

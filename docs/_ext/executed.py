@@ -124,8 +124,8 @@ def _execute(app: Sphinx, docname: str, source: list[str]) -> None:
                 page.append(f"\n```{{raw}} html\n{output.html}\n```\n")
         if output.figures and not block["alt"]:
             logger.warning("a figure has no words: add <!-- picture: ... --> after its block", location=docname)
-        for png in output.figures:
-            file = folder / f"{stem}-{len(cells)}.png"
+        for i, png in enumerate(output.figures, 1):
+            file = folder / f"{stem}-{len(cells)}-{i}.png"
             file.write_bytes(png)
             page.append(f"\n![{block['alt']}]({up}generated/executed/{file.name})\n")
     words(text[end:])
