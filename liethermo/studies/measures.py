@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -69,8 +69,8 @@ class Measure(Protocol):
     @property
     def final(self) -> bool: ...
 
-    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
-        """Its values, shape (B, ...), and why it has none of some trajectories."""
+    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+        """Its values of at least the first ``count`` trajectories, and why it has none of some of them."""
         ...
 
     def told(self) -> str:
@@ -89,7 +89,7 @@ class Named:
     def final(self) -> bool:
         return self.name in ("final", "final_attitude")
 
-    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
         values = getattr(ensemble, field)
         if values is None:
@@ -116,7 +116,7 @@ class EventTime:
     path: bool = False
     final: bool = False
 
-    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         return ensemble.event_time, {}
 
     def told(self) -> str:
@@ -131,7 +131,7 @@ class AtTimes:
     path: bool = True
     final: bool = False
 
-    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         values = getattr(ensemble, self.at.what)
         if values is None:
             raise InputError(f"this system has no {self.at.what}")
@@ -144,30 +144,40 @@ class AtTimes:
 
 @dataclass(frozen=True)
 class OfSolution:
-    """A user's function of a solution, to a number or an array of a fixed shape."""
+    """A user's function of a solution, to a number or an array of a fixed shape.
+
+    Attributes
+    ----------
+    function : function
+    like : ndarray, optional
+        What it returned at the first point that was run: of this shape and kind it is at all others, or has failed.
+    """
 
     function: Callable
+    like: np.ndarray | None = field(default=None, compare=False)
     path: bool = True
     final: bool = False
 
-    def __call__(self, ensemble: Ensemble) -> tuple[np.ndarray, dict[int, str]]:
-        found: list[Any] = []
+    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+        found: dict[int, np.ndarray] = {}
         reasons: dict[int, str] = {}
-        for i in range(len(ensemble)):
+        like = self.like
+        for i in range(count):
             try:
                 value = np.asarray(self.function(ensemble.member(i)))
                 if value.dtype.kind not in "fiubc":
                     raise TypeError(f"it returned {value.dtype}, not numbers")
+                like = value if like is None else like
+                if value.shape != like.shape or (value.dtype.kind == "c") > (like.dtype.kind == "c"):
+                    raise TypeError(f"it returned {_kind(value)}, and {_kind(like)} at the first point")
+                found[i] = value
             except Exception as error:  # the function may be anyone's, and this is the status of one point
-                reasons[i], value = f"{self._name} raised {type(error).__name__}: {error}", None
-            found.append(value)
-        good = next((value for value in found if value is not None), np.asarray(np.nan))
-        for i, value in enumerate(found):
-            if value is not None and value.shape != good.shape:
-                reasons[i] = f"{self._name} returned shape {value.shape}, and {good.shape} at other points"
-        kind = np.result_type(np.float64, *(value for value in found if value is not None))
-        hole = np.full(good.shape, np.nan, dtype=kind)
-        return np.array([hole if i in reasons else value for i, value in enumerate(found)], dtype=kind), reasons
+                reasons[i] = f"{self._name} raised {type(error).__name__}: {error}"
+        like = np.asarray(np.nan) if like is None else like
+        values = np.full((len(ensemble), *like.shape), np.nan, dtype=np.result_type(np.float64, like))
+        for i, value in found.items():
+            values[i] = value
+        return values, reasons
 
     @property
     def _name(self) -> str:
@@ -175,6 +185,10 @@ class OfSolution:
 
     def told(self) -> str:
         return f"function {self._name}"
+
+
+def _kind(value: np.ndarray) -> str:
+    return f"{'complex' if value.dtype.kind == 'c' else 'real'} numbers of shape {value.shape}"
 
 
 def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:

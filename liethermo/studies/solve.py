@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..engines.codes import Code
-from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..results.audit import Tolerances
 from ..results.ensemble import Ensemble
@@ -220,17 +219,13 @@ class Solver:
             self.laws, self.engine = found.laws, found.engine
             summary, codes, texts = self._judged(family, x0s, found)
             for name, measure in self.task.measures.items():
-                values, failed = measure(found)
+                values, failed = measure(found, number)
                 values = np.where(_like(np.isin(codes, (*GOOD, LAW_BROKEN)), values), values, np.nan)
                 for i, reason in failed.items():
                     if codes[i] in GOOD:
                         codes[i], texts[i] = MEASURE_FAILED, f"{name}: {reason}"
                 if name not in measures:
                     measures[name] = np.full((size, *values.shape[1:]), np.nan, dtype=values.dtype)
-                if measures[name].shape[1:] != values.shape[1:]:
-                    raise InputError(
-                        f"the measure {name} has shape {values.shape[1:]} at some points and others elsewhere"
-                    )
                 measures[name][chosen] = values[:number]
             status[chosen], laws[chosen] = codes[:number], summary[:number]
             for i, text in texts.items():

@@ -27,7 +27,7 @@ from ..runs.timetable import Timetable
 from ..systems import System
 from . import files, identity
 from .axes import Axes
-from .measures import AtTimes, measures_of
+from .measures import AtTimes, Measure, OfSolution, measures_of
 from .members import ASKED, Watched, builder, plain
 from .progress import Bar, StudyStatus, seconds_left
 from .running import here, spread
@@ -354,6 +354,8 @@ class Study:
         columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1)
         if columns.status[0] in (Code.INADMISSIBLE, MEASURE_FAILED):
             return columns.message[0], True
+        measures = {name: _shaped(measure, columns.measures[name][0]) for name, measure in self._measures.items()}
+        solver.task = dataclasses.replace(solver.task, measures=measures)
         if solver.members.family is not None:  # and not another engine for some of the chunks
             solver.task = dataclasses.replace(solver.task, engine=solver.engine)
         elif self._axes.size > SLOW:
@@ -386,6 +388,11 @@ class Study:
             raise InputError(
                 f"{unread[0]!r} is looked at neither by the builder nor by x0; an axis of replicas is lt.replicas"
             )
+
+
+def _shaped(measure: Measure, value: np.ndarray) -> Measure:
+    """A measure that knows what it is at the first point."""
+    return dataclasses.replace(measure, like=value) if isinstance(measure, OfSolution) else measure
 
 
 def _at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:

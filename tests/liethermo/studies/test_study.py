@@ -395,6 +395,15 @@ def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path)
     assert results.end.sel(rate=1e-9) == 90.0
     assert results.relaxed.long_name == "time of entropy production below 0.001"
 
+    def growing(solution):
+        return np.ones(2 if solution.entropy[-1] < 0.55 else 3)
+
+    for chunk in (1, 8):  # the first point tells the shape, and not those who are solved beside another
+        pair = {"rate": [0.5, 2.0], "ratio": [0.3]}
+        uneven = study(tmp_path / f"u{chunk}.zarr", pair, measure={"g": growing}, chunk=chunk)
+        assert uneven.run().counts == {"completed": 1, "measure_failed": 1}
+        assert "real numbers of shape (3,), and real numbers of shape (2,)" in uneven.results.message[1, 0].item()
+
     shaped = study(tmp_path / "f.zarr", {"rate": [0.5, 2.0], "ratio": [0.3]}, measure={"turned": turned})
     assert shaped.run().ok
     wanted = turned(lt.integrate(body({"rate": 2.0, "ratio": 0.3}), X0, (0.0, 4.0), 0.1))
