@@ -1,5 +1,7 @@
 """Runs with noise: exact energy on every path, one path whatever takes it, no noise to the bit, and what is refused."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.engines.choice import Chosen
 from liethermo.runs.threefry import threefry
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
@@ -207,3 +210,81 @@ def test_noise_is_named_in_the_provenance():
     solution = run(BODY, NOISE, "compiled")
     assert solution.provenance["noise"]["seed"] == 3
     assert jax.__version__ == solution.provenance["jax"]
+
+
+@dataclasses.dataclass
+class Summed:
+    """The increments of a fine path, added up for longer steps."""
+
+    fine: np.ndarray
+    factor: int
+
+    def rows(self, first, steps, h):
+        del h
+        chosen = self.fine[first * self.factor : (first + steps) * self.factor]
+        return chosen.reshape(steps, self.factor, -1).sum(axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("system", "noise"), [(BODY, NOISE), (CURVED, NOISE), (SPIN, BATH)], ids=["body", "curved", "spin"]
+)
+def test_paths_converge_in_the_mean_square(system, noise):
+    """To those of the same Brownian motion with shorter steps, with order 1/2 at least."""
+    fine, T, paths = 4096, 1.0, 120
+    method, levels, errors = noise.on(system, lt.MetriplecticMidpoint()), (64, 128, 256, 512), []
+    increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, method.increments))
+
+    def end(W, steps):
+        engine = Chosen(system, method, "compiled", steps, Summed(W, fine // steps))
+        return np.asarray(engine.advance(engine.begin(START), T / steps, 1, steps, 1)[0].x)
+
+    exact = np.array([end(W, fine) for W in increments])
+    for steps in levels:
+        errors.append(np.sqrt(((np.array([end(W, steps) for W in increments]) - exact) ** 2).sum(axis=1).mean()))
+    order = -np.polyfit(np.log(levels), np.log(errors), 1)[0]
+    assert order > 0.4, (order, errors)
+
+
+@pytest.mark.slow
+def test_a_spin_with_a_bath_of_its_own():
+    """The bath is a body: the energy of both is exact on a path, and the length of the spin; the heat is recorded."""
+    system = lt.models.single_spin(field=2.0, rate=0.5, baths=lt.HeatBaths(capacity=200.0, temperature=0.8))
+    x0 = np.tile([0.6, 0.0, 0.8, 0.0], (2000, 1))
+    many = lt.ensemble(system, x0, (0.0, 12.0), 0.05, noise=NOISE, outputs="trajectory", save_every=10)
+    assert many.audit().passed
+    assert many.energy_drift.max() < 1e-13
+    assert np.abs(np.linalg.norm(many.x[..., :3], axis=-1) - 1.0).max() < 1e-13
+    heat = 200.0 * 0.8 * np.expm1(many.x[..., 3] / 200.0)
+    lost = 2.0 * (many.x[..., 2] - 0.8)
+    assert np.abs(heat - lost).max() < 1e-11
+    late = many.x[:, many.t >= 6.0, 2].mean(axis=1)
+    z = 2.0 / 0.8
+    assert abs(late.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late.std() / np.sqrt(2000) + 0.005
+
+
+@pytest.mark.slow
+def test_heat_of_a_bath_is_what_the_energy_changes_by():
+    """In every step: friction and noise do the work that the discrete gradient of H measures, the motion none."""
+    solution = run(ROTOR, BATH, "array")
+    method, gradient = lt.MetriplecticMidpoint(), lt.Gonzalez()
+    rows = BATH.rows(3, np.zeros(1, int), 0, 100, 0.05)[0]
+    noisy = BATH.on(ROTOR, method)
+
+    @jax.jit
+    @jax.vmap
+    def missed(x, new, dW):
+        d, low = new - x, jnp.zeros(3)
+        dH = gradient(ROTOR.energy, x, d, low)
+        moved = ROTOR.poisson.sharp(x + 0.5 * d, dH)
+        heat = jnp.dot(dH, 0.05 * (noisy.driven_by(dW).slopes(ROTOR, x, low, 0.05, d[None] / 0.05)[0] - moved))
+        return heat - (ROTOR.energy.value(new) - ROTOR.energy.value(x)), jnp.dot(dH, moved)
+
+    heat, motion = missed(*map(jnp.asarray, (solution.x[:100], solution.x[1:101], rows)))
+    assert np.abs(heat).max() < 1e-13
+    assert np.abs(motion).max() < 1e-14
+
+
+ROTOR = lt.LiePoissonSystem(
+    mf.so(3), lambda m: 0.5 * jnp.dot(m, m) + 0.3 * jnp.cos(m[0]), None, lt.Friction(np.ones(3))
+)
