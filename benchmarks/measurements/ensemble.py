@@ -35,6 +35,7 @@ METHODS: dict[str, tuple[lt.OneStepMethod, int]] = {
     "explicit, order 8, to 1e-5": (lt.MetriplecticRungeKutta(8), 14),
     "explicit, order 8, to 1e-8": (lt.MetriplecticRungeKutta(8), 32),
     "explicit, order 8, to 1e-12": (lt.MetriplecticRungeKutta(8), 96),
+    "Taylor, order 16, to 1e-12": (lt.MetriplecticTaylor(16), 26),
 }
 """The library's methods, each with a number of steps; the peers are set to the accuracy that it reaches."""
 
