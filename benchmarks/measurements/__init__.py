@@ -5,6 +5,7 @@ NAMES = (
     "general",
     "variational",
     "spin",
+    "fluids",
     "ensemble",
     "work_precision",
     "dimension",

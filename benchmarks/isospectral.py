@@ -1,0 +1,82 @@
+"""The isospectral midpoint scheme for Zeitlin's fluid, as published: the contestant of the library's explicit methods.
+
+``W_n = V - h/2 [P, V] - h^2/4 P V P``, ``W_{n+1} = W_n + h [P, V]`` with ``P = Delta^{-1} V`` [Modin & Viviani 2020,
+"A Casimir preserving scheme for long-time simulation of spherical ideal hydrodynamics", J. Fluid Mech. 884, A22, and
+the package quflow]. V is found by fixed-point iteration, two products of complex matrices in each: ``P V`` and
+``(P V) P``, the commutator being ``P V`` less its adjoint. Products are NumPy's, the Laplacian is inverted by
+elimination along each diagonal, in machine code. It conserves the spectrum of W to rounding, and the energy nearly.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+EPS = float(np.finfo(float).eps)
+
+
+class IsospectralMidpoint:
+    """The scheme for N by N matrices; time is that of ``W' = [P, W]``."""
+
+    def __init__(self, N: int):
+        s = (N - 1) / 2
+        self.z = s - np.arange(N)
+        self.step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))
+        self.main = 2.0 * s * (s + 1.0)
+
+    def stream(self, W: np.ndarray) -> np.ndarray:
+        """P, anti-Hermitian and without trace, with ``Delta P = W``."""
+        P = np.zeros_like(W)
+        _eliminate(W, self.z, self.step, self.main, P)
+        return P
+
+    def energy(self, W: np.ndarray) -> float:
+        return -0.5 * float(np.vdot(self.stream(W), W).real)
+
+    def integrate(self, W: np.ndarray, h: float, steps: int) -> tuple[np.ndarray, float]:
+        """The matrix after so many steps, and the mean number of iterations of one."""
+        made, change = 0, np.zeros_like(W)
+        for _ in range(steps):
+            for _ in range(60):
+                made += 1
+                V = W + change
+                P = (0.5 * h) * self.stream(V)
+                PV = P @ V
+                commutator = PV - PV.conj().T
+                new = commutator + PV @ P
+                residual, size = np.abs(new - change).max(), np.abs(W).max()
+                change = new
+                if residual <= 4 * EPS * size:
+                    break
+            else:
+                raise RuntimeError("the fixed-point iteration of the isospectral midpoint does not converge")
+            W = W + 2.0 * commutator
+        return W, made / steps
+
+
+@numba.njit
+def _eliminate(W, z, step, main, P):
+    N = W.shape[0]
+    ratio, y = np.empty(N), np.empty(N, dtype=np.complex128)
+    for m in range(N):
+        size = N - m
+        pivot, before = main - 2.0 * z[0] * z[m], 0.0
+        for i in range(size):
+            if i > 0:
+                beside = -step[i - 1] * step[i + m - 1]
+                pivot, before = main - 2.0 * z[i] * z[i + m] - beside * ratio[i - 1], ratio[i - 1]
+                y[i] = -W[i, i + m] - before * y[i - 1]
+            else:
+                y[i] = -W[i, i + m]
+            ratio[i] = -step[i] * step[i + m] / pivot if i + 1 < size else 0.0
+            P[i, i + m] = y[i] / pivot if (m > 0 or i + 1 < size) else 0.0
+        for i in range(size - 2, -1, -1):
+            P[i, i + m] -= ratio[i] * P[i + 1, i + m + 1]
+        if m > 0:
+            for i in range(size):
+                P[i + m, i] = -P[i, i + m].conjugate()
+    mean = 0.0j
+    for i in range(N):
+        mean += P[i, i] / N
+    for i in range(N):
+        P[i, i] -= mean
