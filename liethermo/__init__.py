@@ -72,7 +72,8 @@ from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
 from .studies.measures import At
 from .studies.progress import StudyStatus
-from .studies.study import Study, load_study
+from .studies.stored import load_study
+from .studies.study import Study
 from .systems import (
     AttitudeSystem,
     ChartSystem,

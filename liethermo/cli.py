@@ -146,9 +146,9 @@ def study(
 @_told()
 def status(store: StoreFolder) -> None:
     """Tell how far the study in a store is, also while it runs."""
-    from .studies.study import status as status_of
+    from .studies.stored import status as told_of
 
-    typer.echo(str(status_of(store)))
+    typer.echo(str(told_of(store)))
 
 
 @app.command()
@@ -303,7 +303,7 @@ def _draw_study(store: Path, measure: str | None, file: Path) -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     from .errors import InputError
     from .results.study_plot import study as draw
-    from .studies.study import load_study
+    from .studies.stored import load_study
 
     try:
         draw(load_study(store), measure, file)

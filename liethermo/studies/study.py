@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import shutil
 import tempfile
 import weakref
@@ -16,11 +15,9 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.codes import Code
-from ..errors import FileError, InputError
+from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
-from ..results.audit import Audit, AuditRow, Tolerances
-from ..results.many import laws_of_many
-from ..results.status import Laws
+from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
 from ..runs.preparation import check_choice
 from ..runs.timetable import Timetable
@@ -29,10 +26,11 @@ from . import files, identity
 from .axes import Axes
 from .measures import AtTimes, Measure, OfSolution, measures_of
 from .members import ASKED, Watched, builder, plain
-from .progress import Bar, StudyStatus, seconds_left
+from .progress import Bar, StudyStatus
 from .running import here, spread
-from .solve import GOOD, LAW_BROKEN, MEASURE_FAILED, MISSING, STATUSES, Columns, Solver, Summary, Task, told
+from .solve import MEASURE_FAILED, STATUSES, Columns, Solver, Task, told
 from .store import FORMAT, Store, Survey, matched
+from .stored import audit, load_study, status, status_of
 
 if TYPE_CHECKING:
     import xarray
@@ -206,7 +204,7 @@ class Study:
                     self._work(store, axes, survey, bar, client)
             except KeyboardInterrupt:
                 interrupted = True
-        return dataclasses.replace(_status_of(store), damaged=survey.damaged, interrupted=interrupted)
+        return dataclasses.replace(status_of(store), damaged=survey.damaged, interrupted=interrupted)
 
     def _work(self, store: Store, axes: Axes, survey: Survey, bar: Bar, client: Any) -> None:
         if not survey.todo:
@@ -404,76 +402,3 @@ def _at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray 
 def _spread(k: int) -> float:
     """The k-th number of van der Corput's sequence: 0, 1/2, 1/4, 3/4, ..."""
     return sum((k >> bit & 1) / 2 ** (bit + 1) for bit in range(k.bit_length()))
-
-
-# -- from the store alone ---------------------------------------------------------------------------------------------
-
-
-def status(path: Any) -> StudyStatus:
-    """How far the study in a store is."""
-    return _status_of(Store.open(Path(path)))
-
-
-def _status_of(store: Store) -> StudyStatus:
-    counts, running = store.counts(), files.running(store.root)
-    done = store.points - counts.get("missing", 0)
-    left = None if running is None or "started" not in running else seconds_left(store.points, done, running)
-    return StudyStatus(store.points, done, counts, running, left)
-
-
-def load_study(path: Any) -> xarray.Dataset:
-    """The results in the store of a :class:`Study`, whoever runs it, read when they are looked at.
-
-    Raises
-    ------
-    FileError
-        If there is no store.
-    """
-    store = Store.open(Path(path))
-    import xarray
-
-    try:
-        found = xarray.open_zarr(store.root, consolidated=True, chunks=None)
-    except Exception as error:  # of a dozen kinds
-        raise FileError(f"{path} cannot be read: {error}") from error
-    return found.set_coords([name for name in store.arrays if name not in store.chunked])
-
-
-def audit(path: Any, **tolerances: float) -> Audit:
-    """The laws over the points of a store."""
-    accepted = Tolerances.of(**tolerances)
-    store = Store.open(Path(path))
-    axes, laws = store.axes(), Laws.of(store.attributes["laws"])
-    worst: dict[str, AuditRow] = {}
-    least, drift, residual = math.inf, 0.0, 0.0
-    counts: dict[int, int] = {}
-    for number, status in store.marks():
-        if status is None:
-            continue
-        for code, count in zip(*np.unique(status, return_counts=True), strict=True):
-            counts[int(code)] = counts.get(int(code), 0) + int(count)
-        index = store.index(number)
-        ended = np.isin(status, (*GOOD, LAW_BROKEN, MEASURE_FAILED)).ravel()
-        if not ended.any():
-            continue
-        summary = Summary(status.ravel()[ended], store.chunk("laws", index).reshape(status.size, -1)[ended])
-        drift, residual = max(drift, summary.energy_drift.max()), max(residual, summary.residual.max())
-        least = min(least, float(np.nanmin(summary.least_entropy_increment, initial=math.inf)))
-        for law in laws_of_many(summary, laws, accepted, summary.energy_terms, summary.entropy_terms):
-            i = law.worst
-            row = law.as_row(i)
-            if law.law not in worst or _beyond(row) > _beyond(worst[law.law]):
-                place = tuple(int(p[np.flatnonzero(ended)[i]]) for p in store.places(index))
-                worst[law.law] = dataclasses.replace(row, note=f"worst at {axes.told(place)}")
-    rows = list(worst.values())
-    for name, code in STATUSES.items():
-        if code not in (*GOOD, MISSING) and counts.get(code):
-            rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
-    failed = sum(count for code, count in counts.items() if code not in (*GOOD, MISSING))
-    if not failed:
-        rows.append(AuditRow("points that failed", 0.0, 0.0, True))
-    return Audit(drift, least if math.isfinite(least) else math.nan, math.nan, residual, tuple(rows))
-
-
-def _beyond(row: AuditRow) -> float:
-    return row.value - (row.tolerance or 0.0)
