@@ -13,6 +13,7 @@ TRIED = {
     "killing": lt.KillingDissipation(0.3),
     "projected": lt.ProjectedMetric(rate=0.2),
     "sum": lt.KillingDissipation(0.1) + lt.ProjectedMetric(rate=0.1),
+    "coulomb": lt.DissipationPotential(lt.CoulombFriction(0.2, 0.1)),
 }
 
 
@@ -22,7 +23,7 @@ def test_methods(method):
     assert testing.check_method(method).passed
 
 
-@pytest.mark.parametrize("name", ["projected", *map(slow, ("killing", "sum"))])
+@pytest.mark.parametrize("name", ["projected", *map(slow, ("killing", "sum", "coulomb"))])
 def test_dissipations(name):
     assert testing.check_dissipation(TRIED[name]).passed
 
