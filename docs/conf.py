@@ -105,6 +105,7 @@ html_theme_options = {
     "footer_end": ["theme-version"],
 }
 html_sidebars = {"index": []}
+html_context = {"default_mode": "auto"}  # else the theme complains to a first visitor
 
 
 def _is_bare_value(app, what, name, value, skip, options):
