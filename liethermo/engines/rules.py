@@ -37,8 +37,7 @@ class Rules:
     stale : float
         Contraction rate above which Newton's method takes the Jacobian afresh.
     forcing : float
-        Share of the misfit that such a solution may leave: a smaller one takes more products for each Newton iteration
-        and no fewer in all.
+        Share of the misfit that such a solution may leave: each Newton iteration then gains two digits.
     kept, products : int
         Directions that it is kept orthogonal to, two vectors each; and the most products for one solution.
     shrinking : float

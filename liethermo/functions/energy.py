@@ -2,7 +2,7 @@
 
 The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
 midpoint is one already; a general term gets a correction of its own, along its own coordinates where it is told them
-(:meth:`Energy.on`) [EQUATIONS: "Sums of energies"].
+(:meth:`Energy.on`) [:doc:`/explanation/exact_laws`].
 """
 
 from __future__ import annotations

@@ -178,7 +178,7 @@ HARMLESS = 1e-10
 def stage_gradients(
     energy: Energy, x, low, h, k, A, b, finer: Finer | None = None, symmetries: jax.Array | None = None
 ) -> jax.Array:
-    """Discrete gradients at the stages of a collocation method, shape (s, n) [EQUATIONS §4, "Metriplectic Gauss"].
+    """Discrete gradients at the stages of a collocation method, shape (s, n) [:doc:`/explanation/exact_laws`].
 
     ``grad H(u_i) + alpha d_i`` at ``u_i = x + h sum_j A_ij k_j``, with the one alpha for which
     ``h sum_i b_i g_i . k_i = H(x') - H(x)``. It is O(h^{2s}) for Gauss nodes, and 0 for quadratic terms. The direction

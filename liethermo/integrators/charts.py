@@ -24,7 +24,7 @@ class InCharts(OneStepMethod):
     method keeps hold on the manifold, exactly; and x' is a point of it to rounding, as charts give points: nothing is
     projected. The order is that of the method, as a change of coordinates does not alter it.
 
-    With a retraction whose base point is at the start of the step, z = x [EQUATIONS §4]. With one whose base point is
+    With a retraction whose base point is at the start of the step, z = x. With one whose base point is
     in the middle, z is the midpoint of x and x' [BFM 4.8]; a method of one stage takes Pi and K there as they are, and
     with the discrete gradient in the chart around z, which is (4.9)-(4.10), this is the integrator of BFM §4.4.
 

@@ -68,7 +68,7 @@ class ExplicitMethod(OneStepMethod):
 
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + what it has produced,
 
-    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. What the entropy has produced
+    for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. What the entropy has produced
     is a quadrature of ``sigma = grad S . K grad S >= 0`` with nonnegative weights, of the order of the method.
 
     The point x' is found by Newton's method along the gradients of H and the C, and that of S as far as it is

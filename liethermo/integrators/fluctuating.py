@@ -21,7 +21,7 @@ MISFIT = 1e-10
 
 
 class Fluctuating(OneStepMethod):
-    """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [EQUATIONS §4, "Fluctuations"].
+    """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [:doc:`/explanation/fluctuations`].
 
     As ``div K = sum_a (b_a . grad) b_a + b_a div b_a`` over the columns of B, the first of which is what turns
     Stratonovich's integral into Itô's, a step is

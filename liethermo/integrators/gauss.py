@@ -1,4 +1,7 @@
-"""Metriplectic Gauss: any even order, with both laws exact for every energy and every entropy [EQUATIONS §4]."""
+"""Metriplectic Gauss: any even order, with both laws exact for every energy and every entropy.
+
+Its derivation is in :doc:`/explanation/exact_laws`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconstruction: the attitude of a body, stepped along with its momentum at the order of any method [EQUATIONS §4]."""
+"""Reconstruction: the attitude of a body, stepped along with its momentum at the order of any method."""
 
 from __future__ import annotations
 

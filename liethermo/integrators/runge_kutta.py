@@ -27,7 +27,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X_i),    sigma = grad S . K grad S >= 0,
 
-    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. The weights b of Lobatto's
+    for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. The weights b of Lobatto's
     quadrature are nonnegative, so that the entropy never falls; the quadrature is of the order p of the method, 4, 6 or
     8, so that x' - y is O(h^{p+1}). How x' is found: :class:`.explicit.ExplicitMethod`.
 

@@ -29,7 +29,7 @@ class MetriplecticTaylor(ExplicitMethod):
 
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X(s_i)),    sigma = grad S . K grad S >= 0,
 
-    for every C that the system is known to conserve [EQUATIONS §4, "Explicit methods"]. The s_i and b_i are those of
+    for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. The s_i and b_i are those of
     Lobatto's quadrature, with ``p / 2 + 1`` nodes: it is of order p, and nothing that it produces is negative. How x'
     is found: :class:`.explicit.ExplicitMethod`.
 

@@ -41,7 +41,7 @@ class OfMomentum(Energy):
 
 
 class AttitudeSystem(System):
-    """A Lie-Poisson system for mu, and ``g' = g hat(grad H(mu))`` beside it [EQUATIONS §4, "Group reconstruction"].
+    """A Lie-Poisson system for mu, and ``g' = g hat(grad H(mu))`` beside it [:doc:`/explanation/exact_laws`].
 
     A state is mu followed by the entries of g, row by row, their imaginary parts last where there are any. Energy,
     entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.

@@ -57,7 +57,7 @@ def test_observed_order(system, x0, gradient, order):
 
 
 def test_free_body_reference_values():
-    """EQUATIONS §5: I = (2, 1, 2/3), and its state at t = 10."""
+    """A free body with I = (2, 1, 2/3), and its state at t = 10."""
     system = lt.models.free_rigid_body(inertia=(2.0, 1.0, 2.0 / 3.0))
     x0 = np.array([np.cos(1.1), 0.0, np.sin(1.1)])
     expected = np.array([0.407066136588041, 0.283007426812844, 0.868449167661562])

@@ -13,7 +13,7 @@ from liethermo.tracing.interpret import at_points
 from tests.liethermo.closed_systems import ISOLATED, OPEN, SCHEMES, X0
 
 H = 1e-3
-TABLE = {  # EQUATIONS §7: largest |E - E_0| / E_0 over 5-20 thousand steps, for lambda = 0, 0.2, 5, 10
+TABLE = {  # largest |E - E_0| / E_0 over 5-20 thousand steps, for lambda = 0, 0.2, 5, 10
     (1, "scheme 1"): (3.0e-8, 2.8e-8, 1.3e-8, 9.3e-9),
     (1, "scheme 2"): (3e-15, 8.4e-12, 1.6e-11, 1.6e-11),
     (1, "scheme 3"): (3.0e-11, 2.9e-11, 2.0e-11, 1.7e-11),

@@ -1,0 +1,191 @@
+"""The derivatives of every method's flow: along trajectories, and at equilibria, where its quotients are 0/0."""
+
+import decimal
+from decimal import Decimal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import liethermo as lt
+import manifolds as mf
+from tests.cases import slow
+from tests.liethermo.integrators.test_convergence import OF_EVERY_SYSTEM, PROBLEMS, SYSTEMS
+
+METHODS = [m for m in lt.registered_methods() if isinstance(m, OF_EVERY_SYSTEM)]
+
+
+def by_differences(f, x, size=2e-3):
+    """The Jacobian of f by central differences of sixth order."""
+    weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+
+    def along(v):
+        return sum(w * (f(x + c * size * v) - f(x - c * size * v)) for c, w in weights.items()) / size
+
+    return np.stack([along(v) for v in np.eye(len(x))], axis=1)
+
+
+# -- along trajectories ------------------------------------------------------------------------------------------------
+
+PLAIN = [name for name in PROBLEMS if name != "spin with a bath"]  # its coordinates are bound to a sphere
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PLAIN)
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_along_trajectories(method, name):
+    """Both modes are the derivative of the discrete flow, as its differences show."""
+    problem, system, h = PROBLEMS[name], SYSTEMS[name](), 0.1
+    end = jax.jit(lambda x: lt.flow(system, x, (0.0, 3 * h), h, method))
+    x = jnp.asarray(problem.start)
+    found = jax.jit(jax.jacfwd(end))(x), jax.jit(jax.jacrev(end))(x)
+    expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(problem.start))
+    for jacobian in found:
+        assert np.abs(jacobian - expected).max() < 2e-10 * max(1.0, np.abs(expected).max())
+
+
+MOMENTS = tuple(map(Decimal, ("3", "2", "1")))
+QUARTIC, RATE = Decimal("0.25"), Decimal("0.5")
+
+
+def midpoint_step(x, h):
+    """The midpoint scheme (BFM 4.5) of a body with a quartic energy and S = log(1 + |m|^2), written out in decimals.
+
+    Gonzalez' discrete gradient (4.3), K of (2.2) with it in the kernel (4.6).
+    """
+
+    def energy(m):
+        return sum(c * c / (2 * i) for c, i in zip(m, MOMENTS, strict=True)) + QUARTIC * m[0] ** 4
+
+    def gradient(m):
+        return np.array([c / i for c, i in zip(m, MOMENTS, strict=True)]) + np.array([4 * QUARTIC * m[0] ** 3, 0, 0])
+
+    d, moved = np.array([Decimal(0)] * 3), Decimal(1)
+    while moved > Decimal("1e-40"):
+        z = x + d / 2
+        dH, dS = gradient(z), 2 * z / (1 + z @ z)
+        if d @ d > 0:
+            dH = dH + (energy(x + d) - energy(x) - dH @ d) / (d @ d) * d
+        new = h * (np.cross(z, dH) + RATE * ((dH @ dH) * dS - (dH @ dS) * dH))
+        moved, d = max(abs(c) for c in new - d), new
+    return x + d
+
+
+@pytest.mark.parametrize(
+    "start", [slow(pytest.param(("0.3", "1.0", "0.2"), id="moving")), pytest.param(("1.0", "0", "0"), id="at rest")]
+)
+def test_the_midpoint_scheme_in_eighty_digits(start):
+    """Differences of a step written out in decimals have no rounding; at rest they go round the 0/0 as well."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m: 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.25 * m[0] ** 4,
+        lambda m: jnp.log(1.0 + jnp.dot(m, m)),
+        lt.ProjectedMetric(rate=0.5),
+    )
+    steps, h = 3, Decimal("0.125")
+
+    def end(x):
+        for _ in range(steps):
+            x = midpoint_step(x, h)
+        return x
+
+    with decimal.localcontext(prec=80):
+        x, size = np.array(list(map(Decimal, start))), Decimal("1e-12")
+        units = [np.array([Decimal(int(i == j)) for j in range(3)]) for i in range(3)]
+        expected = np.stack([(end(x + size * e) - end(x - size * e)) / (2 * size) for e in units], axis=1).astype(float)
+        state = end(x).astype(float)
+    flow = jax.jit(lambda y: lt.flow(system, y, (0.0, steps * float(h)), float(h), lt.MetriplecticMidpoint()))
+    x = jnp.array(list(map(float, start)))
+    assert np.abs(flow(x) - state).max() < 4e-16
+    assert np.abs(jax.jit(jax.jacfwd(flow))(x) - expected).max() < 2e-14
+    assert np.abs(jax.jit(jax.jacrev(flow))(x) - expected).max() < 2e-14
+    assert np.abs(expected - np.eye(3)).max() > 0.1
+
+
+# -- at equilibria -----------------------------------------------------------------------------------------------------
+
+
+def _body():
+    def energy(m):
+        return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4
+
+    friction = lt.ProjectedMetric(rate=0.3)
+    return lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction)
+
+
+def _sleeping_top():
+    """Spinning upright; no dissipation, no entropy, two Casimirs."""
+
+    def energy(x):
+        return 0.5 * jnp.sum(jnp.array([1.0, 0.8, 0.5]) * x[:3] ** 2) + x[5] + 0.3 * x[5] ** 3
+
+    return lt.LiePoissonSystem(mf.se(3), energy)
+
+
+def _pendulum():
+    """At rest below, with friction that heats a bath: S is not quadratic, T = 1.3."""
+
+    def energy(x):
+        return 0.5 * x[1] ** 2 + 1.0 - jnp.cos(x[0]) + jnp.exp(x[2])
+
+    def entropy(x):
+        return x[2]
+
+    def K(x):
+        T = jnp.exp(x[2])
+        e = jnp.array([0.0, 1.0, -x[1] / T])
+        return 0.5 * T * jnp.outer(e, e)
+
+    tensor = np.zeros((3, 3))
+    tensor[0, 1], tensor[1, 0] = 1.0, -1.0
+    return lt.MetriplecticSystem(tensor, energy, entropy, lt.FrictionOperator(K), dim=3)
+
+
+def _lowered():
+    def energy(m):
+        return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4 + 0.2 * m[0]
+
+    return lt.LiePoissonSystem(mf.so(3), energy, dissipation=lt.DoubleBracket(rate=0.4))
+
+
+def _two_bodies():
+    """Heat between two bodies at one temperature."""
+    return lt.MetriplecticSystem(
+        None,
+        lambda u: u[0] + u[1],
+        lambda u: jnp.log(u[0]) + 2.0 * jnp.log(u[1]),
+        lt.ProjectedMetric(normalized=True, rate=0.7),
+        dim=2,
+    )
+
+
+EQUILIBRIA = {
+    "a body about its axis": (_body, (1.0, 0.0, 0.0)),
+    "a body about its middle axis": (_body, (0.0, 1.0, 0.0)),
+    "a sleeping top": (_sleeping_top, (0.0, 0.0, 1.5, 0.0, 0.0, 1.0)),
+    "a pendulum below": (_pendulum, (0.0, 0.0, np.log(1.3))),
+    "a pendulum above": (_pendulum, (np.pi, 0.0, np.log(1.3))),
+    "a body that was lowered": (_lowered, (-1.0, 0.0, 0.0)),
+    "two bodies of one temperature": (_two_bodies, (1.0, 2.0)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EQUILIBRIA)
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_at_equilibria(method, name):
+    """The Jacobian is that of differences, and the exponential of the field's to the order of the method."""
+    build, x = EQUILIBRIA[name]
+    system, x, h = build(), jnp.asarray(x), 0.1
+    assert np.abs(system.vector_field(x)).max() < 1e-15
+    end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
+    found = np.asarray(jax.jit(jax.jacfwd(end))(x))
+    expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(x))
+    assert np.abs(found - expected).max() < 2e-9
+    assert np.abs(jax.jit(jax.jacrev(end))(x) - found).max() < 1e-12
+    linear = np.asarray(jax.jit(jax.jacfwd(system.vector_field))(x))
+    exact = scipy.linalg.expm(h * linear)
+    assert np.abs(found - exact).max() < (2.0 * h * np.abs(linear).max()) ** (method.order + 1)
+    assert np.abs(exact - np.eye(len(x))).max() > 0.01
