@@ -74,7 +74,10 @@ copybutton_selector = "div:not(.output) > div.highlight > pre"
 sphinx_gallery_conf = {
     "examples_dirs": ["../examples"],
     "gallery_dirs": ["gallery"],
-    "subsection_order": [*map("../examples/{}".format, "bodies algebras spins fluids heat studies methods".split()), "*"],
+    "subsection_order": [
+        *map("../examples/{}".format, "bodies algebras spins fluids heat studies methods".split()),
+        "*",
+    ],
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"/(?!plot_)[^/]*\.py$",
     "download_all_examples": False,
