@@ -278,10 +278,9 @@ def fastest(matrices: np.ndarray) -> np.ndarray:
     return np.where(rates.real > TURNING * np.abs(rates), np.abs(rates), 0.0).max(axis=-1, initial=0.0)
 
 
-def rate_of(system: System, method: OneStepMethod, x, seen: np.ndarray) -> float:
-    """How fast what grows near a state does, ``seen`` being the stretch there."""
-    matrix = seen if seen.shape[1] <= array.FEW else np.asarray(array.growing(system, method, jnp.asarray(x)))
-    return float(fastest(matrix))
+def rate_of(system: System, method: OneStepMethod, x) -> float:
+    """How fast what grows near a state does, of a system whose stretch is no matrix."""
+    return float(fastest(np.asarray(array.growing(system, method, jnp.asarray(x)))))
 
 
 # -- programs ---------------------------------------------------------------------------------------------------------

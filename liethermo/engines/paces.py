@@ -203,8 +203,7 @@ class Guide:
             rates = pace.fastest(seen)
         else:
             x = paces.read("x", chosen)
-            found = [pace.rate_of(self.member(int(i)), self.method, x[j], seen[j]) for j, i in enumerate(chosen)]
-            rates = np.array(found)
+            rates = np.array([pace.rate_of(self.member(int(i)), self.method, x[j]) for j, i in enumerate(chosen)])
         longest = np.divide(pace.reach(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
         paces.write("growth", chosen, rates)
         paces.write("wish", chosen, np.minimum(paces.read("wish", chosen), longest))

@@ -158,9 +158,7 @@ class ExplicitMethod(OneStepMethod):
         """The vectors that the step hands on; of those before it the levels alone are needed."""
         laws = self._laws(system)
         d, changes, error, between = self.uncorrected(system, laws, x, low, h)
-        if not isinstance(
-            system, ChartSystem
-        ):  # whose coordinates, and with them the levels' row, are new at every step
+        if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
             changes = changes + self._steering(laws, x, low, k[LEVELS])
         d, missed = self._corrected(system, laws, x, low, d, changes)
         return jnp.stack([d / h, error, jnp.broadcast_to(missed / h, x.shape), k[LEVELS], *between])

@@ -18,7 +18,7 @@ from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import Audit, AuditRow, Tolerances, accuracy_row
 from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, as_parts, checksum, describe, from_parts, write
+from .files import ENSEMBLE_FORMAT, as_parts, described, from_parts, write
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -322,8 +322,6 @@ class Ensemble:
         InputError
             If there is no variable of a name.
         """
-        import xarray
-
         path = self.energy.ndim == 2
         each = ("trajectory", "time") if path else ("trajectory",)
         variables: dict[str, Any] = {
@@ -351,10 +349,8 @@ class Ensemble:
             "wall_time": self.wall_time,
             "reasons": json.dumps({str(i): text for i, text in self.reasons.items()}),
         }
-        dataset = xarray.Dataset(variables, {"time": self.t, "trajectory": np.arange(len(self))}, attributes)
-        describe(dataset, {"energy": self.laws.energy, "entropy": self.laws.entropy}, units or {})
-        content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
-        return dataset.assign_attrs(sha256=checksum(content, attributes))
+        coordinates = {"time": self.t, "trajectory": np.arange(len(self))}
+        return described(variables, coordinates, attributes, self.laws, units)
 
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
         """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all.

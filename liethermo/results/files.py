@@ -14,6 +14,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..errors import FileError, InputError
+from .status import Laws
 
 if TYPE_CHECKING:
     import xarray
@@ -46,18 +47,30 @@ LONG_NAMES = {
 }
 
 
-def describe(dataset: xarray.Dataset, laws: Mapping[str, str | None], units: Mapping[str, str]) -> None:
-    """Say of each variable what it is, in which unit, and what law the system promises of it; in place."""
+def described(
+    variables: dict[str, Any],
+    coordinates: dict[str, Any],
+    attributes: dict[str, Any],
+    laws: Laws,
+    units: Mapping[str, str] | None,
+) -> xarray.Dataset:
+    """The dataset of a result: what each variable is, its unit, the law that is promised of it, and a checksum."""
+    import xarray
+
+    dataset, units = xarray.Dataset(variables, coordinates, attributes), units or {}
     unknown = [name for name in units if name not in dataset.variables]
     if unknown:
         raise InputError(f"a result has no variable {unknown[0]!r}; it has {', '.join(map(str, dataset.variables))}")
+    promised = {"energy": laws.energy, "entropy": laws.entropy}
     for name, variable in dataset.variables.items():
         said = {
             "long_name": LONG_NAMES.get(str(name), str(name).replace("_", " ")),
             "units": units.get(str(name)),
-            "law": laws.get(str(name)),
+            "law": promised.get(str(name)),
         }
         variable.attrs.update({key: text for key, text in said.items() if text is not None})
+    content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
+    return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
 def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:

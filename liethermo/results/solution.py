@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, as_parts, checksum, describe, from_parts, write
+from .files import FORMAT, as_parts, described, from_parts, write
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
@@ -129,8 +129,6 @@ class Solution:
         InputError
             If there is no variable of a name.
         """
-        import xarray
-
         series = {"energy": ("time", self.energy)}
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
@@ -153,10 +151,7 @@ class Solution:
             "provenance": json.dumps(self.provenance),
             "event_time": json.dumps(self.event_time),
         }
-        dataset = xarray.Dataset(variables, coordinates, attributes)
-        describe(dataset, {"energy": self.laws.energy, "entropy": self.laws.entropy}, units or {})
-        content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
-        return dataset.assign_attrs(sha256=checksum(content, attributes))
+        return described(variables, coordinates, attributes, self.laws, units)
 
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
         """Write a NetCDF file; it appears whole or not at all.
