@@ -21,6 +21,10 @@ hypothesis.settings.register_profile(
 )
 
 
+gc.set_threshold(200_000, 20, 100)
+"""Tracing makes many small objects that live: looking through them ever again costs a tenth of the time."""
+
+
 def pytest_configure(config):
     slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
     hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")

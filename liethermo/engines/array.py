@@ -370,8 +370,8 @@ def advance(
 ):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
-    Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
-    ``noise`` has the increments of each step, shape (steps, increments); steps without any where it is None.
+    Returns the new state and, for each of ``capacity`` saves, the state vector, energy and entropy, and whether it was
+    reached. ``noise`` has the increments of each step, shape (steps, increments); steps without any where it is None.
     """
     h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
     return _advance(system, method, state, h, saves, every, capacity, rules, noise)
@@ -385,17 +385,30 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
         own = method if noise is None else method.driven_by(noise[s.step - first])
         return take_step(system, own, s, h, rules)
 
-    def one_save(state: State, index):
+    def one_save(index, carry: tuple[State, tuple]):
+        state, kept = carry
         target = state.step + every
 
         def goes_on(s: State):
-            return (s.status == Code.COMPLETED) & (s.step < target) & (index < saves)
+            return (s.status == Code.COMPLETED) & (s.step < target)
 
         state = jax.lax.while_loop(goes_on, step, state)
-        reached = (state.status == Code.COMPLETED) & (index < saves)
-        return state, (state.x, state.energy, state.entropy, reached)
+        saved = state.x, state.energy, state.entropy, state.status == Code.COMPLETED
+        return state, jax.tree_util.tree_map(lambda all_of, one: all_of.at[index].set(one), kept, saved)
 
-    return jax.lax.scan(one_save, state, jnp.arange(capacity))
+    one = state.x, state.energy, state.entropy, jnp.zeros((), bool)
+    kept = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in one)
+    return jax.lax.fori_loop(0, saves, one_save, (state, kept))  # as many passes as saves, whatever the capacity
+
+
+KEPT_STATES, KEPT_NUMBERS = 1024, 2**16
+"""States that one call keeps at most, and their components: enough to hide the cost of a call, few enough to show
+progress."""
+
+
+def portion_of(system: System) -> int:
+    """The states that one call keeps at most: one number for all runs of a system, so that one program serves them."""
+    return min(KEPT_STATES, max(1, KEPT_NUMBERS // system.dim))
 
 
 class ArrayEngine:
@@ -405,16 +418,16 @@ class ArrayEngine:
 
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
         self.system, self.method, self.rules = system, method, rules
+        self.portion = portion_of(system)
 
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
 
-    def advance(self, state: State, h, saves, every, capacity: int, noise=None):
-        return advance(self.system, self.method, state, h, saves, every, capacity, self.rules, rows(noise))
+    def advance(self, state: State, h, saves: int, every: int, noise=None):
+        return advance(self.system, self.method, state, h, saves, every, self.portion, self.rules, rows(noise))
 
     def step(self, state: State, h, noise=None) -> State:
-        method = self.method if noise is None else self.method.driven_by(jnp.asarray(noise[0]))
-        return _one_step(self.system, method, state, jnp.asarray(h), self.rules)
+        return self.advance(state, h, 1, 1, noise)[0]
 
 
 def rows(noise) -> jax.Array | None:
@@ -423,11 +436,6 @@ def rows(noise) -> jax.Array | None:
         return None
     missing = (1 << max(0, noise.shape[-2] - 1).bit_length()) - noise.shape[-2]
     return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, missing), (0, 0)]))
-
-
-@program
-def _one_step(system, method, state, h, rules):
-    return take_step(system, method, state, h, rules)
 
 
 def error_of_step(system: System, method: OneStepMethod, x, low, h, k):

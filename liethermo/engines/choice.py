@@ -42,13 +42,14 @@ class Engine(Protocol):
     """Takes the steps of one method on one system."""
 
     name: str
+    portion: int  # saves that one call takes at most
 
     def begin(self, x) -> State:
         """The state of a run about to start at x."""
         ...
 
-    def advance(self, state: State, h, saves: int, every: int, capacity: int, noise=None) -> tuple[State, tuple]:
-        """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
+    def advance(self, state: State, h, saves: int, every: int, noise=None) -> tuple[State, tuple]:
+        """Up to ``saves <= portion`` times ``every`` steps of size h; stops where a step fails.
 
         Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
         ``noise`` has the increments that drive each step, an array of shape (steps, increments), where there are any.
@@ -96,6 +97,10 @@ class Chosen:
     def name(self) -> str:
         return self._engine.name
 
+    @property
+    def portion(self) -> int:
+        return self._engine.portion
+
     def begin(self, x) -> State:
         if not self._begun:
             self._engine, self._begun = self._choose(), True
@@ -105,9 +110,9 @@ class Chosen:
             self._fall_back(error)
             return self._engine.begin(x)
 
-    def advance(self, state: State, h, saves: int, every: int, capacity: int) -> tuple[State, tuple]:
+    def advance(self, state: State, h, saves: int, every: int) -> tuple[State, tuple]:
         noise = self._noise(state, int(saves) * int(every), h)
-        return self._attempt(lambda engine, state: engine.advance(state, h, saves, every, capacity, noise), state)
+        return self._attempt(lambda engine, state: engine.advance(state, h, saves, every, noise), state)
 
     def step(self, state: State, h) -> State:
         noise = self._noise(state, 1, h)

@@ -51,7 +51,7 @@ def given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
     return Status(Code.STEP_UNDERFLOW, text, steps, now, residual)
 
 
-def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, capacity: int = 1) -> Status:
+def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool) -> Status:
     """How fixed steps of size h ended, or a step that could not be taken."""
     code, step, residual = int(state.status), int(state.step), float(state.residual)
     if interrupted:
@@ -63,14 +63,13 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, ca
         message = (
             f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
             f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e}). "
-            + _advice(engine, state, h, capacity)
+            + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)
     if code == Code.NOT_CONVERGED:
         message = (
             f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
-            f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). "
-            + _advice(engine, state, h, capacity)
+            f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). " + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)
     message = (
@@ -81,13 +80,11 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool, ca
     return Status(Code.NON_FINITE, message, step, now, residual)
 
 
-def _advice(engine: Chosen, state, h: float, capacity: int) -> str:
+def _advice(engine: Chosen, state, h: float) -> str:
     """What helps where a step of size h could not be solved: shorter ones are tried."""
     state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
     for part in SHORTER:
-        one = h / part, 1, 1, capacity
-        new, _ = engine.advance(state, *one)
-        if int(new.status) == Code.COMPLETED:
+        if int(engine.step(state, h / part).status) == Code.COMPLETED:
             stiff = (
                 "; if that is far below what the motion needs, it is stiff, and lt.MetriplecticGauss takes long steps"
             )

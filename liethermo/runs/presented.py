@@ -55,16 +55,12 @@ def _value(function, x):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Again:
-    """One step from any state, by the program that a run has compiled; ``capacity`` is None for single steps."""
+    """One step from any state, by the program that a run has compiled."""
 
     engine: Chosen
-    capacity: int | None
 
     def __call__(self, x: np.ndarray, h: float):
-        state = self.engine.begin(jnp.asarray(x))
-        if self.capacity is None:
-            return self.engine.step(state, h)
-        return self.engine.advance(state, h, 1, 1, self.capacity)[0]
+        return self.engine.step(self.engine.begin(jnp.asarray(x)), h)
 
 
 def provenance_of(

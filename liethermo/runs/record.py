@@ -185,7 +185,7 @@ class Alone:
             energy=energy,
             entropy=plain.entropy,
             steps=steps,
-            again=Again(Chosen(system, self.method, "auto", 1), None),
+            again=Again(Chosen(system, self.method, "auto", 1)),
             status=plain.status,
             stats=plain.stats,
             provenance=plain.provenance,

@@ -26,7 +26,7 @@ from .fluctuations import Fluctuations, Path
 from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, stops_of
 from .stepwise import run as run_stepwise
-from .timetable import CHUNK_SAVES, CHUNK_STEPS, Timetable
+from .timetable import Timetable
 
 MOST_LISTED = 1_000
 """Components up to which the first state is listed in the provenance; an attribute of a file cannot be of any size."""
@@ -51,7 +51,6 @@ class Run:
         self.event_time: float | None = None
         self.dense: Dense | None = None
         self.longest: list[float] = []  # steps after each state that is kept
-        self.capacity: int | None = None
         self.noise = noise
         path = None if noise is None or not method.increments else Path(noise, method.increments)
         self.engine = Chosen(system, method, engine, table.steps, path)
@@ -60,18 +59,12 @@ class Run:
 
     def by_steps(self, bar) -> None:
         """Drive the engine call by call, to the end, a failure or Ctrl-C."""
-        every = self.table.every or 1
-        saves = _power_of_two(self.table.full // every)  # few distinct capacities, so few compilations
-        capacity = max(1, min(CHUNK_SAVES, CHUNK_STEPS // every, saves))
         state, interrupted = None, False
         try:
             state = self.engine.begin(self.states[0][0])
             self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-            if self.engine.name == "sparse":
-                capacity = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
-            self.capacity = capacity
-            for h, saves, every in self.table.calls(saves=capacity):
-                state = self._advance(state, h, saves, every, capacity)
+            for h, saves, every in self.table.calls(saves=self.engine.portion):
+                state = self._advance(state, h, saves, every)
                 bar.update(self.times[-1])
                 if int(state.status) != Code.COMPLETED:
                     break
@@ -84,7 +77,7 @@ class Run:
             return
         step = int(state.step)
         now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
-        self.stats, self.status = stats_of(state), status_of(self.engine, state, now, h, interrupted, capacity)
+        self.stats, self.status = stats_of(state), status_of(self.engine, state, now, h, interrupted)
 
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
@@ -157,9 +150,9 @@ class Run:
         self.states.append(np.asarray(state.x)[None])
         self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
 
-    def _advance(self, state, h, saves, every, capacity):
+    def _advance(self, state, h, saves, every):
         before = int(state.step)
-        state, (x, energy, entropy, reached) = self.engine.advance(state, h, saves, every, capacity)
+        state, (x, energy, entropy, reached) = self.engine.advance(state, h, saves, every)
         kept = int(np.asarray(reached).sum())
         states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
         values = np.stack([np.asarray(energy)[:kept], np.asarray(entropy)[:kept]], axis=1)
@@ -211,7 +204,7 @@ class Run:
             energy=energy,
             entropy=entropy,
             steps=np.array((self.longest or same)[: len(x) - 1]),
-            again=Again(self.engine, self.capacity),
+            again=Again(self.engine),
             status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.times[-1]),
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),
@@ -237,8 +230,3 @@ class Run:
 @program
 def _along(system: System, method: OneStepMethod, x, v):
     return jax.vmap(lambda x, v: method.along(system, x, v))(x, v)
-
-
-def _power_of_two(n: int) -> int:
-    """The next power of two: few distinct chunk sizes, so few compilations."""
-    return 1 << max(0, n - 1).bit_length()

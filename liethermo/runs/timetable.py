@@ -8,10 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..engines.array import KEPT_STATES
 from ..errors import InputError
-
-CHUNK_SAVES = 1024
-"""Saved states per call of the engine: enough to hide the cost of a call, few enough to show progress."""
 
 CHUNK_STEPS = 100_000
 """Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
@@ -69,7 +67,7 @@ class Timetable:
         """The times at :attr:`counts`."""
         return np.array([self.time(int(n)) for n in self.counts])
 
-    def calls(self, limit: int = CHUNK_STEPS, saves: int = CHUNK_SAVES) -> Iterator[tuple[float, int, int]]:
+    def calls(self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES) -> Iterator[tuple[float, int, int]]:
         """The run in calls ``(h, saves, every)`` of an engine: so many saves, each after so many steps of size h.
 
         None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save.

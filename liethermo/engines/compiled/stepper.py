@@ -22,7 +22,7 @@ from ...systems import System
 from ...tracing.remembered import Latest, remembered
 from ...tracing.scalarize import scalarize
 from .. import array
-from ..array import Iteration, Solved, State
+from ..array import Iteration, Solved, State, portion_of
 from ..rules import RULES, Rules
 from .form import Form, numbers_of
 from .loop import Layout, Piece, step_loop
@@ -46,6 +46,7 @@ class CompiledEngine:
 
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
         self._stepper, self._parameters = stepper_for(system, method, rules)
+        self.portion = portion_of(system)
 
     @property
     def operations(self) -> int:
@@ -55,8 +56,7 @@ class CompiledEngine:
     def begin(self, x) -> State:
         return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None]))
 
-    def advance(self, state: State, h, saves: int, every: int, capacity: int, noise=None):
-        del capacity  # nothing is compiled for a number of saves
+    def advance(self, state: State, h, saves: int, every: int, noise=None):
         new, out = self._run(state, h, saves, every, noise)
         reached = np.arange(saves) < (int(new.step) - int(state.step)) // every
         return new, (out[:, :-2], out[:, -2], out[:, -1], reached)

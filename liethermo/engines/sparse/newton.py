@@ -42,6 +42,7 @@ class SparseEngine:
     """
 
     name = "sparse"
+    portion = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
@@ -56,9 +57,9 @@ class SparseEngine:
     def begin(self, x) -> array.State:
         return array.begin(self.system, self.method, x)
 
-    def advance(self, state, h, saves, every, capacity: int, noise=None):
+    def advance(self, state, h, saves, every, noise=None):
         """Keeps no more than it reaches."""
-        del capacity, noise  # steps with noise are not for this engine
+        del noise  # steps with noise are not for this engine
         kept: list[array.State] = []
         for _ in range(int(saves)):
             for _ in range(int(every)):

@@ -61,7 +61,8 @@ def assert_slope(errors, order):
 @pytest.mark.parametrize("name", ["spin", "bath", "frame"])
 def test_observed_order_on_manifolds(name, order, length):
     system, x0 = CASES[name](), starts(name)
-    length = 0.6 * length if name == "frame" else length
+    if name == "frame":  # of a smaller radius of convergence
+        length *= 0.3 if order == 20 else 0.6
     exact, errors = reference(system, x0, length, 8), []
     for m in MULTIPLES:
         h = m * length / 8

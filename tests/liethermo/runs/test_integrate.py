@@ -14,7 +14,6 @@ import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.codes import Code
 from liethermo.engines.rules import RULES, Rules
-from liethermo.runs import run as loop
 from liethermo.runs.progress import Progress
 from tests.cases import EPS
 
@@ -51,7 +50,7 @@ def test_save_every(every):
 
 def test_chunks_do_not_show(monkeypatch):
     whole = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    monkeypatch.setattr(loop, "CHUNK_SAVES", 16)
+    monkeypatch.setattr(array, "KEPT_STATES", 16)
     pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
     assert np.array_equal(whole.x, pieces.x)
 
@@ -168,7 +167,7 @@ def test_one_iteration_is_not_enough_and_says_so(method):
     """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     engine = array.ArrayEngine(system, method.on(system), Rules(fixed_point=1, newton=1))
-    state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1, 16)
+    state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1)
     assert int(state.status) == (Code.COMPLETED if method.explicit else Code.NOT_CONVERGED)
     assert int(state.step) == (10 if method.explicit else 0)
 

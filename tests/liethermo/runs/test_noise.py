@@ -237,7 +237,7 @@ def test_paths_converge_in_the_mean_square(system, noise):
 
     def end(W, steps):
         engine = Chosen(system, method, "compiled", steps, Summed(W, fine // steps))
-        return np.asarray(engine.advance(engine.begin(START), T / steps, 1, steps, 1)[0].x)
+        return np.asarray(engine.advance(engine.begin(START), T / steps, 1, steps)[0].x)
 
     exact = np.array([end(W, fine) for W in increments])
     for steps in levels:
