@@ -18,7 +18,7 @@ from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import Audit, AuditRow, Tolerances, accuracy_row
 from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, as_parts, described, from_parts, write
+from .files import ENSEMBLE_FORMAT, as_parts, described, from_parts, places, write
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -90,7 +90,7 @@ class Ensemble:
         Time reached.
     rejected : ndarray of int64, shape (B,)
         Adaptive steps that were tried and were too long.
-    x0 : ndarray, shape (B, n)
+    x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` in the place of n
         Initial states.
     laws : Laws
     engine : str
@@ -331,7 +331,7 @@ class Ensemble:
         }
         for name, dims in (("x", each), ("x0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
-                variables[name] = ((*dims, "component"), value)
+                variables[name] = ((*dims, *places(value.ndim - len(dims))), value)
         for name, dims in (("attitude", each), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), as_parts(value))

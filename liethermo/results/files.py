@@ -47,6 +47,12 @@ LONG_NAMES = {
 }
 
 
+def places(axes: int) -> list[str]:
+    """The names of the axes of a state: those of its sites, if it has any, and its components."""
+    sites = ["site"] if axes == 2 else [f"site_{i + 1}" for i in range(axes - 1)]
+    return [*sites, "component"]
+
+
 def described(
     variables: dict[str, Any],
     coordinates: dict[str, Any],

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, as_parts, described, from_parts, write
+from .files import FORMAT, as_parts, described, from_parts, places, write
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
@@ -132,8 +132,7 @@ class Solution:
         series = {"energy": ("time", self.energy)}
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
-        sites = ["site"] if self.x.ndim == 3 else [f"site_{i + 1}" for i in range(self.x.ndim - 2)]
-        variables: dict[str, Any] = {"x": (("time", *sites, "component"), self.x), **series}
+        variables: dict[str, Any] = {"x": (("time", *places(self.x.ndim - 1)), self.x), **series}
         if self.attitude is not None:
             variables["attitude"] = (("time", "row", "column", "part"), as_parts(self.attitude))
         variables["invariant"] = (

@@ -143,7 +143,7 @@ class Record:
         if isinstance(self.member, DrivenSystem):
             work = placed(self.work if self.path is None else np.asarray(self.member.work(x)))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        return Ensemble(
+        found = Ensemble(
             t=t,
             x=placed(x),
             energy=energy,
@@ -159,6 +159,7 @@ class Record:
             **rows,
             **fields,
         )
+        return self.member.on_sites(found)
 
 
 class Alone:

@@ -263,10 +263,12 @@ class System(eqx.Module):
         return self.on_sites(solution)
 
     def on_sites(self, found: Any) -> Any:
-        """A solution, or an ensemble, with its states x, shape (..., n), as they are shown on sites."""
-        if not self.sites or found.x is None:
+        """A solution, or an ensemble, with its states, shape (..., n), as they are shown on sites."""
+        if not self.sites:
             return found
-        return dataclasses.replace(found, x=found.x.reshape(*found.x.shape[:-1], *self.shape))
+        states = {name: value for name in ("x", "x0") if (value := getattr(found, name, None)) is not None}
+        shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
+        return dataclasses.replace(found, **shown)
 
     def seen(self, x) -> jax.Array:
         """The part of a state that is the user's, as points: what the functions of an event are functions of."""

@@ -171,6 +171,9 @@ class DrivenSystem(System):
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.presented(found)
 
+    def on_sites(self, found):
+        return self.body.on_sites(found)
+
 
 class _WithoutClock(Energy):
     """A function of a state with clock and work that depends on neither, as one of the body's state."""

@@ -47,7 +47,10 @@ def test_user_functions_results_and_files_have_the_shape_of_the_sites(tmp_path):
     flat = lt.integrate(made, STATE.ravel(), **run)
     np.testing.assert_array_equal(flat.x, solution.x)
     some = lt.ensemble(made, np.stack([STATE, 2.0 * STATE]), (0.0, 0.3), 0.1, engine="array")
-    assert some.x.shape == (2, *G.shape)
+    assert some.x.shape == some.x0.shape == (2, *G.shape)
+    assert some[1].x.shape == (2, *G.shape)
+    assert some.to_xarray()["x"].dims == ("trajectory", "site_1", "site_2", "component")
+    np.testing.assert_array_equal(lt.load(some.save(tmp_path / "some.nc")).x, some.x)
     np.testing.assert_allclose(some.x[0], solution.x[-1], atol=1e-13)
     np.testing.assert_allclose(lt.flow(made, STATE, (0.0, 0.3), 0.1), solution.x[-1], atol=1e-13)
 
