@@ -15,12 +15,13 @@ from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
-from .array import ArrayEngine, State
+from .array import ArrayEngine
 from .compiled.paced import lane_pace
 from .compiled.stepper import CompiledEngine
-from .pace import Pacing
-from .paces import Paces, SinglePaces
+from .paced import Paces, SinglePaces
+from .pacing import Pacing
 from .sparse.newton import SparseEngine
+from .stepping import State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
 
@@ -122,7 +123,7 @@ class Chosen:
         return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
 
     def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> Paces:
-        """The run with a pace, about to start at x at a time; see :func:`.pace.begun`."""
+        """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
         if isinstance(self._engine, CompiledEngine):
             return _Compiled(self, pacing, x, t, stop, length)
         return self._single(pacing).begin(x, t, stop, length)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
-from ..engines.pace import Pacing
+from ..engines.pacing import Pacing
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..results.evidence import has_estimate

@@ -16,7 +16,8 @@ import numpy as np
 from ..engines import array
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
-from ..engines.paces import step_all
+from ..engines.paced import step_all
+from ..engines.stepping import State, begin
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
@@ -34,7 +35,7 @@ ARRAY_BATCH = 65_536
 """Trajectories that the array engine takes at once: bounded memory."""
 
 KEPT_BEFORE = ("x", "energy", "entropy")
-KEPT_AFTER = tuple(name for name in array.State._fields if name not in ("low", "k", "before"))
+KEPT_AFTER = tuple(name for name in State._fields if name not in ("low", "k", "before"))
 """Fields of the states of a batch that its record is made from."""
 
 
@@ -189,7 +190,7 @@ def first_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndar
 
 @program
 def begin_all(form, parameters, axes, method, x):
-    return jax.vmap(lambda p, x: array.begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
+    return jax.vmap(lambda p, x: begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
 
 
 @program

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines import array
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.rules import RULES
+from ..engines.stepping import State
 from ..results.status import Stats, Status
 from .adaptive import Adaptive
 
@@ -16,7 +16,7 @@ SHORTER = (2.0, 8.0, 64.0, 1024.0, 16384.0)
 """Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
 
 
-def stats_of(state: array.State) -> Stats:
+def stats_of(state: State) -> Stats:
     """What an engine has counted."""
     followed = int(state.step) > 0
     return Stats(

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines import array, implicit
+from ..engines import implicit
+from ..engines.stages import explicit, newton_steps, noise_of, scale_of, solve_stages
+from ..engines.stepping import finish
 from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import DrivenSystem, System, driven
@@ -86,11 +88,11 @@ def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...]
     """A step that JAX differentiates, from what :func:`first_carry` says; NaN where it could not be solved."""
     x, low, k, before = carry
     if method.explicit:
-        solved = array.explicit(system, method, x, low, h, k)
+        solved = explicit(system, method, x, low, h, k)
         new = jnp.where(solved.converged, solved.k, jnp.nan)
     else:
         new = _stages(system, method, x, low, h, method.predict(k, before))
-    after, after_low, *_ = array.finish(system, method, x, low, h, new, system.energy.value(x))
+    after, after_low, *_ = finish(system, method, x, low, h, new, system.energy.value(x))
     return after, after_low, new, k
 
 
@@ -112,12 +114,12 @@ def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Arra
 
     def solve(dynamic, guess):
         system, method, x, low, h = eqx.combine(dynamic, static)
-        solved = array.solve_stages(
+        solved = solve_stages(
             lambda k: slopes(dynamic, k),
             guess,
-            lambda k: array.scale_of(x, h, k),
-            array.newton_steps(system, method, x, low, h),
-            lambda: array.noise_of(system, x),
+            lambda k: scale_of(x, h, k),
+            newton_steps(system, method, x, low, h),
+            lambda: noise_of(system, x),
         )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 

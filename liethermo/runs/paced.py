@@ -10,8 +10,8 @@ import numpy as np
 from ..engines.codes import Code
 from ..engines.compiled.form import Form, numbers_of
 from ..engines.compiled.paced import LanePaces, paced_stepper_of
-from ..engines.pace import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
-from ..engines.paces import Guide, Paces, VmapPaces
+from ..engines.paced import Guide, Paces, VmapPaces
+from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
 from ..integrators import OneStepMethod
 from ..tracing.interpret import at_points
 from .batches import ARRAY_BATCH, KEPT_AFTER, KEPT_BEFORE, LANES, Lanes, Tally, by_threads

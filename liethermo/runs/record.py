@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..engines import array
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.compiled.form import Form
+from ..engines.stepping import relaxing
 from ..integrators import OneStepMethod
 from ..results.audit import Rounding
 from ..results.ensemble import Ensemble
@@ -85,7 +85,7 @@ class Record:
             self.path[chosen, np.searchsorted(self.times, t)] = states
 
     def put(self, chosen: Part, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
-        """The outcome of some trajectories of equal steps: fields of :class:`liethermo.engines.array.State`."""
+        """The outcome of some trajectories of equal steps: fields of :class:`liethermo.engines.stepping.State`."""
         steps = after["step"].astype(np.int64)
         status = np.where((after["status"] == 0) & (steps < self.total), Code.INTERRUPTED, after["status"])
         self.finish(chosen, before, after, status, self.course.reached(steps))
@@ -108,7 +108,7 @@ class Record:
         rows["entropy_scale"][chosen] = np.maximum(np.abs(before["entropy"]), np.abs(after["entropy"]))
         rows["residual"][chosen] = after["residual"]
         rows["end_time"][chosen] = end_time
-        start, end = (np.asarray(array.relaxing(self.member, f["energy"], f["entropy"])) for f in (before, after))
+        start, end = (np.asarray(relaxing(self.member, f["energy"], f["entropy"])) for f in (before, after))
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
         rows["relaxation_time"][chosen] = (end * (end_time - self.course.start) - after["integral"]) / change
         self.status[chosen], self.steps[chosen] = status, after["step"]

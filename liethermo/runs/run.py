@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..engines import array
 from ..engines.choice import Chosen
 from ..engines.codes import Code
+from ..engines.stepping import values
 from ..integrators import OneStepMethod, Reference
 from ..results.dense import Dense
 from ..results.solution import Solution
@@ -187,7 +187,7 @@ class Run:
             self.status = Status(Code.COMPLETED, f"reached t = {now:g}", len(x) - 1, now)
 
     def _energies(self, x: np.ndarray) -> np.ndarray:
-        return np.stack(at_points(array.values, self.system, x), axis=1)
+        return np.stack(at_points(values, self.system, x), axis=1)
 
     # -- the result ---------------------------------------------------------------------------------------------------
 

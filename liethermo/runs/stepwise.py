@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from ..engines.array import State
 from ..engines.choice import Chosen
 from ..engines.codes import Code
-from ..engines.pace import CAUGHT
-from ..engines.paces import Guide
+from ..engines.paced import Guide
+from ..engines.pacing import CAUGHT
+from ..engines.stepping import State
 from ..errors import InputError
 from .adaptive import UNDERFLOW, Adaptive, pacing_of
 from .events import Event, located

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..engines.choice import Chosen
-from ..engines.pace import GROWTH
+from ..engines.pacing import GROWTH
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven

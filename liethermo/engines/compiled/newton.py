@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from .. import array
-from ..array import Iteration
 from ..rules import Rules
+from ..stages import Iteration, noise_of, scale_of
 from .loop import NUMBERS, SOLVED, Layout, Piece
 from .machine_code import NUMBER, WHOLE, MachineCode, Writer
 
@@ -58,7 +57,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
         return k - step, k, found, jnp.ones(()), jnp.max(jnp.abs(step))
 
     def worse(x, h, k, damped, found, sought, factor, length):
-        scale = array.scale_of(x, h, k, rules)
+        scale = scale_of(x, h, k, rules)
         halve = (damped > 0.0) & (factor > 0.5**rules.halvings) & (length > rules.plateau * scale)
         return jnp.where(halve & ~(found < sought), 1.0, 0.0)
 
@@ -67,7 +66,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
 
     def judge(x, h, k, old, update, best, stalled, rate, made, used, factor, found, missed, noise, regular):
         s = Iteration(old, update, best, stalled, rate, made).after(k, rules)
-        scale = array.scale_of(x, h, k, rules)
+        scale = scale_of(x, h, k, rules)
         defined = jnp.isfinite(found + scale) & (regular > 0.0)
         plain, used = s.settled(scale, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
         converged = defined & (plain | s.settled(scale, rules, missed, noise))
@@ -82,7 +81,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
         )
 
     def sound(p, x):
-        return array.noise_of(both(p)[0], x)
+        return noise_of(both(p)[0], x)
 
     def settle(missed, noise, goes_on):
         settled = missed <= rules.plateau * noise

@@ -6,10 +6,9 @@ import numpy as np
 
 from ...integrators import OneStepMethod
 from ...systems import System
-from .. import pace
-from ..array import State
-from ..pace import Pace, Pacing
+from ..pacing import Pace, Pacing, begun, fitted, judged, shape_seen
 from ..rules import RULES, Rules
+from ..stepping import State
 from .form import Form, numbers_of
 from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper, stepper_for
 
@@ -49,17 +48,17 @@ class PacedStepper(Stepper):
             return *found.state, *found[1:]
 
         def begin(p, x, t, stop, length):
-            return split(pace.begun(*both(p), way.build(p[skip:]), x, t, stop, length))
+            return split(begun(*both(p), way.build(p[skip:]), x, t, stop, length))
 
         def prepare(p, k, before, *fields):
-            return *programs["prepare"].function(p, k, before), *pace.fitted(way.build(p[skip:]), joined(fields))
+            return *programs["prepare"].function(p, k, before), *fitted(way.build(p[skip:]), joined(fields))
 
         def conclude(p, reached, *rest):
             given = rest[: -len(OWN)]
             h, state = given[0], State(*given[-len(FIELDS) :])
             before = Pace(state, *rest[-len(OWN) :])
             new = State(*programs["conclude"].function(p, *given))
-            return split(pace.judged(*both(p), way.build(p[skip:]), before, h, reached, new))
+            return split(judged(*both(p), way.build(p[skip:]), before, h, reached, new))
 
         fields, solved = " ".join(NAMES), programs["conclude"].arguments.removeprefix("p ")
         return {
@@ -89,14 +88,14 @@ def paced_stepper_of(
     varies = np.append(varies, np.zeros(len(whole) - len(varies), dtype=bool))
 
     def make() -> PacedStepper:
-        seen = pace.shape_seen(form.build(parameters), method, pacing)
+        seen = shape_seen(form.build(parameters), method, pacing)
         return PacedStepper(form, own, way, whole, method, seen, lanes, varies, rules)
 
     return remembered_stepper(key_of((form, own, way), whole, varies, lanes, rules), make), whole
 
 
 class LanePaces:
-    """Trajectories in lanes, each with a pace of its own: what :class:`..paces.Paces` asks for.
+    """Trajectories in lanes, each with a pace of its own: what :class:`..paced.Paces` asks for.
 
     Parameters
     ----------
@@ -108,7 +107,7 @@ class LanePaces:
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
     t, stop, length : float
-        See :func:`..pace.begun`.
+        See :func:`..pacing.begun`.
     """
 
     def __init__(self, stepper: PacedStepper, plain: Stepper, first, parameters, x: np.ndarray, t, stop, length):

@@ -21,9 +21,10 @@ from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.remembered import Latest, remembered
 from ...tracing.scalarize import scalarize
-from .. import array
-from ..array import Iteration, Solved, State, portion_of
+from ..array import portion_of
 from ..rules import RULES, Rules
+from ..stages import Iteration, Solved, explicit, scale_of
+from ..stepping import State, conclude, first_state
 from .form import Form, numbers_of
 from .loop import Layout, Piece, step_loop
 from .machine_code import MachineCode
@@ -119,7 +120,7 @@ class Stepper:
             return form.build(p[:size]), own.build(p[size:])
 
         def begin(p, x):
-            return array.first_state(*both(p), x)
+            return first_state(*both(p), x)
 
         def prepare(p, k, before):
             zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
@@ -133,18 +134,18 @@ class Stepper:
         def iterate(p, dW, x, low, h, *iteration):
             system, method = driven(p, dW)
             if method.explicit:
-                solved = array.explicit(system, method, x, low, h, iteration[0], rules)
+                solved = explicit(system, method, x, low, h, iteration[0], rules)
                 _, _, best, stalled, rate, made = iteration
                 s = Iteration(solved.k, solved.residual, best, stalled, rate, made + 1.0)
                 return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
             s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
-            converged, going = s.stands(array.scale_of(x, h, s.k, rules), rules)
+            converged, going = s.stands(scale_of(x, h, s.k, rules), rules)
             return *s, jnp.where(converged, 1.0, 0.0), jnp.where(going, 1.0, 0.0)
 
-        def conclude(p, h, guess, update, converged, defined, made, newtons, noise, *state):
+        def concluded(p, h, guess, update, converged, defined, made, newtons, noise, *state):
             defined = jnp.isfinite(update) & (defined > 0.0)
             solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
-            return array.conclude(*both(p), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
+            return conclude(*both(p), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
 
         self._both, self._driven, self._explicit, self._increments = both, driven, method.explicit, method.increments
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
@@ -157,7 +158,7 @@ class Stepper:
             "begin": Spec(begin, "p x", FIELDS),
             "prepare": Spec(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
             "iterate": Spec(iterate, f"p dW x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
-            "conclude": Spec(conclude, f"p {solved} {' '.join(FIELDS)}", FIELDS),
+            "conclude": Spec(concluded, f"p {solved} {' '.join(FIELDS)}", FIELDS),
         }
         self._pieces = {name: self._piece(*spec) for name, spec in self._programs(programs).items()}
         own_size = int(varies.sum())
@@ -218,7 +219,7 @@ class Stepper:
         return self._shapes.get(name, ())
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Blocks of trajectories with the given fields of :class:`.array.State`, trajectories first."""
+        """Blocks of trajectories with the given fields of :class:`.stepping.State`, trajectories first."""
         if len(fields["x"]) == self.lanes == 1 and not self._varies.any():  # nothing to rearrange
             whole = np.zeros((1, self._layout.height))
             for name, values in fields.items():

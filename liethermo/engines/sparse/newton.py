@@ -20,9 +20,10 @@ from ...functions.rounding import with_rounding
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.programs import program
-from .. import array
 from ..codes import Code
 from ..rules import RULES
+from ..stages import Iteration, Solved, better_start, fixed_point
+from ..stepping import State, begin, conclude, equations
 from .linear import Compression, Inverse
 
 PATIENT = replace(RULES, newton=80, halvings=12, stale=0.1, large=sys.maxsize)
@@ -54,13 +55,13 @@ class SparseEngine:
         self._inverse: Inverse | None = None
         self._h = np.nan
 
-    def begin(self, x) -> array.State:
-        return array.begin(self.system, self.method, x)
+    def begin(self, x) -> State:
+        return begin(self.system, self.method, x)
 
     def advance(self, state, h, saves, every, noise=None):
         """Keeps no more than it reaches."""
         del noise  # steps with noise are not for this engine
-        kept: list[array.State] = []
+        kept: list[State] = []
         for _ in range(int(saves)):
             for _ in range(int(every)):
                 state = self.step(state, h)
@@ -73,7 +74,7 @@ class SparseEngine:
         energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
 
-    def step(self, state: array.State, h, noise=None) -> array.State:
+    def step(self, state: State, h, noise=None) -> State:
         """One step; where it fails the state is left as it was, with a status."""
         del noise
         h = jnp.asarray(h, dtype=jnp.float64)
@@ -84,9 +85,9 @@ class SparseEngine:
 
     # -- Newton's method ------------------------------------------------------------------------------------------
 
-    def _newton(self, state: array.State, h, before: int) -> array.Solved:
+    def _newton(self, state: State, h, before: int) -> Solved:
         k, misfit, scale = _better_start(self.system, self.method, state, h)
-        s, renew = array.Iteration.begin(k), float(h) != self._h
+        s, renew = Iteration.begin(k), float(h) != self._h
         noise = jnp.zeros(())
         while not self._settled(s, scale, misfit, noise) and int(s.made) < PATIENT.newton:
             if renew or self._inverse is None:
@@ -105,7 +106,7 @@ class SparseEngine:
             if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale, PATIENT)):
                 noise = _noise(self.system, state.x)
         defined = bool(jnp.isfinite(misfit).all())
-        return array.Solved(
+        return Solved(
             k=s.k,
             converged=jnp.asarray(self._settled(s, scale, misfit, noise) and defined),
             defined=jnp.asarray(defined),
@@ -116,10 +117,10 @@ class SparseEngine:
         )
 
     @staticmethod
-    def _settled(s: array.Iteration, scale, misfit, noise) -> bool:
+    def _settled(s: Iteration, scale, misfit, noise) -> bool:
         return bool(s.settled(scale, PATIENT, jnp.max(jnp.abs(misfit)), noise))
 
-    def _improved(self, state, h, s: array.Iteration, misfit, scale, inverse: Inverse, attempts: int):
+    def _improved(self, state, h, s: Iteration, misfit, scale, inverse: Inverse, attempts: int):
         """After a Newton step, halved until the equations are solved better than before; None if that fails.
 
         At the rounding plateau they are not, and a whole step is taken.
@@ -159,21 +160,21 @@ class SparseEngine:
 
 
 @program
-def _fixed_point(system: System, method: OneStepMethod, state: array.State, h) -> array.Solved:
-    return array.fixed_point(*array.equations(system, method, state, h, PATIENT), rules=PATIENT)
+def _fixed_point(system: System, method: OneStepMethod, state: State, h) -> Solved:
+    return fixed_point(*equations(system, method, state, h, PATIENT), rules=PATIENT)
 
 
 @program
-def _conclude(system: System, method: OneStepMethod, state: array.State, h, solved: array.Solved) -> array.State:
-    return array.conclude(system, method, state, h, solved, PATIENT)
+def _conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
+    return conclude(system, method, state, h, solved, PATIENT)
 
 
-def _equations(system: System, method: OneStepMethod, state: array.State, h):
+def _equations(system: System, method: OneStepMethod, state: State, h):
     """The misfit ``w (slopes(k) - k)``, a guess of k, and the size that the plateau is measured against.
 
     With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
     """
-    slopes, guess, scale = array.equations(system, method, state, h, PATIENT)
+    slopes, guess, scale = equations(system, method, state, h, PATIENT)
 
     def misfit(k):
         middle = state.x + (state.low + 0.5 * method.increment(h, k))
@@ -183,7 +184,7 @@ def _equations(system: System, method: OneStepMethod, state: array.State, h):
 
 
 @program
-def _misfit(system: System, method: OneStepMethod, state: array.State, h, k) -> tuple[Any, Any]:
+def _misfit(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
     misfit, _, scale = _equations(system, method, state, h)
     return misfit(k), scale(k)
 
@@ -195,20 +196,20 @@ def _noise(system: System, x) -> Any:
 
 
 @program
-def _better_start(system: System, method: OneStepMethod, state: array.State, h):
+def _better_start(system: System, method: OneStepMethod, state: State, h):
     """The predicted slopes, or a step of nothing where that solves the equations better; with misfit and scale."""
     misfit, guess, scale = _equations(system, method, state, h)
-    k, found = array.better_start(misfit, guess)
+    k, found = better_start(misfit, guess)
     return k, found, scale(k)
 
 
 @program
-def _pushed(system: System, method: OneStepMethod, state: array.State, h, k, seed):
+def _pushed(system: System, method: OneStepMethod, state: State, h, k, seed):
     misfit = _equations(system, method, state, h)[0]
     return jax.jvp(misfit, (k,), (jnp.asarray(seed),))[1]
 
 
 @program
-def _pulled(system: System, method: OneStepMethod, state: array.State, h, k, seed):
+def _pulled(system: System, method: OneStepMethod, state: State, h, k, seed):
     misfit = _equations(system, method, state, h)[0]
     return jax.vjp(misfit, k)[1](jnp.asarray(seed))[0]

@@ -13,6 +13,8 @@ from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array
 from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
+from liethermo.engines.stages import solve_stages
+from liethermo.engines.stepping import begin
 
 COUNT = 5_000
 
@@ -84,7 +86,7 @@ def solved(slopes, guess, rules=RULES):
 
     n = guess.shape[1]
     measure = rules.size(n)
-    return array.solve_stages(slopes, guess, lambda k: 1.0 + measure(k), inverted, rules=rules)
+    return solve_stages(slopes, guess, lambda k: 1.0 + measure(k), inverted, rules=rules)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +117,7 @@ def test_the_work_does_not_depend_on_how_many_copies_there_are():
     for copies in (1, 8):
         system, x = ring(400 * copies, 3.0), np.append(np.tile(one, copies), 0.0)
         method = lt.MetriplecticGauss(1).on(system)
-        state = array.begin(system, method, x)
+        state = begin(system, method, x)
         after = array.ArrayEngine(system, method).step(state, 0.2)
         assert int(after.status) == 0
         counts.append((int(after.fixed_point), int(after.newton)))

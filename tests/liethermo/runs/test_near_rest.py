@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import array
+from liethermo.engines.stages import noise_of
 from liethermo.functions.rounding import with_rounding
 from liethermo.models.thermo_particles import thermo_particles_solution
 from tests.cases import slow
@@ -31,8 +31,8 @@ def test_the_size_at_which_a_function_is_rounded():
         value, size = with_rounding(function, np.array(x))
         assert value == function(x)
         assert 0.2 * expected <= size <= 5 * expected
-    assert 0.2 < array.noise_of(two(), np.zeros(2)) < 10.0
-    assert array.noise_of(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
+    assert 0.2 < noise_of(two(), np.zeros(2)) < 10.0
+    assert noise_of(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
 
 
 @pytest.mark.sampled(1)

@@ -10,7 +10,9 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.compiled import stepper as compiled
-from liethermo.engines.pace import after_bad, after_good
+from liethermo.engines.growth import growing
+from liethermo.engines.pacing import after_bad, after_good
+from liethermo.engines.stepping import error_of_step
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -72,7 +74,7 @@ def test_the_estimate_of_the_local_error(stages, h):
     ratios = []
     for x in lt.integrate(SYSTEM, START, (0.0, 20.0), 0.5, engine="array").x:
         new, right = (f.step(f.begin(x), h) for f in engines)
-        estimate = array.error_of_step(SYSTEM, method, x, np.zeros(3), h, new.k)
+        estimate = error_of_step(SYSTEM, method, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate / np.abs(new.x - right.x).max()))
     mean = np.exp(np.mean(np.log(ratios)))
     assert 0.5 < mean < 2.0, ratios
@@ -89,7 +91,7 @@ def test_the_estimate_scales_with_the_motion():
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
         new, right = (e.step(e.begin(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
-        estimate = array.error_of_step(free, method, x, np.zeros(3), h, new.k)
+        estimate = error_of_step(free, method, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios
 
@@ -231,7 +233,7 @@ def test_what_grows_in_a_larger_system():
     system = wells(6)
     x = np.concatenate([[0.0, 0.1, 0.0, 0.7, 0.0, 0.2], np.zeros(6)])
     matrix = np.asarray(jax.jacfwd(system.vector_field)(jnp.asarray(x)))
-    found = np.linalg.eigvals(np.asarray(array.growing(system, lt.MetriplecticMidpoint(), jnp.asarray(x))))
+    found = np.linalg.eigvals(np.asarray(growing(system, lt.MetriplecticMidpoint(), jnp.asarray(x))))
     assert np.sort(found.real) == pytest.approx(np.sort(np.linalg.eigvals(matrix).real), abs=1e-9)
 
 

@@ -19,10 +19,10 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-from . import array
-from .array import State
 from .codes import Code
+from .growth import FEW, growing, stretch
 from .rules import RULES, Rules
+from .stepping import State, first_state, take_step
 
 GROWTH = 3.0
 """Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""
@@ -101,12 +101,12 @@ class Pace(NamedTuple):
 
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
-    state, zero = array.first_state(system, method, x), jnp.zeros(())
+    state, zero = first_state(system, method, x), jnp.zeros(())
     speed, size = jnp.max(jnp.abs(state.k)), jnp.max(jnp.abs(x))
     moving = (speed > 0.0) & (size > 0.0)  # a hundredth of the time in which the state would change by its size
     found = jnp.where(moving, jnp.minimum(length, 0.01 * size / jnp.where(moving, speed, 1.0)), 1e-3 * length)
     wish = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
-    now = array.stretch(*method.judged(system, x)) if pacing.adaptive else jnp.zeros((1, 1))
+    now = stretch(*method.judged(system, x)) if pacing.adaptive else jnp.zeros((1, 1))
     pace = Pace(
         state=state,
         t=zero + t,
@@ -130,7 +130,7 @@ def shape_seen(system: System, method: OneStepMethod, pacing: Pacing) -> tuple[i
     if not pacing.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: array.stretch(*method.judged(system, x)), x).shape
+    return jax.eval_shape(lambda x: stretch(*method.judged(system, x)), x).shape
 
 
 def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
@@ -152,7 +152,7 @@ def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
 def attempted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, rules: Rules = RULES) -> Pace:
     """One attempt."""
     h, reached = fitted(pacing, pace)
-    return judged(system, method, pacing, pace, h, reached, array.take_step(system, method, pace.state, h, rules))
+    return judged(system, method, pacing, pace, h, reached, take_step(system, method, pace.state, h, rules))
 
 
 def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h, reached, new: State) -> Pace:
@@ -197,7 +197,7 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     )
     if not pacing.adaptive:
         return after
-    looked = held_back(method, after, array.stretch(*method.judged(system, new.x)))
+    looked = held_back(method, after, stretch(*method.judged(system, new.x)))
     after = jax.tree_util.tree_map(kept, looked, after)
     spent = (tried >= pacing.most) & (after.state.status == Code.COMPLETED)
     status = jnp.where(spent, Code.STEP_LIMIT, after.state.status).astype(old.status.dtype)
@@ -244,7 +244,7 @@ def reach(method: OneStepMethod) -> float:
 def held_back(method: OneStepMethod, pace: Pace, now) -> Pace:
     """No step longer than what grows near the state allows; a pause where that is not known.
 
-    ``now`` is how the motion stretches what lies near, as :func:`.array.stretch` finds it.
+    ``now`` is how the motion stretches what lies near, as :func:`.growth.stretch` finds it.
     """
     short = ~((reach(method) < size_of(now) * pace.wish) & jnp.isfinite(size_of(now)))
     same = norm(now - pace.seen) <= CHANGED * norm(pace.seen)
@@ -261,7 +261,7 @@ def held_back(method: OneStepMethod, pace: Pace, now) -> Pace:
 
 def size_of(stretch) -> jax.Array:
     """No eigenvalue of the linearised motion is larger: from its matrix, or about so from its powers."""
-    if stretch.shape[1] > array.FEW:
+    if stretch.shape[1] > FEW:
         return jnp.sqrt(jnp.max(jnp.sum(stretch * stretch, axis=1)))
     square = stretch @ stretch
     return jnp.sqrt(jnp.sqrt(norm(square @ square)))
@@ -280,7 +280,7 @@ def fastest(matrices: np.ndarray) -> np.ndarray:
 
 def rate_of(system: System, method: OneStepMethod, x) -> float:
     """How fast what grows near a state does, of a system whose stretch is no matrix."""
-    return float(fastest(np.asarray(array.growing(system, method, jnp.asarray(x)))))
+    return float(fastest(np.asarray(growing(system, method, jnp.asarray(x)))))
 
 
 # -- programs ---------------------------------------------------------------------------------------------------------

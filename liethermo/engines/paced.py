@@ -12,12 +12,26 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-from . import array, pace
-from .array import State
 from .codes import Code
 from .compiled.form import Form
-from .pace import ARRIVED, FINISHED, LOOKING, Pace, Pacing
+from .growth import FEW
+from .pacing import (
+    ARRIVED,
+    FINISHED,
+    LOOKING,
+    Pace,
+    Pacing,
+    begin,
+    begun,
+    fastest,
+    follow,
+    follow_by,
+    followed,
+    rate_of,
+    reach,
+)
 from .rules import RULES
+from .stepping import State, take_step
 
 
 class Paces(Protocol):
@@ -30,7 +44,7 @@ class Paces(Protocol):
         ...
 
     def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
-        """A field of :class:`.array.State` or of :class:`.pace.Pace` of some of them, trajectories first."""
+        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
         ...
 
     def write(self, name: str, chosen: np.ndarray, values) -> None: ...
@@ -78,7 +92,7 @@ class SinglePaces(_ArrayPaces):
 
     def begin(self, x, t: float, stop: float, length: float) -> SinglePaces:
         times = (jnp.asarray(float(time)) for time in (t, stop, length))
-        self.pace = pace.begin(self.system, self.method, self.pacing, jnp.asarray(x), *times)
+        self.pace = begin(self.system, self.method, self.pacing, jnp.asarray(x), *times)
         return self
 
     def continued(self, others: Paces) -> SinglePaces:
@@ -91,9 +105,9 @@ class SinglePaces(_ArrayPaces):
     def follow(self, most: int) -> None:
         if self._step is None:
             number = jnp.asarray(most)
-            self.pace = pace.follow(self.system, self.method, self.pacing, self.pace, number, RULES)
+            self.pace = follow(self.system, self.method, self.pacing, self.pace, number, RULES)
         else:
-            self.pace = pace.follow_by(self._step, self.system, self.method, self.pacing, self.pace, most)
+            self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, most)
 
     def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
         del chosen
@@ -125,13 +139,13 @@ class VmapPaces(_ArrayPaces):
 
 @program
 def _one(system, method, state, h):
-    return array.take_step(system, method, state, h)
+    return take_step(system, method, state, h)
 
 
 @program
 def _begin_all(form, parameters, axes, method, pacing, x, t, stop, length):
     def one(p, x):
-        return pace.begun(form.rebuild(p), method, pacing, x, t, stop, length)
+        return begun(form.rebuild(p), method, pacing, x, t, stop, length)
 
     return jax.vmap(one, in_axes=(axes, 0))(parameters, x)
 
@@ -139,7 +153,7 @@ def _begin_all(form, parameters, axes, method, pacing, x, t, stop, length):
 @program
 def _follow_all(form, parameters, axes, method, pacing, paces, most):
     def one(p, own):
-        return pace.followed(form.rebuild(p), method, pacing, own, most, RULES)
+        return followed(form.rebuild(p), method, pacing, own, most, RULES)
 
     return jax.vmap(one, in_axes=(axes, 0))(parameters, paces)
 
@@ -147,7 +161,7 @@ def _follow_all(form, parameters, axes, method, pacing, paces, most):
 @program
 def step_all(form, parameters, axes, method, state, h):
     def one(p, state, h):
-        return array.take_step(form.rebuild(p), method, state, h)
+        return take_step(form.rebuild(p), method, state, h)
 
     return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, h)
 
@@ -199,11 +213,11 @@ class Guide:
 
     def _look(self, chosen: np.ndarray) -> None:
         seen, paces = self.paces.read("seen", chosen), self.paces
-        if seen.shape[2] <= array.FEW:
-            rates = pace.fastest(seen)
+        if seen.shape[2] <= FEW:
+            rates = fastest(seen)
         else:
             x = paces.read("x", chosen)
-            rates = np.array([pace.rate_of(self.member(int(i)), self.method, x[j]) for j, i in enumerate(chosen)])
-        longest = np.divide(pace.reach(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
+            rates = np.array([rate_of(self.member(int(i)), self.method, x[j]) for j, i in enumerate(chosen)])
+        longest = np.divide(reach(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
         paces.write("growth", chosen, rates)
         paces.write("wish", chosen, np.minimum(paces.read("wish", chosen), longest))

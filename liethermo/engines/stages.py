@@ -1,0 +1,226 @@
+"""The equations of a step, ``k = slopes(k)``, and how they are solved.
+
+By fixed-point iteration from extrapolated slopes and, where that converges slowly or not at all, by simplified Newton
+with the exact Jacobian: its matrix, or of large systems products with it. Both stop at the *rounding plateau*, where
+the update no longer shrinks, rather than at a tolerance that could lie below it. All loops are ``lax.while_loop``:
+unrolling them would make the compiler duplicate work exponentially.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from manifolds.matrices.linear import inverse
+
+from ..functions.rounding import with_rounding
+from ..integrators import OneStepMethod
+from ..systems import System
+from .krylov import krylov
+from .rules import RULES, Rules
+
+
+class Solved(NamedTuple):
+    """Outcome of the stage equations.
+
+    ``converged``; whether the last evaluation was finite (``defined``); the last update; iterations of both kinds; and
+    ``noise``, the size at which the slopes are rounded, where the iteration did not settle without it, else 0.
+    """
+
+    k: jax.Array
+    converged: jax.Array
+    defined: jax.Array
+    residual: jax.Array
+    fixed_point: jax.Array
+    newton: jax.Array
+    noise: jax.Array
+
+
+class Iteration(NamedTuple):
+    """An iteration on the stage equations under way."""
+
+    k: jax.Array
+    update: jax.Array
+    best: jax.Array
+    stalled: jax.Array  # iterations in a row that did not shrink the update
+    rate: jax.Array
+    made: jax.Array  # iterations so far
+
+    @classmethod
+    def begin(cls, k) -> Iteration:
+        infinite, zero, none = jnp.asarray(jnp.inf), jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
+        return cls(k, infinite, infinite, none, zero, none)
+
+    def after(self, k, rules: Rules) -> Iteration:
+        update = rules.size(k.shape[-1])(k - self.k)
+        rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
+        if k.shape[-1] > rules.large:
+            rate = jnp.where(self.made > 1, jnp.sqrt(rate * self.rate), rate)
+        stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
+        return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
+
+    def settled(self, scale, rules: Rules, misfit=jnp.inf, noise=0.0) -> jax.Array:
+        """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
+
+        Small beside the scale of the slopes and the state; or the misfit is, beside the ``noise`` that slopes have.
+        """
+        small = (self.update <= rules.plateau * scale) | (misfit <= rules.plateau * noise)
+        return (self.update <= rules.floor * scale) | ((self.stalled >= 2) & small)
+
+    def stands(self, scale, rules: Rules, noise=0.0) -> tuple[jax.Array, jax.Array]:
+        """How a fixed-point iteration stands: whether it has converged, and whether to go on."""
+        slow = (self.made >= 3) & (self.rate > rules.slow) & (self.best > rules.plateau * jnp.maximum(scale, noise))
+        finite = jnp.isfinite(self.update)
+        hopeless = slow | ((self.made > 0) & ~finite)
+        settled = self.settled(scale, rules, self.update, noise)
+        return settled & finite, ~settled & ~hopeless & (self.made < rules.fixed_point)
+
+
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0, rules: Rules = RULES) -> Solved:
+    """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
+
+    def goes_on(s: Iteration):
+        return s.stands(scale(s.k), rules, noise)[1]
+
+    s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k), rules), Iteration.begin(guess))
+    converged = s.stands(scale(s.k), rules, noise)[0]
+    noise = jnp.zeros(()) + noise
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), noise)
+
+
+def noise_of(system: System, x, rules: Rules = RULES) -> jax.Array:
+    """The size at which the motion from a state is rounded, as a whole."""
+    return rules.size(x.size)(with_rounding(system.vector_field, x)[1])
+
+
+def solve_stages(
+    slopes: Callable,
+    guess: jax.Array,
+    scale: Callable,
+    inverted: Callable,
+    noise: Callable = lambda: jnp.zeros(()),
+    rules: Rules = RULES,
+) -> Solved:
+    """Solve ``k = slopes(k)`` from ``guess``.
+
+    ``scale(k)`` is the size that the plateau is measured against, ``inverted(k)`` a function from ``slopes - k`` to
+    what Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where
+    fixed-point iteration fails.
+    """
+    measure = rules.size(guess.shape[-1])
+    first = fixed_point(slopes, guess, scale, rules=rules)
+    done = first.converged
+    size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
+
+    def misfit(k):
+        return slopes(k) - k
+
+    def lost(s: Iteration, damped):
+        return (s.made >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
+
+    def unsolved(s: Iteration, found):
+        return ~done & ~s.settled(scale(s.k), rules, measure(found), size)
+
+    def improved(k, step, size, plateau, damped):
+        """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
+
+        def worse(carry):
+            factor, found = carry
+            halve = damped & (factor > 0.5**rules.halvings) & (factor * measure(step) > plateau)
+            return (factor > 1.0) | (~(jnp.linalg.norm(found) < size) & halve)
+
+        def halved(carry):
+            factor = 0.5 * carry[0]
+            return factor, misfit(k - factor * step)
+
+        factor, found = jax.lax.while_loop(worse, halved, (jnp.asarray(2.0), step))
+        return k - factor * step, found, factor == 1.0
+
+    def newton(carry):
+        s, found, damped = carry
+        again = lost(s, damped)
+        restart = Iteration.begin(start)._replace(made=s.made), start_misfit
+        s, found = jax.tree_util.tree_map(lambda a, b: jnp.where(again, a, b), restart, (s, found))
+        damped, step_from, before = damped | again, inverted(s.k), s.made
+
+        def reuse(carry):
+            inner, found, _ = carry
+            k, found, whole = improved(
+                inner.k, step_from(found), jnp.linalg.norm(found), rules.plateau * scale(inner.k), damped
+            )
+            inner = inner.after(k, rules)
+            return inner, found, jnp.where(whole, inner.made - before, rules.reuse)
+
+        def goes_on(carry):
+            inner, found, used = carry
+            fresh = (used == 0) | ((used < rules.reuse) & (inner.rate < rules.stale))
+            return fresh & unsolved(inner, found) & ~lost(inner, damped)
+
+        s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
+        return s, found, damped
+
+    def to_do(carry):
+        s, found, damped = carry
+        return unsolved(s, found) & ~(damped & lost(s, damped))
+
+    start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), lambda: better_start(misfit, guess))
+    second, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
+    k = jnp.where(done, first.k, second.k)
+    converged = ~unsolved(second, found) & jnp.isfinite(jnp.sum(k))
+    residual = jnp.where(done, first.residual, second.update)
+    size = jnp.where(second.settled(scale(second.k), rules), 0.0, size)
+    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made, size)
+
+
+def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The guess, or a step of nothing where that solves the equations better, and the misfit there.
+
+    Far out Newton may wander.
+    """
+    starts = jnp.stack([guess, jnp.zeros_like(guess)])
+    found = jax.lax.map(misfit, starts)
+    predicted = jnp.linalg.norm(found[0]) <= jnp.linalg.norm(found[1])
+    return jnp.where(predicted, starts[0], starts[1]), jnp.where(predicted, found[0], found[1])
+
+
+@jax.custom_batching.custom_vmap
+def _inverse(matrix):
+    """For Newton's method, which corrects what an inverse loses."""
+    return jnp.linalg.inv(matrix)
+
+
+@_inverse.def_vmap
+def _inverses(axis_size, batched, matrices):
+    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrices.linear.solve
+    return inverse(matrices), True
+
+
+def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules = RULES) -> Solved:
+    """The slopes of an explicit method, which there is nothing to solve for."""
+    k = method.slopes(system, x, low, h, k)
+    missed, none = method.missed(system, x, low, h, k), jnp.zeros((), dtype=jnp.int64)
+    missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(missed))  # it is the length of a vector
+    converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
+    return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
+
+
+def newton_steps(system: System, method: OneStepMethod, x, low, h, rules: Rules = RULES) -> Callable:
+    """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there."""
+
+    def linearised(k) -> Callable:
+        if k.shape[-1] > rules.large:
+            product = jax.linearize(lambda d: method.change(system, x, low, h, k, d), jnp.zeros_like(k))[1]
+            return lambda found: krylov(product, found, rules)
+        inverse = _inverse(method.jacobian(system, x, low, h, k))
+        return lambda found: (inverse @ found.ravel()).reshape(k.shape)
+
+    return linearised
+
+
+def scale_of(x, h, k, rules: Rules = RULES):
+    """What updates of slopes are measured against."""
+    measure = rules.size(x.size)
+    return measure(x) / h + measure(k) + rules.vanished
