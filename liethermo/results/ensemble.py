@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import Audit, AuditRow, Tolerances, accuracy_row
 from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, as_parts, described, from_parts, places, write
+from .files import ENSEMBLE_FORMAT, Saved, as_parts, described, from_parts, places
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -26,7 +24,6 @@ from .status import Laws, Stats, Status
 if TYPE_CHECKING:
     import xarray
 
-STATUSES = TEXTS
 
 SENTENCES = {
     Code.COMPLETED: "reached t = {t:.15g} in {n} steps",
@@ -46,7 +43,7 @@ SENTENCES = {
 
 
 @dataclass(frozen=True)
-class Ensemble:
+class Ensemble(Saved):
     """What :func:`ensemble` returns; trajectories come first in every array, and B is their number.
 
     ``e[i]`` is one trajectory as a :class:`Solution`, and a loop over an ensemble is one over these.
@@ -61,7 +58,7 @@ class Ensemble:
     energy, entropy : ndarray, shape (B,) or (B, times), as x has
         Final ones for ``"summary"``. ``entropy`` is None for a system without one.
     status : ndarray of int8, shape (B,)
-        Places in ``STATUSES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
+        Places in ``TEXTS``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
         adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started, with its
         parameters or from its state.
     steps : ndarray of int64, shape (B,)
@@ -261,15 +258,15 @@ class Ensemble:
     # -- all of them ----------------------------------------------------------------------------------------------
 
     def __str__(self) -> str:
-        counts = [f"{(self.status == code).sum()} {name}" for code, name in enumerate(STATUSES) if code in self.status]
+        counts = [f"{(self.status == code).sum()} {name}" for code, name in enumerate(TEXTS) if code in self.status]
         lines = [f"{len(self)} trajectories to t = {self.t[-1]:g}: {', '.join(counts)}"]
         failed = np.flatnonzero(~self.ok)
-        lines += [f"  {STATUSES[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
+        lines += [f"  {TEXTS[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
         lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        counts = [(STATUSES[code], str(int((self.status == code).sum()))) for code in np.unique(self.status)]
+        counts = [(TEXTS[code], str(int((self.status == code).sum()))) for code in np.unique(self.status)]
         drift = f"largest relative energy drift {np.max(self.energy_drift, initial=0.0):.1e}"
         return html_grid((f"{len(self)} trajectories to t = {self.t[-1]:g}", ""), counts, drift)
 
@@ -335,7 +332,7 @@ class Ensemble:
         for name, dims in (("attitude", each), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), as_parts(value))
-        variables["status_text"] = ("trajectory", np.array([STATUSES[code] for code in self.status], dtype=object))
+        variables["status_text"] = ("trajectory", np.array([TEXTS[code] for code in self.status], dtype=object))
         failed = ~self.ok
         messages = [self.message(i) if failed[i] else "" for i in range(len(self))]
         variables["message"] = ("trajectory", np.array(messages, dtype=object))
@@ -351,24 +348,6 @@ class Ensemble:
         }
         coordinates = {"time": self.t, "trajectory": np.arange(len(self))}
         return described(variables, coordinates, attributes, self.laws, units)
-
-    def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
-        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all.
-
-        Parameters
-        ----------
-        path : path
-        units : dict of str, optional
-            Units by the name of a variable: see :meth:`to_xarray`.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        InputError
-            If there is no variable of a name in ``units``.
-        """
-        return write(self.to_xarray(units), path)
 
     @classmethod
     def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:

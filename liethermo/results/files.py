@@ -79,6 +79,31 @@ def described(
     return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
+class Saved:
+    """What can be kept in a file, from which :func:`liethermo.load` brings it back."""
+
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        raise NotImplementedError
+
+    def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
+        """Write a NetCDF file; which :func:`load` reads; it appears whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+        units : dict of str, optional
+            Units by the name of a variable: see :meth:`to_xarray`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written.
+        InputError
+            If there is no variable of a name in ``units``.
+        """
+        return write(self.to_xarray(units), path)
+
+
 def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     """Write a NetCDF file; it appears whole or not at all."""
     path = Path(path)

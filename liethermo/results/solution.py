@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,13 +20,13 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, as_parts, described, from_parts, places, write
+from .files import FORMAT, Saved, as_parts, described, from_parts, places
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(Saved):
     """A trajectory with its laws.
 
     Attributes
@@ -151,24 +149,6 @@ class Solution:
             "event_time": json.dumps(self.event_time),
         }
         return described(variables, coordinates, attributes, self.laws, units)
-
-    def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
-        """Write a NetCDF file; it appears whole or not at all.
-
-        Parameters
-        ----------
-        path : path
-        units : dict of str, optional
-            Units by the name of a variable: see :meth:`to_xarray`.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        InputError
-            If there is no variable of a name in ``units``.
-        """
-        return write(self.to_xarray(units), path)
 
     def __repr__(self) -> str:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"

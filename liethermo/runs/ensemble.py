@@ -11,7 +11,7 @@ import numpy as np
 from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
-from ..results.ensemble import STATUSES, Ensemble
+from ..results.ensemble import Ensemble
 from ..results.evidence import has_estimate
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.scalarize import UnsupportedPrimitive
@@ -28,7 +28,7 @@ from .record import Alone, FirstSteps, Record
 from .stepwise import stops_of
 from .timetable import Course
 
-__all__ = ["STATUSES", "THREADS", "Ensemble", "ensemble"]
+__all__ = ["THREADS", "Ensemble", "ensemble"]
 
 
 def ensemble(
