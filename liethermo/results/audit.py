@@ -110,7 +110,7 @@ class AuditRow:
         return Row(f"{label}{self.law}", self.value, self.tolerance, self.passed, self.note)
 
 
-ACCURACY, CONSISTENCY = "accuracy", "consistency"
+ACCURACY, CONSISTENCY, TAKEN = "accuracy", "consistency", "steps taken"
 """The rows that are not about laws."""
 
 LAW_FAILS = "A LAW FAILS"
@@ -157,8 +157,10 @@ class Audit:
     def verdict(self) -> str:
         """The whole in one line."""
         failing = {row.law for row in self.rows if row.passed is False}
-        if failing - {ACCURACY, CONSISTENCY}:
+        if failing - {ACCURACY, CONSISTENCY, TAKEN}:
             return LAW_FAILS
+        if TAKEN in failing:
+            return "THE RUN STOPPED before its end; the laws hold until there"
         if CONSISTENCY in failing:
             return "the laws hold, but THIS IS NOT THE MOTION of the system"
         if self.resolved is None:
@@ -257,9 +259,7 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
     status = solution.status  # a run stopped by its user is short, but breaks no law
     failed = not status.ok and status.code != Code.INTERRUPTED.text
     rows.append(
-        AuditRow(
-            "steps taken", float(stats.steps), None, False if failed else None, "" if status.ok else str(status.code)
-        )
+        AuditRow(TAKEN, float(stats.steps), None, False if failed else None, "" if status.ok else str(status.code))
     )
     return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows))
 

@@ -90,8 +90,13 @@ class SpinSystem(System):
         return self.poisson.joined((a + damped[0], b + damped[1], c + damped[2]), warmed)
 
     def state(self, x, batch: bool = False) -> jax.Array:
-        """A state in one row; also from spins of shape ``(*sites, 3)`` alone, with every bath at entropy zero."""
+        """A state in one row; also from the spins alone, with every bath at entropy zero.
+
+        The spins have the shape ``(*sites, 3)``; a single one may have the shape (3,).
+        """
         shape, given = (*self.lattice, 3), np.shape(x)
+        if shape == (1, 3) and not batch and given == (3,):
+            x, given = np.asarray(x)[None], shape
         if given != (self.dim,) and given[-len(shape) :] == shape and (batch or len(given) == len(shape)):
             flat = jnp.reshape(jnp.asarray(x, dtype=jnp.float64), (*given[: -len(shape)], -1))
             x = jnp.concatenate([flat, jnp.zeros((*flat.shape[:-1], self.dim - flat.shape[-1]))], axis=-1)

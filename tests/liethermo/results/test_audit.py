@@ -193,6 +193,15 @@ def test_a_method_that_follows_another_field():
     assert "NOT THE MOTION" in str(solution.audit()) or "A LAW FAILS" in str(solution.audit())
 
 
+def test_a_run_that_stopped_is_no_law_that_fails():
+    system = lt.models.rigid_body()
+    x0, explicit = [0.1, 1.0, 0.3], lt.MetriplecticRungeKutta(8)
+    solution = lt.integrate(system, x0, (0.0, 60.0), 15.0, explicit, on_failure="return")
+    assert not solution.status.ok
+    assert not solution.audit().passed
+    assert solution.audit().verdict == "THE RUN STOPPED before its end; the laws hold until there"
+
+
 class Late(lt.MetriplecticMidpoint):
     """Control: consistent, but of first order only."""
 

@@ -231,6 +231,12 @@ def test_a_single_spin_switches_when_the_closed_form_says(method):
         assert short == pytest.approx(switched, rel=1e-10)
 
 
+def test_one_spin_is_a_vector():
+    heated = lt.models.single_spin(baths=lt.HeatBaths(2.0))
+    for spin in ([0.6, 0.0, 0.8], [[0.6, 0.0, 0.8]], [0.6, 0.0, 0.8, 0.0]):
+        assert np.array_equal(heated.state(spin), [0.6, 0.0, 0.8, 0.0])
+
+
 def test_the_closed_form_solves_the_equations():
     start, t = np.array([0.6, 0.0, -0.8]), 1.7
     exact = functools.partial(single_spin_solution, start=start, field=1.3, rate=0.4)
