@@ -13,8 +13,10 @@ from tests.additions.group import AFFINE
 from tests.additions.integrator import Simpson
 from tests.additions.space import Ring
 from tests.additions.system import LotkaVolterra
+from tests.cases import slow
 
 PREY = LotkaVolterra([[0.0, -1.0, 0.5], [1.0, 0.0, -0.8], [-0.5, 0.8, 0.0]], [1.0, 1.2, 0.9])
+START = [1.5, 0.7, 1.0]
 
 
 def test_the_algebra():
@@ -25,37 +27,50 @@ def test_the_algebra():
 
 
 def test_the_group():
-    assert mf.testing.check_group(AFFINE).passed
     body = lt.LiePoissonSystem(AFFINE.algebra, lt.Quadratic([1.0, 2.0]), group=AFFINE)
     run = lt.integrate(body, [0.3, 0.8], (0.0, 2.0), 0.05, attitude=np.eye(2))
     assert run.audit().passed
     assert float(np.max(AFFINE.defect(run.attitude))) < 1e-13
 
 
-def test_the_space():
-    assert mf.testing.check_space(Ring()).passed
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), slow(lt.MetriplecticRungeKutta(4))], ids=str)
+def test_the_space(method):
     system = lt.MetriplecticSystem(
         None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, lt.ProjectedMetric(normalized=True), space=Ring()
     )
-    run = lt.integrate(system, system.space.random(0), (0.0, 2.0), 0.1, lt.MetriplecticRungeKutta(4))
+    run = lt.integrate(system, system.space.random(0), (0.0, 2.0), 0.1, method)
     assert run.audit().passed
     assert system.space.belongs(run.x).all()
 
 
-@pytest.mark.slow
 def test_the_dissipation():
-    assert lt.testing.check_dissipation(Steep(0.2), mf.so(3)).passed
+    system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lt.Quadratic(np.ones(3)), Steep(0.2))
+    assert lt.integrate(system, [0.5, 0.2, 1.0], (0.0, 5.0), 0.05).audit().passed
+
+
+def test_the_integrator():
+    run = lt.integrate(lt.models.rigid_body(), [0.5, 0.2, 1.0], (0.0, 5.0), 0.05, Simpson())
+    assert run.audit().passed
 
 
 @pytest.mark.slow
-def test_the_integrator():
-    assert lt.testing.check_method(Simpson()).passed
+@pytest.mark.parametrize(
+    "suite",
+    [
+        lambda: mf.testing.check_group(AFFINE),
+        lambda: mf.testing.check_space(Ring()),
+        lambda: lt.testing.check_dissipation(Steep(0.2), mf.so(3)),
+        lambda: lt.testing.check_method(Simpson()),
+        lambda: lt.testing.check_system(PREY, START),
+    ],
+    ids=["group", "space", "dissipation", "integrator", "system"],
+)
+def test_each_in_the_suite_of_its_kind(suite):
+    assert suite().passed
 
 
 def test_the_system():
-    x0 = [1.5, 0.7, 1.0]
-    assert lt.testing.check_system(PREY, x0).passed
-    run = lt.integrate(PREY, x0, (0.0, 20.0), 0.1, lt.MetriplecticRungeKutta(6))
+    run = lt.integrate(PREY, START, (0.0, 20.0), 0.1, lt.MetriplecticRungeKutta(6))
     assert run.audit().passed
     with pytest.raises(lt.InputError, match="no members"):
         lt.integrate(PREY, [1.0, -1.0, 1.0], (0.0, 1.0), 0.1)

@@ -17,13 +17,21 @@ TRIED = {
 }
 
 
-@pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods(special=True)])
-@pytest.mark.sampled(2)
+QUICK = "MetriplecticRungeKutta(order=4)"
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(m, id=str(m), marks=[pytest.mark.slow] if str(m) != QUICK else [])
+        for m in lt.registered_methods(special=True)
+    ],
+)
 def test_methods(method):
     assert testing.check_method(method).passed
 
 
-@pytest.mark.parametrize("name", ["projected", *map(slow, ("killing", "sum", "coulomb"))])
+@pytest.mark.parametrize("name", ["killing", *map(slow, ("projected", "sum", "coulomb"))])
 def test_dissipations(name):
     assert testing.check_dissipation(TRIED[name]).passed
 
