@@ -173,3 +173,30 @@ def test_orders(method):
         assert run.audit().passed
         errors.append(np.abs(run.x[-1] - exact).max())
     assert np.abs(np.log2(np.array(errors[:-1]) / errors[1:]) - 4.0).max() < 0.35
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=str)
+def test_activated_friction_may_end_in_finite_time(method):
+    """Where the entropy grows steeper along the motion, exp(|grad S| / scale) runs away: to rates of 1e7 and beyond.
+
+    The one that comes through is SciPy's to the tolerance; the other ends for SciPy at the same time.
+    """
+    g = mf.so(3)
+    p, x0s = random_systems.parameters(g, 1000, 3), random_systems.states(g, 1000, 3)
+    through, ending = (({name: value[i] for name, value in p.items()}, x0s[i]) for i in (365, 240))
+
+    def system(q):
+        S = random_systems.entropy(random_systems.casimirs(g), q)
+        dissipation = lt.DissipationPotential(lt.ActivatedFriction(q["rate"], 2.0))
+        return lt.LiePoissonSystem(g, random_systems.energy(q), S, dissipation, validate=False)
+
+    run = lt.integrate(system(through[0]), through[1], (0.0, 1.0), lt.Adaptive(1e-6), method)
+    exact = lt.integrate(system(through[0]), through[1], (0.0, 1.0), 0.01, lt.Reference(rtol=1e-10))
+    assert run.audit().passed
+    assert np.abs(run.x[-1] - exact.x[-1]).max() < 1e-5
+    run = lt.integrate(system(ending[0]), ending[1], (0.0, 1.0), lt.Adaptive(1e-6), method, on_failure="return")
+    exact = lt.integrate(system(ending[0]), ending[1], (0.0, 1.0), 0.01, lt.Reference(rtol=1e-10), on_failure="return")
+    assert run.status.code == "step_underflow"
+    assert exact.status.code == "reference_failed"
+    assert exact.t[-1] < run.t[-1] < exact.t[-1] + 0.01
