@@ -32,14 +32,20 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Of the cases of a test marked ``sampled(n)``, n spread over all of them run by default; the rest are slow."""
+    """Of the cases of a test marked ``sampled`` some run by default; the rest are slow.
+
+    ``sampled(n)``: n spread over all of them; ``sampled("a", "b")``: those of these ids.
+    """
     cases = defaultdict(list)
     for item in items:
         mark = item.get_closest_marker("sampled")
         if mark and not item.get_closest_marker("slow"):
-            cases[item.parent.nodeid, item.originalname, mark.args[0]].append(item)
+            cases[item.parent.nodeid, item.originalname, mark.args].append(item)
     for (*_, wanted), crossed in cases.items():
-        kept = {(2 * i + 1) * len(crossed) // (2 * wanted) for i in range(wanted)}
+        if isinstance(wanted[0], str):
+            kept = {i for i, item in enumerate(crossed) if item.callspec.id in wanted}
+        else:
+            kept = {(2 * i + 1) * len(crossed) // (2 * wanted[0]) for i in range(wanted[0])}
         for i, item in enumerate(crossed):
             if i not in kept:
                 item.add_marker("slow")

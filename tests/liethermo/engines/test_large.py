@@ -15,6 +15,7 @@ from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
 from liethermo.engines.stages import solve_stages
 from liethermo.engines.stepping import begin
+from tests.cases import slow
 
 COUNT = 5_000
 
@@ -90,7 +91,7 @@ def solved(slopes, guess, rules=RULES):
 
 
 @pytest.mark.parametrize(
-    "rate", [pytest.param(0.1, marks=pytest.mark.slow), pytest.param(10.0, marks=pytest.mark.slow), 1000.0]
+    "rate", [pytest.param(0.1, marks=pytest.mark.slow), pytest.param(10.0, marks=pytest.mark.slow), slow(1000.0)]
 )
 def test_stiff_equations_are_solved_to_rounding_without_their_matrix(rate):
     slopes, guess = stiff(1_500, rate)

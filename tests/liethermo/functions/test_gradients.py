@@ -34,7 +34,7 @@ def test_identity_at_every_distance(gradient, distance, seed):
     assert abs(found - (after - before)) <= allowed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("gonzalez")
 @each_gradient
 @given(seed=seeds)
 def test_tends_to_the_gradient(gradient, seed):

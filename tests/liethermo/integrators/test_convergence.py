@@ -281,7 +281,7 @@ def cases():
             yield case if quick and not method.functions else slow(case)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "method"), list(cases()))
 def test_convergence(name, method):
     problem, system = PROBLEMS[name], SYSTEMS[name]()

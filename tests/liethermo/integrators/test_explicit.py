@@ -34,7 +34,7 @@ def assert_laws(many):
     assert (many.least_entropy_increment >= -4 * EPS * np.maximum(many.entropy_scale, many.entropy_sensitivity)).all()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @each_method
 def test_laws_of_random_systems(method):
     assert_laws(random_run(mf.so(3), 24, 500, method))
@@ -112,7 +112,7 @@ def kepler():
     )
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @each_method
 @pytest.mark.parametrize("excess", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
 def test_dependent_gradients(method, excess):
@@ -182,7 +182,7 @@ def test_adaptive_steps_events_and_output_between(method):
     assert event.x[-1][1] == pytest.approx(0.5, abs=1e-12)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @each_method
 def test_engines_take_the_same_steps(method):
     quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4  # noqa: E731
@@ -197,7 +197,7 @@ def test_engines_take_the_same_steps(method):
     assert np.abs(many - alone).max() <= 1e-15 * np.abs(many).max()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @each_method
 def test_derivatives(method):
     """Against differences of fourth order, by the state and by a parameter."""

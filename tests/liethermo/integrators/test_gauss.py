@@ -8,7 +8,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators.tableaus import gauss
-from tests.cases import EPS, TRANSCENDENTAL
+from tests.cases import EPS, TRANSCENDENTAL, slow
 from tests.liethermo import random_systems
 from tests.liethermo.integrators.test_orders import nonlinear_systems
 
@@ -49,7 +49,7 @@ SO3, SE3_BODY = (case.values[0] for case in nonlinear_systems())
             system,
             stages,
             id=f"{system.algebra.name}, order {2 * stages}",
-            marks=() if (system.dim, stages) in [(3, 2), (6, 3)] else pytest.mark.slow,
+            marks=() if (system.dim, stages) in [(3, 2)] else pytest.mark.slow,
         )
         for system in (SO3, SE3_BODY)
         for stages in STEPS
@@ -89,8 +89,9 @@ def assert_laws(many):
     assert (many.least_entropy_increment >= -ENTROPY * np.maximum(many.entropy_scale, 1.0)).all()
 
 
-def test_laws():
-    assert_laws(random_run(mf.so(3), 12, 1000, engine="array"))
+@pytest.mark.parametrize("engine", ["compiled", slow("array")])
+def test_laws(engine):
+    assert_laws(random_run(mf.so(3), 12, 1000, engine=engine))
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ def final(system, x0, method, steps, T=2.0):
     return lt.integrate(system, x0, (0.0, T), T / steps, method, engine="array", save_every=steps)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("spin-midpoint-exp")
 @pytest.mark.parametrize(("name", "method"), RUNS)
 def test_orders_and_laws(build, name, method):
     """Order 2s against SciPy; then the laws at each of many steps, and points of the space at the end of them."""

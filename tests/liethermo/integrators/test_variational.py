@@ -62,7 +62,7 @@ def _printed(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
     return np.array(x), np.array(S)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("scheme 1-compiled")
 @pytest.mark.parametrize(
     ("name", "engine"),
     [
@@ -165,7 +165,7 @@ def _momenta(discrete, x):
 # -- the paper's tests ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("scheme 1-2")
 @pytest.mark.parametrize("case", CASES)
 @each_scheme
 def test_the_table_of_energies(case, name):

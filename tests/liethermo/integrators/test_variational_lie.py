@@ -98,6 +98,7 @@ def test_observed_order(make, x0):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_without_friction_the_casimirs_and_the_energy_stay():
     """Free rigid body: |mu|^2 to rounding, the energy within a bound that does not grow; in both engines."""
     free = lt.EulerPoincareClosedSystem(

@@ -171,6 +171,7 @@ def closed_form_39(q, p, S, h, gamma):
     return q1, p1, S1 + ((16 * S * gamma + 16 * p**2) * h + 16 * S) / D**2
 
 
+@pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_39(engine):

@@ -74,7 +74,7 @@ def both_sides(L, x):
     return [*zeros, *more_zeros, heat - made, action - value], related, heat - value
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("quadratic")
 @each_lagrangian
 def test_herglotz_equations_and_the_legendre_transform(L):
     """(12) and (10); Gamma_L and E_H are FL-related with H = E_L o FL^-1 [SML §3.1], and so are xi_L and X_H."""

@@ -86,7 +86,7 @@ def _run_and_judge(system, x0):
 
 def test_the_ledger_in_the_audit():
     system = small()
-    solution = lt.integrate(system, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05, engine="array")
+    solution = lt.integrate(system, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
     work, heat = solution.casimirs["work received"], solution.casimirs["heat received"]
     assert min(abs(work[-1]), abs(heat[-1])) > 0.01
     gained = np.asarray(system.own_energy(solution.x)) - work - heat
@@ -99,7 +99,7 @@ def test_the_ledger_in_the_audit():
 
 
 def test_a_ledger_is_written_and_read(tmp_path):
-    solution = lt.integrate(small(), [0.4, 0.5, 0.2], (0.0, 2.0), 0.05, engine="array")
+    solution = lt.integrate(small(), [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
     again = lt.load(solution.save(tmp_path / "run.nc"))
     assert str(again.audit()) == str(solution.audit())
 

@@ -114,9 +114,8 @@ def test_forces_are_functions_on_the_sites():
     )
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(lt.MetriplecticGauss(1), marks=pytest.mark.slow), lt.MetriplecticRungeKutta(4)], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)], ids=str)
 def test_laws_hold_on_many_sites(method):
     g = mf.so(3) ** 60
     x = np.random.default_rng(2).standard_normal(g.shape)

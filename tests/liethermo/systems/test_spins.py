@@ -273,6 +273,7 @@ def damped(count, h, t, method, **given):
     return solution
 
 
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @pytest.mark.parametrize("method", BOTH, ids=str)
 def test_ten_thousand_damped_spins_with_a_bath(method):
     damped(10_000, 0.1, 2.0, method)

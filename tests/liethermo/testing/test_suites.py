@@ -31,7 +31,8 @@ def test_methods(method):
     assert testing.check_method(method).passed
 
 
-@pytest.mark.parametrize("name", ["killing", *map(slow, ("projected", "sum", "coulomb"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TRIED))
 def test_dissipations(name):
     assert testing.check_dissipation(TRIED[name]).passed
 

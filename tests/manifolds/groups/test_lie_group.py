@@ -305,7 +305,7 @@ def test_log_up_to_the_half_turn(G):
             G.log([matrix] * BATCH)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("group1-3")
 @pytest.mark.parametrize(
     ("group", "count"), [(mf.SO(2), 1), (mf.SO(3), 3), (mf.SO(4), 6), (mf.SE(2), 1), (mf.SE(3), 3)]
 )

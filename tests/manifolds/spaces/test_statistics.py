@@ -30,7 +30,7 @@ def twin(space):
     return (Hypersphere if isinstance(space, mf.Sphere) else Hyperboloid)(dim=2)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("S^2")
 @pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
 def test_the_mean_is_that_of_geomstats(space):
     """To the accuracy of its descent; and by its logarithms ours is stationary to rounding."""
@@ -43,6 +43,8 @@ def test_the_mean_is_that_of_geomstats(space):
     assert np.abs(other.metric.log(points, mean).mean(axis=0)).max() < 1e-13
 
 
+@pytest.mark.slow
+@pytest.mark.sampled("H^2")
 @pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
 def test_no_point_nearby_is_better(space):
     rng, points = np.random.default_rng(0), cloud(space, 2)

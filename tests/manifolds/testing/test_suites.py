@@ -14,19 +14,19 @@ def named(objects):
     return [pytest.param(thing, id=thing.name) for thing in objects]
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("g", named(mf.registered()))
 def test_algebras(g):
     assert testing.check_algebra(g, degree=2).passed
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled("SO(3)")
 @pytest.mark.parametrize("G", named(mf.registered_groups()))
 def test_groups(G):
     assert testing.check_group(G).passed
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled("S^2")
 @pytest.mark.parametrize("M", named(mf.registered_spaces()))
 def test_spaces(M):
     assert testing.check_space(M).passed
