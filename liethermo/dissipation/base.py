@@ -117,6 +117,10 @@ class Dissipation(eqx.Module):
         del dH, turned
         return None
 
+    def change(self, system: Geometry, x, dH, dS, dL, gradient) -> jax.Array:
+        """``gradient . force``: the rate at which a function with this gradient changes by the dissipation."""
+        return gradient @ self.force(system, x, dH, dS, dL)
+
     def __add__(self, other: Dissipation) -> Dissipation:
         return Several((*self.terms, *other.terms))
 

@@ -52,6 +52,9 @@ class InnerProductDissipation(Dissipation):
         g = system.algebra
         return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
+    def change(self, system, x, dH, dS, dL, gradient):
+        return _change(self, system, dH, dS, gradient)
+
     def factor(self, system, x, dH, dL):
         return _factor(system, dH, self.K)
 
@@ -113,9 +116,18 @@ class KillingDissipation(Dissipation):
         g = system.algebra
         return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
 
+    def change(self, system, x, dH, dS, dL, gradient):
+        return _change(self, system, dH, dS, gradient)
+
     def factor(self, system, x, dH, dL):
         factor = _factor(system, dH, self.form)
         return None if factor is None else factor.scaled(self.rate)
+
+
+def _change(dissipation: Dissipation, system, dH, dS, gradient) -> jax.Array:
+    """``gradient . ad*_dH F = F . [dH, gradient]``: of the entropy, with the bracket that F is made of and no other."""
+    action = system.algebra.action(dH)
+    return action.bracket(gradient) @ dissipation.momentum(dH, action.bracket(dS))
 
 
 def _factor(system, dH, form) -> Factor | None:

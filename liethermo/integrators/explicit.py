@@ -188,13 +188,17 @@ class ExplicitMethod(OneStepMethod):
         dL = tuple(L.gradient(x) for L in system.preserved)
         if system.dissipation is None:
             return system.field(x, dH, dS, dL), jnp.zeros(len(laws))
-        names, force = tuple(system.preserved_by_name()), jnp.zeros_like(x)
-        gradients = dict(zip(names, dL, strict=True))
-        for part, own in portions(system.dissipation, names):
-            force = force + part.force(system, x, dH, dS, tuple(gradients[name] for name in own))
-        # apart from the motion, along which H and S do not change: near rest that is rounding noise
-        rates = [law.sign * jnp.maximum(law.sign * jnp.dot(law.function.gradient(x), force), 0.0) for law in laws]
-        return system.field(x, dH, dS, dL), jnp.stack(rates)
+        parts = list(portions(system.dissipation, dL))
+
+        def rate(law: Law) -> jax.Array:
+            """Without the motion, along which H and S do not change: near rest that is rounding noise."""
+            if law.sign == 0.0:
+                return jnp.zeros(())
+            gradient = law.function.gradient(x)
+            found = sum(part.change(system, x, dH, dS, own, gradient) for part, own in parts)
+            return law.sign * jnp.maximum(law.sign * found, 0.0)
+
+        return system.field(x, dH, dS, dL), jnp.stack([rate(law) for law in laws])
 
     def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
         """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
