@@ -217,8 +217,11 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     gradients, between = change.gradients[: len(k)], change.gradients[len(k) :]
     smooth, spread = jnp.zeros(()), jnp.zeros(())
     if path.finer is not None and path.further is not None:
-        rates = jnp.sum(between * path.further[1], axis=1)
-        smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, jnp.sum(gradients * k, axis=1)))
+        # Both rules are exact for a gradient that does not vary: less one of the gradients the two sums vanish with the
+        # step, where rounding of the weights alone would be divided by it in a derivative.
+        rates = jnp.sum((between - gradients[0]) * path.further[1], axis=1)
+        own = jnp.sum((gradients - gradients[0]) * k, axis=1)
+        smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, own))
         spread = jnp.max(jnp.linalg.norm(between - b @ gradients, axis=1))
     weights = along(gradients) if callable(along) else along
     return corrected(change, gradients, k, Direction.of(k, b, weights, path.symmetries), h, b, smooth, spread)
