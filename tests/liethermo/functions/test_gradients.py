@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.functions.gradients import GRADIENTS
+from liethermo.functions.energy import as_energy
+from liethermo.functions.gradients import GRADIENTS, stage_gradients
+from liethermo.integrators.tableaus import finer, gauss
 from tests.cases import EPS, energy_of
 
 NAMES = list(GRADIENTS)
@@ -177,3 +179,19 @@ def test_unknown_names_and_bad_nodes_are_refused():
         lt.MetriplecticMidpoint(gradient="gonzales")
     with pytest.raises(lt.InputError, match="positive integer"):
         lt.MeanValue(nodes=0)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-45, 1e-30, 1e-17])
+@pytest.mark.parametrize("stages", [1, 2])
+def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):
+    """Compiled too, where products and sums are fused: by k they are ``h A (x) Hess``, whatever is left of k."""
+    A, b, _ = gauss(stages)
+    x, h, energy = jnp.array([1.0, 2.0]), 0.1, as_energy(lambda u: jnp.log(u[0]) + 2.0 * jnp.log(u[1]), "S")
+
+    @jax.jit
+    @jax.jacfwd
+    def found(k):
+        return stage_gradients(energy, x, jnp.zeros(2), h, k, A, b, finer(stages))
+
+    expected = np.einsum("ij,ab->iajb", h * A, np.diag([-1.0, -0.5]))
+    np.testing.assert_allclose(found(jnp.full((stages, 2), length)), expected, atol=1e-15)
