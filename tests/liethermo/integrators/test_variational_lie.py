@@ -98,7 +98,6 @@ def test_observed_order(make, x0):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_without_friction_the_casimirs_and_the_energy_stay():
     """Free rigid body: |mu|^2 to rounding, the energy within a bound that does not grow; in both engines."""
     free = lt.EulerPoincareClosedSystem(
@@ -115,6 +114,7 @@ def test_without_friction_the_casimirs_and_the_energy_stay():
     assert np.abs(runs[0].x[:200] - runs[1].x[:200]).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_a_control_that_does_not_keep_the_spatial_momentum():
     """The same system by a metriplectic scheme, which knows no group: its |mu| drifts."""
     solution = lt.integrate(body(), X0, (0.0, 20.0), 0.1, lt.Reference(rtol=1e-5))

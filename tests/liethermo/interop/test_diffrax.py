@@ -36,7 +36,6 @@ def test_a_run_by_diffrax_is_ours(method):
     assert np.ptp(energies) < 1e-15
 
 
-@pytest.mark.slow
 def test_adaptive_steps_and_diffrax_own_solvers_agree():
     controller = diffrax.PIDController(rtol=1e-8, atol=1e-10)
     ours = solve(body(), lt.diffrax.Solver(lt.MetriplecticRungeKutta(6)), stepsize_controller=controller)
@@ -46,6 +45,7 @@ def test_adaptive_steps_and_diffrax_own_solvers_agree():
     assert int(ours.stats["num_accepted_steps"]) > 3
 
 
+@pytest.mark.slow
 def test_reverse_mode_through_diffrax_is_the_derivative_of_the_flow():
     def end(rate):
         run = diffrax.diffeqsolve(

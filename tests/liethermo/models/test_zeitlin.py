@@ -140,7 +140,8 @@ def test_the_equations_are_the_documented_ones(decay):
         assert float(made.entropy_production(x)) == pytest.approx(rate * np.linalg.norm(motion) ** 2, rel=1e-12)
 
 
-@pytest.mark.parametrize("decay", ["enstrophy", pytest.param("energy", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("decay", ["enstrophy", "energy"])
 def test_what_is_to_stay_stays_to_rounding_and_what_is_to_fall_falls(decay):
     q = QuantisedSphere(12)
     x = q.random(2, (2, 5), 4.0)

@@ -171,7 +171,6 @@ def closed_form_39(q, p, S, h, gamma):
     return q1, p1, S1 + ((16 * S * gamma + 16 * p**2) * h + 16 * S) / D**2
 
 
-@pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_39(engine):
@@ -189,6 +188,7 @@ def test_39(engine):
     assert solution.entropy[-1] == pytest.approx(50.0 / GAMMA, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_observed_order():
     system, x0 = lt.EvolutionSystem(bumpy_energy(3, True), 5, validate=False), 0.5 * random_state(3)
     exact = lt.integrate(system, x0, (0.0, 2.0), 2.0, lt.Reference(rtol=1e-13)).x[-1]

@@ -43,7 +43,6 @@ def test_the_mean_is_that_of_geomstats(space):
     assert np.abs(other.metric.log(points, mean).mean(axis=0)).max() < 1e-13
 
 
-@pytest.mark.slow
 @pytest.mark.sampled("H^2")
 @pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
 def test_no_point_nearby_is_better(space):
@@ -57,6 +56,7 @@ def test_no_point_nearby_is_better(space):
         assert mf.dispersion(space, points, weights, other) > least + 1e-4
 
 
+@pytest.mark.slow
 def test_closed_forms():
     """Rotations about one axis by angles, and points of R^2."""
     angles = np.array([0.1, 0.4, 1.0])

@@ -129,7 +129,6 @@ def against_the_definition(M, x, alpha):
     return of_points | {name: getattr(M, name)(x, alpha) - getattr(D, name)(x, alpha) for name in sharps}
 
 
-@pytest.mark.slow
 @pytest.mark.sampled(1)
 @each_split
 @given(seed=seeds)
@@ -139,6 +138,7 @@ def test_closed_forms_follow_from_the_form(M, seed):
     assert_zero(against_the_definition(M, x, alpha))
 
 
+@pytest.mark.slow
 def test_the_volume_is_that_of_the_form():
     """n = 1: ``eta ^ d eta = eta_1 omega_23 + eta_2 omega_31 + eta_3 omega_12``; zero for a closed form."""
     M, x = general(3), np.array([0.4, -0.7, 1.1])
