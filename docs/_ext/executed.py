@@ -13,6 +13,7 @@ import contextlib
 import io
 import json
 import re
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,11 +106,13 @@ def _execute(app: Sphinx, docname: str, source: list[str]) -> None:
             )
 
     up = "../" * docname.count("/")
+    place = tempfile.TemporaryDirectory()  # of the files that the blocks of this page write and read again
     for block in BLOCK.finditer(text):
         words(text[end : block.start()])
         end = block.end()
         try:
-            output = run(block["code"], namespace, f"{docname}.md", text.count("\n", 0, block.start("code")))
+            with contextlib.chdir(place.name):
+                output = run(block["code"], namespace, f"{docname}.md", text.count("\n", 0, block.start("code")))
         except Exception as error:
             logger.warning("a block fails: %s: %s", type(error).__name__, error, location=docname)
             output = Output()
@@ -128,6 +131,7 @@ def _execute(app: Sphinx, docname: str, source: list[str]) -> None:
             file = folder / f"{stem}-{len(cells)}-{i}.png"
             file.write_bytes(png)
             page.append(f"\n![{block['alt']}]({up}generated/executed/{file.name})\n")
+    place.cleanup()
     words(text[end:])
     if docname.startswith(app.config.notebook_folders):
         notebook = folder / f"{stem.partition('-')[2]}.ipynb"
