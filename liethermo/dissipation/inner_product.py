@@ -17,7 +17,20 @@ from .checks import checked_rate, needed_algebra, over_sites, semidefinite
 from .factor import Factor, root_of
 
 
-class InnerProductDissipation(Dissipation):
+class OfBracket(Dissipation):
+    """``ad*_dH F`` with F linear in ``[dH, dS]``: its ``momentum``."""
+
+    def force(self, system, x, dH, dS, dL):
+        g = system.algebra
+        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
+
+    def change(self, system, x, dH, dS, dL, gradient):
+        """``F . [dH, gradient]``: of the entropy, with the bracket that F is made of and no other."""
+        action = system.algebra.action(dH)
+        return action.bracket(gradient) @ self.momentum(dH, action.bracket(dS))
+
+
+class InnerProductDissipation(OfBracket):
     """Dissipation by an inner product on the Lie algebra: ``K(alpha, beta) = 𝒦([dH, alpha], [dH, beta])``.
 
     It is the forced Euler-Poincaré equation ``mu' = ad*_xi (mu + F)`` with ``<F, eta> = 𝒦(eta, [xi, grad S])``
@@ -48,18 +61,11 @@ class InnerProductDissipation(Dissipation):
     def momentum(self, dH, turned):
         return self.K @ turned
 
-    def force(self, system, x, dH, dS, dL):
-        g = system.algebra
-        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
-
-    def change(self, system, x, dH, dS, dL, gradient):
-        return _change(self, system, dH, dS, gradient)
-
     def factor(self, system, x, dH, dL):
         return _factor(system, dH, self.K)
 
 
-class KillingDissipation(Dissipation):
+class KillingDissipation(OfBracket):
     """Dissipation by the Killing form kappa, made positive: :class:`InnerProductDissipation` with the algebra's own 𝒦.
 
     ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
@@ -112,22 +118,9 @@ class KillingDissipation(Dissipation):
     def momentum(self, dH, turned):
         return self.rate * (self.form @ turned)
 
-    def force(self, system, x, dH, dS, dL):
-        g = system.algebra
-        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
-
-    def change(self, system, x, dH, dS, dL, gradient):
-        return _change(self, system, dH, dS, gradient)
-
     def factor(self, system, x, dH, dL):
         factor = _factor(system, dH, self.form)
         return None if factor is None else factor.scaled(self.rate)
-
-
-def _change(dissipation: Dissipation, system, dH, dS, gradient) -> jax.Array:
-    """``gradient . ad*_dH F = F . [dH, gradient]``: of the entropy, with the bracket that F is made of and no other."""
-    action = system.algebra.action(dH)
-    return action.bracket(gradient) @ dissipation.momentum(dH, action.bracket(dS))
 
 
 def _factor(system, dH, form) -> Factor | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,14 +80,15 @@ def described(
     return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
-class Saved:
+class Saved(ABC):
     """What can be kept in a file, from which :func:`liethermo.load` brings it back."""
 
+    @abstractmethod
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        raise NotImplementedError
+        """The whole as a dataset, its variables with these units."""
 
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
-        """Write a NetCDF file; which :func:`load` reads; it appears whole or not at all.
+        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all.
 
         Parameters
         ----------

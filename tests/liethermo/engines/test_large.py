@@ -15,7 +15,6 @@ from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
 from liethermo.engines.stages import solve_stages
 from liethermo.engines.stepping import begin
-from tests.cases import slow
 
 COUNT = 5_000
 
@@ -90,9 +89,8 @@ def solved(slopes, guess, rules=RULES):
     return solve_stages(slopes, guess, lambda k: 1.0 + measure(k), inverted, rules=rules)
 
 
-@pytest.mark.parametrize(
-    "rate", [pytest.param(0.1, marks=pytest.mark.slow), pytest.param(10.0, marks=pytest.mark.slow), slow(1000.0)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [0.1, 10.0, 1000.0])
 def test_stiff_equations_are_solved_to_rounding_without_their_matrix(rate):
     slopes, guess = stiff(1_500, rate)
     found = solved(slopes, guess)

@@ -49,7 +49,7 @@ SO3, SE3_BODY = (case.values[0] for case in nonlinear_systems())
             system,
             stages,
             id=f"{system.algebra.name}, order {2 * stages}",
-            marks=() if (system.dim, stages) in [(3, 2)] else pytest.mark.slow,
+            marks=() if (system.dim, stages) == (3, 2) else pytest.mark.slow,
         )
         for system in (SO3, SE3_BODY)
         for stages in STEPS

@@ -17,16 +17,8 @@ TRIED = {
 }
 
 
-QUICK = "MetriplecticRungeKutta(order=4)"
-
-
-@pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(m, id=str(m), marks=[pytest.mark.slow] if str(m) != QUICK else [])
-        for m in lt.registered_methods(special=True)
-    ],
-)
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
+@pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods(special=True)])
 def test_methods(method):
     assert testing.check_method(method).passed
 
