@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..functions.gradients import EPS
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
@@ -24,17 +25,25 @@ from .growth import FEW, growing, stretch
 from .rules import RULES, Rules
 from .stepping import State, first_state, take_step
 
-GROWTH = 3.0
-"""Largest factor from one step to the next: more, and the prediction of the stages is worth nothing."""
+GROWTH, EXPLICIT_GROWTH = 3.0, 10.0
+"""Largest factor from one step to the next: more, and the prediction of the stages of an implicit one is worth
+nothing."""
 
 SHRINKAGE = 0.2
 UNSOLVED = 0.25
 """Smallest factor after a step of too large an error, and the factor after one that could not be solved."""
 
-SAFETY = 0.8
+AIM = 0.4
+"""The share of the allowed error that the next step aims at."""
+
+CUT = 0.99
+"""The share of the wanted size below which a step has been cut short."""
 
 DEADBAND = (0.9, 1.3)
 """Factors for which the step is kept: changes that small are not worth a worse prediction, and would chatter."""
+
+ROUNDED = 4.0 * EPS
+"""The least error that is allowed in a step, relative to the size of the state."""
 
 GROWTH_ERROR = 2e-3
 """Largest relative error of the rate at which a small deviation grows: what falls from an unstable rest does so in its
@@ -77,6 +86,10 @@ class Pacing(eqx.Module):
     falling: bool = eqx.field(static=True)
     adaptive: bool = eqx.field(static=True)
 
+    def allowed(self, size) -> jax.Array:
+        """The error that a state of a size may have."""
+        return self.atol + self.rtol * size
+
     def watch(self, system: System, x) -> jax.Array:
         return jnp.zeros(()) if self.watched is None else self.watched(system, x)
 
@@ -91,10 +104,12 @@ class Pace(NamedTuple):
     since: jax.Array  # and the steps taken until then
     wish: jax.Array  # size of the next step, unless it has to end somewhere
     taken: jax.Array  # size of the last one tried
+    fair: jax.Array  # the size with which the last one that counts would have had the allowed error; 0 before
     tried: jax.Array
     rejected: jax.Array
     cause: jax.Array  # status of the last one tried
     value: jax.Array  # of what is watched
+    speed: jax.Array  # the largest at which the state has changed, relative to its size
     growth: jax.Array  # rate of what grows fastest, when it was looked at last,
     seen: jax.Array  # and how the motion stretched what lay near
 
@@ -102,9 +117,12 @@ class Pace(NamedTuple):
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
     state, zero = first_state(system, method, x), jnp.zeros(())
-    speed, size = jnp.max(jnp.abs(state.k)), jnp.max(jnp.abs(x))
-    moving = (speed > 0.0) & (size > 0.0)  # a hundredth of the time in which the state would change by its size
-    found = jnp.where(moving, jnp.minimum(length, 0.01 * size / jnp.where(moving, speed, 1.0)), 1e-3 * length)
+    size, length = jnp.max(jnp.abs(x)), zero + length
+    speed = jnp.max(jnp.abs(system.vector_field(x))) / jnp.where(size > 0.0, size, 1.0)
+    share = jnp.minimum(pacing.allowed(size) / jnp.where(size > 0.0, size, 1.0), 1.0)
+    # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
+    found = 0.5 * share ** (1.0 / method.order) / jnp.where(speed > 0.0, speed, 1.0)
+    found = jnp.where((speed > 0.0) & (size > 0.0), jnp.minimum(length, found), 1e-3 * length)
     wish = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
     now = stretch(*method.judged(system, x)) if pacing.adaptive else jnp.zeros((1, 1))
     pace = Pace(
@@ -115,10 +133,12 @@ def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
         since=zero,
         wish=wish,
         taken=zero,
+        fair=zero,
         tried=zero,
         rejected=zero,
         cause=zero,
         value=pacing.watch(system, x),
+        speed=speed,
         growth=zero,
         seen=jnp.full_like(now, jnp.nan),
     )
@@ -159,14 +179,21 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     """The pace after an attempt: the step from it to the state ``new`` counts, or another is to be tried."""
     old, solved, cause = pace.state, new.status == Code.COMPLETED, 1.0 * new.status
     good, wish, code = solved, pace.wish, new.status
+    speed, fair = pace.speed, pace.fair
     if pacing.adaptive:
         size = jnp.maximum(jnp.max(jnp.abs(old.x)), jnp.max(jnp.abs(new.x)))
-        allowed = jnp.maximum(pacing.atol + pacing.rtol * size, RULES.vanished)
+        gone = jnp.max(jnp.abs(new.x - old.x)) / jnp.where(size > 0.0, size, 1.0)
+        speed = jnp.maximum(speed, jnp.where(solved, gone / h, 0.0))
+        part = h * speed  # of the time in which the state, at its fastest, changes by its size
+        allowed = jnp.maximum(pacing.allowed(size) * jnp.minimum(part, 1.0), ROUNDED * size + RULES.vanished)
         error = method.error(system, old.x, old.low, h, new.k) / allowed
         error = jnp.where(solved, error, jnp.inf)
         good = error <= 1.0
-        power = 1.0 / (method.order + 1)
-        wish = jnp.where(good, after_good(error, h, wish, power, pacing.largest), after_bad(error, h, power))
+        power = 1.0 / (method.order + jnp.where(part < 1.0, 0.0, 1.0))
+        fair = h * jnp.maximum(error, 1e-12) ** -power
+        longer = after_good(fair, pace.fair, h, wish, power, pacing.largest, method.explicit)
+        fair = jnp.where(h < CUT * wish, pace.fair, fair)
+        wish = jnp.where(good, longer, after_bad(error, h, power))
         code = jnp.where(good | (wish >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
     value = pacing.watch(system, new.x)
     crosses = (pace.value > 0.0) & (value <= 0.0)
@@ -188,10 +215,12 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         since=pace.since,
         wish=jnp.where(caught, pace.wish, wish),
         taken=h,
+        fair=kept(fair, pace.fair),
         tried=tried,
         rejected=pace.rejected + jnp.where(good, 0.0, 1.0),
         cause=cause,
         value=kept(value, pace.value),
+        speed=kept(speed, pace.speed),
         growth=pace.growth,
         seen=pace.seen,
     )
@@ -207,22 +236,25 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
 # -- the size of the next step ----------------------------------------------------------------------------------------
 
 
-def after_good(error, h, wish, power: float, largest) -> jax.Array:
-    """The size of the next step, after one of size h whose error is this fraction of the allowed one, at most 1.
+def after_good(fair, before, h, wish, power, largest, explicit: bool) -> jax.Array:
+    """The size of the next step, after one of size h that would have had the allowed error with the size ``fair``.
 
-    Small changes are left out, so that it does not chatter. A step that is cut short to end somewhere says little about
-    the next.
+    Where the fair size shrinks, from ``before``, it is taken to go on as it does [Gustafsson; Hairer & Wanner 1996,
+    IV.8]. The size of an implicit method's steps is kept where the change would be small. A step that is cut short to
+    end somewhere says little about the next.
     """
-    factor = jnp.clip(SAFETY * jnp.maximum(error, 1e-12) ** -power, SHRINKAGE, GROWTH)
+    most = EXPLICIT_GROWTH if explicit else GROWTH
+    trend = jnp.where(fair < before, fair / jnp.where(before > 0.0, before, 1.0), 1.0)
+    factor = jnp.clip(AIM**power * fair / h * trend, SHRINKAGE, most)
     proposed = jnp.minimum(h * factor, largest)
-    same = (DEADBAND[0] < factor) & (factor < DEADBAND[1])
-    return jnp.where(h < 0.99 * wish, jnp.maximum(wish, proposed), jnp.where(same, wish, proposed))
+    same = (DEADBAND[0] < factor) & (factor < DEADBAND[1]) & (not explicit)
+    return jnp.where(h < CUT * wish, jnp.maximum(wish, proposed), jnp.where(same, wish, proposed))
 
 
-def after_bad(error, h, power: float) -> jax.Array:
+def after_bad(error, h, power) -> jax.Array:
     """The size of the next step after one with too large an error; infinity where its equations are not solved."""
     finite = jnp.isfinite(error)
-    factor = jnp.maximum(SHRINKAGE, SAFETY * jnp.where(finite, jnp.maximum(error, 1.0), 1.0) ** -power)
+    factor = jnp.maximum(SHRINKAGE, (AIM / jnp.where(finite, jnp.maximum(error, 1.0), 1.0)) ** power)
     return h * jnp.minimum(jnp.where(finite, factor, UNSOLVED), 0.9)
 
 

@@ -18,8 +18,8 @@ class ExplicitTableau(NamedTuple):
         ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
     q : int
     scale : float
-        The local error of a step of length l is ``scale |E| (|E| / l)^((p - q) / (q + 1))``, p the order: right for a
-        linear equation as h -> 0.
+        The local error of a step of length l is ``scale l (|E| / l)^(p / q)``, p the order: right for a linear equation
+        as h -> 0.
     """
 
     A: np.ndarray
@@ -61,7 +61,7 @@ def lobatto(order: int) -> ExplicitTableau:
     missed = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ tall[order])
     seen = abs(d @ tall[q])
     assert seen > 0.0
-    return ExplicitTableau(A, b, d, q, missed / seen ** ((order + 1) / (q + 1)))
+    return ExplicitTableau(A, b, d, q, missed / seen ** (order / q))
 
 
 def _estimate(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:

@@ -103,8 +103,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         del system, x, low
         t = self.tableau
         found, length = h * jnp.max(jnp.abs(k[ERROR])), h * jnp.max(jnp.abs(k[SLOPE]))
-        share = found / jnp.where(length > 0.0, length, 1.0)
-        return t.scale * found * share ** ((self.order - t.q) / (t.q + 1))
+        return t.scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.q)
 
 
 register(*map(MetriplecticRungeKutta, ORDERS))

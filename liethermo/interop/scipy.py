@@ -93,7 +93,7 @@ def solve_ivp(
         Their zeros are located. The attributes ``terminal`` (True, or the number of zeros after which to stop) and
         ``direction`` mean what they mean in SciPy.
     rtol, atol : float
-        Of the local error in a step, ``atol + rtol * max|y|``. SciPy's defaults.
+        SciPy's defaults. What they mean: :class:`.Adaptive`.
     first_step, max_step : float, optional
 
     Returns

@@ -19,11 +19,15 @@ UNDERFLOW = 1e-14
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Steps chosen by an estimate of the local error, relative to the size of the state.
+    """Steps chosen by an estimate of the local error, so that errors add up to what is asked for.
 
-    Each step's estimate is held below ``atol + rtol * max|x|``. Steps are short enough, too, for what grows near the
-    state to grow at its rate, to a few thousandths, however small it is yet: a body spinning about its middle axis
-    falls when it has to. The laws hold at every step, whatever its size.
+    In the time in which the state changes by its own size, going as fast as it ever has, the errors of the steps add up
+    to ``atol + rtol * max|x|`` at most: a step that takes a part of that time may have this part of the error, a longer
+    one all of it. So the error of a run is proportional to the tolerance, with every method.
+
+    Steps are short enough, too, for what grows near the state to grow at its rate, to a few thousandths, however small
+    it is yet: a body spinning about its middle axis falls when it has to. The laws hold at every step, whatever its
+    size.
 
     Parameters
     ----------

@@ -86,7 +86,8 @@ def _advice(engine: Chosen, state, h: float) -> str:
     for part in SHORTER:
         if int(engine.step(state, h / part).status) == Code.COMPLETED:
             stiff = (
-                "; if that is far below what the motion needs, it is stiff, and lt.MetriplecticGauss takes long steps"
+                "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
+                "takes long steps"
             )
             return f"Try a smaller step, for example {h / part:g}{stiff if engine.method.explicit else ''}"
     return (

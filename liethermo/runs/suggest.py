@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..engines.choice import Chosen
-from ..engines.pacing import GROWTH
+from ..engines.pacing import DEADBAND
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven
@@ -19,7 +19,7 @@ from .stepwise import run
 
 
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
-    """A step size for fixed steps whose local error is about ``rtol`` times the state, near x0.
+    """A step size for fixed steps as accurate as those of ``lt.Adaptive(rtol)``, near x0.
 
     The smallest of the first thirty that adaptive steps take, once they no longer grow as fast as they are let,
     rounded down to two digits.
@@ -155,8 +155,8 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
         state = engine.begin(x)
         run(engine, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
     if len(taken) < 2:
-        raise InputError(f"no step from this state has a local error of {rtol:g}: {len(taken)} steps were taken")
-    settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < 0.9 * GROWTH * a), len(taken) - 1)
+        raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(taken)} steps were taken")
+    settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < DEADBAND[1] * a), len(taken) - 1)
     h = min(taken[settled:])
     digits = 1 - math.floor(math.log10(h))
     work = used.evaluations * (iterations[-1] - iterations[settled]) / sum(taken[settled:])

@@ -68,7 +68,7 @@ class Model(Section):
 class AdaptiveStep(Section):
     """Steps that the error chooses."""
 
-    adaptive: FiniteFloat = Field(gt=0, description="the error of a step, relative to the state: `lt.Adaptive(rtol)`")
+    adaptive: FiniteFloat = Field(gt=0, description="the error wanted, relative to the state: `lt.Adaptive(rtol)`")
     atol: FiniteFloat = Field(0.0, ge=0, description="the error that is allowed besides")
     first: FiniteFloat | None = Field(None, gt=0, description="the first step to try")
     largest: FiniteFloat | None = Field(None, gt=0, description="no step is longer")
