@@ -18,7 +18,7 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
 from .compiled.paced import lane_pace
 from .compiled.stepper import CompiledEngine
-from .paced import Paces, SinglePaces
+from .paced import OnePace, SinglePaces
 from .pacing import Pacing
 from .sparse.newton import SparseEngine
 from .stepping import State
@@ -122,7 +122,7 @@ class Chosen:
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
 
-    def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> Paces:
+    def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> OnePace:
         """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
         if isinstance(self._engine, CompiledEngine):
             return _Compiled(self, pacing, x, t, stop, length)
@@ -183,7 +183,7 @@ class _Compiled:
     def __init__(self, chosen: Chosen, pacing: Pacing, x, t: float, stop: float, length: float):
         self._chosen, self._pacing, self._start = chosen, pacing, (x, t, stop, length)
         try:
-            self._paces: Paces = lane_pace(chosen.system, chosen.method, pacing, x, t, stop, length)
+            self._paces: OnePace = lane_pace(chosen.system, chosen.method, pacing, x, t, stop, length)
         except UnsupportedPrimitive as error:
             self._take_over(error)
 
@@ -192,13 +192,16 @@ class _Compiled:
         self._paces = self._chosen._single(self._pacing).begin(*self._start)
 
     def follow(self, most: int) -> None:
+        self.attempts(most)
+
+    def attempts(self, most: int) -> dict[str, np.ndarray]:
         try:
-            self._paces.follow(most)
+            return self._paces.attempts(most)
         except UnsupportedPrimitive as error:
             before = self._paces
             self._take_over(error)
             assert isinstance(self._paces, SinglePaces)
-            self._paces.continued(before).follow(most)
+            return self._paces.continued(before).attempts(most)
 
     def read(self, name: str, chosen: Any = slice(None)):
         return self._paces.read(name, chosen)

@@ -54,6 +54,15 @@ class Paces(Protocol):
         ...
 
 
+class OnePace(Paces, Protocol):
+    """One trajectory, whose attempts can be looked at."""
+
+    def attempts(self, most: int) -> dict[str, np.ndarray]:
+        """So many attempts, or fewer: after each its time, the size of its step, and of its state what is no vector, x
+        alone excepted; attempts come first."""
+        ...
+
+
 class _ArrayPaces:
     """What the array engine's have in common; fields are read and written with trajectories first."""
 
@@ -108,6 +117,10 @@ class SinglePaces(_ArrayPaces):
             self.pace = follow(self.system, self.method, self.pacing, self.pace, number, RULES)
         else:
             self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, most)
+
+    def attempts(self, most: int) -> dict[str, np.ndarray]:
+        self.follow(1)
+        return {name: self.read(name) for name in (*State._fields, "t", "taken")}
 
     def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
         del chosen

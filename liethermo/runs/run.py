@@ -118,6 +118,7 @@ class Run:
             event,
             keep,
             most_kept=MOST_KEPT / max(numbers, 1e-9),
+            whole=dense,
         )
         if last is not None:
             self._append(*last)

@@ -23,6 +23,9 @@ from .adaptive import UNDERFLOW, Adaptive, pacing_of
 from .events import Event, located
 from .timetable import Timetable
 
+TOGETHER = 64
+"""Attempts between looks at an adaptive run."""
+
 MOST_KEPT = 2**28
 """Numbers that an adaptive run keeps at most (2 GiB)."""
 
@@ -48,6 +51,7 @@ def run(
     event: Event | None,
     keep: Callable,
     most_kept: float = MOST_KEPT,
+    whole: bool = True,
 ) -> Outcome:
     """Step from the start of the span to its end, an event, a failure or Ctrl-C.
 
@@ -61,11 +65,13 @@ def run(
         Told of every step taken, between the times t and its end.
     most_kept : float
         Adaptive steps after which there is no room for more.
+    whole : bool
+        Whether keep has to be told of whole states: of those after adaptive steps it is not the stages otherwise.
     """
     outcome, stops = Outcome(state), stops[stops > span[0]]
     try:
         if isinstance(step, Adaptive):
-            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept)
+            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept, 1 if whole else TOGETHER)
         else:
             _fixed(engine, outcome, span, step, stops, event, keep)
     except KeyboardInterrupt:
@@ -73,8 +79,8 @@ def run(
     return outcome
 
 
-def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep, most_kept) -> None:
-    """By the paces that ensembles have too: attempt by attempt."""
+def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep, most_kept, together: int) -> None:
+    """By the paces that ensembles have too, so many attempts together."""
     length = span[1] - span[0]
     pacing = pacing_of(step, engine.method, length, event)
     paces = engine.paces(pacing, np.asarray(outcome.state.x), span[0], float(stops[0]), length)
@@ -93,12 +99,15 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
         if int(outcome.state.step) >= most_kept:
             outcome.limit = "memory"
             return
-        paces.follow(1)
+        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(outcome.state.step)))))
         outcome.rejected = int(told("rejected"))
-        if told("step") > int(outcome.state.step):
-            before, outcome.state = outcome.state, State(*(paces.read(name)[0] for name in State._fields))
-            outcome.state = outcome.state._replace(status=np.int64(0))
-            keep(t, told("t"), told("taken"), before, outcome.state)
+        last: Any = State(*(paces.read(name)[0] for name in State._fields))
+        last = last._replace(status=np.int64(0))
+        for i in np.flatnonzero(np.diff(rows["step"], prepend=int(outcome.state.step))):  # those that count
+            before, known = outcome.state, {name: rows[name][i] for name in State._fields if name in rows}
+            outcome.state = last if known["step"] == last.step else before._replace(**known)
+            keep(t, float(rows["t"][i]), float(rows["taken"][i]), before, outcome.state)
+            t = float(rows["t"][i])
     if code == Code.STEP_LIMIT:
         outcome.limit = "steps"
     elif code == Code.STEP_UNDERFLOW:

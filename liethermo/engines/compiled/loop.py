@@ -52,6 +52,7 @@ def step_loop(
     varies: np.ndarray,
     lanes: int,
     explicit: bool = False,
+    kept: Sequence[str] = ("x", "energy", "entropy"),
 ) -> MachineCode:
     """The functions ``advance`` and ``begin`` of :class:`_Steps` as machine code.
 
@@ -68,29 +69,31 @@ def step_loop(
         Which parameters lie in the block, under the name "p"; the others are the same for all.
     explicit : bool
         Of a method that has nothing to solve: what its one iteration does not do, Newton's method cannot.
+    kept : sequence of str
+        The arrays that are written down at each save.
     """
     module = ir.Module("steps")
     kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, NUMBERS, POINTER]
     function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
     function.args[0].add_attribute("noalias")
-    _Steps(function, pieces, layout, state, varies, lanes, explicit).write_loops()
+    _Steps(function, pieces, layout, state, varies, lanes, explicit, kept).write_loops()
     begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "begin")
-    _Steps(begin, pieces, layout, state, varies, lanes, explicit).write_begin()
+    _Steps(begin, pieces, layout, state, varies, lanes, explicit, kept).write_begin()
     return MachineCode(module)
 
 
 class _Steps(Writer):
     """Writes ``advance(p, blocks, done, count, saves, every, out, most, noise, newton)``.
 
-    Every block from its step ``done`` to step ``saves * every``, each so-manieth state kept in ``out``, with its energy
-    and entropy; the increments that drive the steps are read from ``noise``, block by block. No further than ``most``
-    steps, or to where a block needs Newton's method and ``newton`` is null: the number of that block is returned, and
-    another call goes on there; otherwise the number of blocks.
+    Every block from its step ``done`` to step ``saves * every``, what is kept of each so-manieth state in ``out``; the
+    increments that drive the steps are read from ``noise``, block by block. No further than ``most`` steps, or to where
+    a block needs Newton's method and ``newton`` is null: the number of that block is returned, and another call goes on
+    there; otherwise the number of blocks.
     """
 
-    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool):
+    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool, kept):
         super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
-        self.pieces, self.layout, self.state, self.explicit = pieces, layout, state, explicit
+        self.pieces, self.layout, self.state, self.explicit, self.kept = pieces, layout, state, explicit, kept
         names = "p blocks done count saves every out most noise newton" if len(function.args) > 3 else "p blocks count"
         self.argument = dict(zip(names.split(), function.args, strict=True))
         own = np.cumsum(varies) - 1
@@ -235,9 +238,9 @@ class _Steps(Writer):
                 self.builder.store(self.builder.load(slot), self.place(self.layout.rows[name] + i), align=8)
 
     def keep(self, i: ir.Value, number: ir.Value) -> None:
-        """The states, energies and entropies as the so-manieth of block i in ``out``."""
+        """What is written down, as the so-manieth of block i in ``out``."""
         build, argument = self.builder, self.argument
-        kept = [slot for name in ("x", "energy", "entropy") for slot in self.slots[name]]
+        kept = [slot for name in self.kept for slot in self.slots[name]]
         row = build.add(build.mul(i, argument["saves"]), build.sub(number, self.whole_number(1)))
         start = build.gep(argument["out"], [build.mul(row, self.whole_number(len(kept) * self.lanes))])
         for j, slot in enumerate(kept):

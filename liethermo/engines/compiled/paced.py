@@ -6,6 +6,7 @@ import numpy as np
 
 from ...integrators import OneStepMethod
 from ...systems import System
+from ...tracing.scalarize import UnsupportedPrimitive
 from ..pacing import Pace, Pacing, begun, fitted, judged, shape_seen
 from ..rules import RULES, Rules
 from ..stepping import State
@@ -15,6 +16,9 @@ from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_steppe
 OWN = tuple(name for name in Pace._fields if name != "state")
 NAMES = (*FIELDS, *OWN)
 assert not {*NAMES} & {*ITERATION}
+
+VECTORS = ("x", "low", "k", "before")
+"""The fields of a state that are no numbers."""
 
 
 class PacedStepper(Stepper):
@@ -31,6 +35,7 @@ class PacedStepper(Stepper):
     """
 
     names, passed = NAMES, ("reached", "length")
+    kept = ("x", *(name for name in FIELDS if name not in VECTORS), "t", "taken")
 
     def __init__(self, form: Form, own: Form, way: Form, parameters, method, seen: tuple, lanes, varies, rules):
         self._way, self._seen, self._skip = way, seen, form.size + own.size
@@ -117,6 +122,16 @@ class LanePaces:
 
     def follow(self, most: int) -> None:
         self.stepper.run(self.first, self.blocks, 0.0, 1, most)
+
+    def attempts(self, most: int) -> dict[str, np.ndarray]:
+        """So many attempts of the one trajectory that there is, or less; what is known after each, but for vectors."""
+        before, out = self.read("tried")[0], np.empty((1, most, self.stepper.width))
+        try:
+            self.stepper.run(self.first, self.blocks, 0.0, most, 1, out=out)
+        except UnsupportedPrimitive:
+            if self.read("tried")[0] == before:
+                raise
+        return self.stepper.kept_of_one(out[0, : int(self.read("tried")[0] - before)])
 
     def read(self, name: str, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
         if isinstance(chosen, slice):

@@ -174,6 +174,7 @@ class Stepper:
     """The fields of a trajectory."""
 
     passed: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ("x", "energy", "entropy")
     """What its programs hand to each other besides."""
 
     def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
@@ -252,20 +253,21 @@ class Stepper:
         return found
 
     def run(
-        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, every: int, noise=None
+        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, every: int, noise=None, out=None
     ) -> np.ndarray:
         """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
 
         The size is one for all, or one for each lane, those of empty ones among them.
         ``noise`` has the increments, shape (trajectories, steps, increments), of a method that is driven by any.
 
-        Returns, at each save, every trajectory's state, energy and entropy: shape (trajectories, saves, n + 2), with
-        those of empty lanes, and undefined after a failure.
+        Returns, at each save, what is :attr:`kept` of every trajectory: shape (trajectories, saves, width), with those
+        of empty lanes, and undefined after a failure. It is written to ``out``, if there is one.
         """
-        n, lanes, count = self._shapes["x"][0], self.lanes, len(blocks)
+        lanes, count, width = self.lanes, len(blocks), self.width
         self.part(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
-        out, done = np.empty((count, saves, (n + 2) * lanes)), np.zeros(count, dtype=np.int64)
+        out = np.empty((count, saves, width * lanes)) if out is None else out
+        done = np.zeros(count, dtype=np.int64)
         saves, every = int(saves), int(every)
         arguments = [parameters.ctypes.data, blocks.ctypes.data, done.ctypes.data, count, saves, every]
         increments = self._in_blocks(noise, count, saves * every)
@@ -273,7 +275,18 @@ class Stepper:
         solve = 0 if self._newton is None else self._solver()
         while self._code()[1](*arguments, solve) < count:
             solve = self._solver()
-        return out.reshape(count, saves, n + 2, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, n + 2)
+        return out.reshape(count, saves, width, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, width)
+
+    def kept_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
+        """By name what is kept of a trajectory that is a block by itself, from rows of ``out``."""
+        ends = np.cumsum([self._layout.sizes[name] for name in self.kept])
+        parts = np.split(out, ends[:-1], axis=-1)
+        return {name: part.reshape(len(out), *self.shape(name)) for name, part in zip(self.kept, parts, strict=True)}
+
+    @property
+    def width(self) -> int:
+        """Numbers that are kept of a trajectory at each save."""
+        return sum(self._layout.sizes[name] for name in self.kept)
 
     def _in_blocks(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
         """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
@@ -290,7 +303,7 @@ class Stepper:
         with self._lock:
             if self._functions is None:
                 state = (*self.names, "h")
-                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self._explicit)
+                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self._explicit, self.kept)
                 self._loaded = code  # unloaded with this object
                 self._functions = BEGIN(code.address("begin")), ADVANCE(code.address("advance"))
             return self._functions
