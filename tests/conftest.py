@@ -31,7 +31,7 @@ def pytest_configure(config):
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Of the cases of a test marked ``sampled`` some run by default; the rest are slow.
 
     ``sampled(n)``: n spread over all of them; ``sampled("a", "b")``: those of these ids.
@@ -41,8 +41,14 @@ def pytest_collection_modifyitems(items):
         mark = item.get_closest_marker("sampled")
         if mark and not item.get_closest_marker("slow"):
             cases[item.parent.nodeid, item.originalname, mark.args].append(item)
-    for (*_, wanted), crossed in cases.items():
+    whole = not any("::" in argument for argument in config.args)
+    for (file, test, wanted), crossed in cases.items():
         if isinstance(wanted[0], str):
+            unknown = set(wanted) - {item.callspec.id for item in crossed}
+            if unknown and whole:
+                raise pytest.UsageError(
+                    f"{file}::{test} is to be sampled at {sorted(unknown)}, which are no cases of it"
+                )
             kept = {i for i, item in enumerate(crossed) if item.callspec.id in wanted}
         else:
             kept = {(2 * i + 1) * len(crossed) // (2 * wanted[0]) for i in range(wanted[0])}

@@ -100,7 +100,7 @@ RUNS = [
     pytest.param("frame", MIDPOINT, id="frame-midpoint"),
     pytest.param("covariance", lt.MetriplecticMidpoint(retraction="midpoint_euclidean"), id="covariance-euclidean"),
     *(
-        pytest.param(name, method, id=f"{name}-{kind}", marks=pytest.mark.slow)
+        pytest.param(name, method, id=f"{name}-{kind}")
         for name, method, kind in [
             ("spin", lt.MetriplecticMidpoint("mean_value"), "mean_value"),
             ("spin", lt.MetriplecticMidpoint(retraction="exp"), "midpoint-exp"),
