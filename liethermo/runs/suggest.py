@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..engines.choice import Chosen
-from ..engines.pacing import DEADBAND
+from ..engines.pacing import DEADBAND, rate_of
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven
@@ -149,7 +149,8 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
         if len(taken) == 30:
             raise _EnoughError
 
-    span = (0.0, 1e6 * max(size, 1e-300) / speed)
+    fastest = max(speed / max(size, 1e-300), rate_of(system, used, x))  # near a rest that is left
+    span = (0.0, 1e6 / fastest)
     with contextlib.suppress(_EnoughError):
         engine = Chosen(system, used, "auto", 1)
         state = engine.begin(x)
