@@ -58,8 +58,10 @@ class OnePace(Paces, Protocol):
     """One trajectory, whose attempts can be looked at."""
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
-        """So many attempts, or fewer: after each its time, the size of its step, and of its state what is no vector, x
-        alone excepted; attempts come first."""
+        """Make so many attempts, or fewer.
+
+        Returns, after each of them, the time, the size of the step, x, and the numbers of the state; attempts first.
+        """
         ...
 
 

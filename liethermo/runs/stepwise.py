@@ -66,7 +66,7 @@ def run(
     most_kept : float
         Adaptive steps after which there is no room for more.
     whole : bool
-        Whether keep has to be told of whole states: of those after adaptive steps it is not the stages otherwise.
+        Whether the states that keep is told of need their stages; after most adaptive steps they have none otherwise.
     """
     outcome, stops = Outcome(state), stops[stops > span[0]]
     try:

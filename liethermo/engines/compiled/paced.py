@@ -124,7 +124,7 @@ class LanePaces:
         self.stepper.run(self.first, self.blocks, 0.0, 1, most)
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
-        """So many attempts of the one trajectory that there is, or less; what is known after each, but for vectors."""
+        """Make so many attempts of the only trajectory, or fewer: see :class:`..paced.OnePace`."""
         before, out = self.read("tried")[0], np.empty((1, most, self.stepper.width))
         try:
             self.stepper.run(self.first, self.blocks, 0.0, most, 1, out=out)
