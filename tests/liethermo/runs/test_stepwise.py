@@ -1,5 +1,7 @@
 """Adaptive steps, events, outputs at given times and dense output: where a run steps is free, the laws are not."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +134,27 @@ def test_control(explicit):
     cut_short = 0.01 * wish  # which says nothing
     assert float(after_good(10.0, 0.0, cut_short, wish, power, np.inf, explicit)) == wish
     assert float(after_bad(np.inf, wish, power)) == 0.25 * wish
+
+
+def test_attempts_together_are_attempts_one_by_one():
+    """As dense output, which needs the stages of every step, makes them; rejected ones among them."""
+    together, single = (
+        lt.integrate(
+            SYSTEM,
+            START,
+            (0.0, 20.0),
+            lt.Adaptive(1e-7, first=2.0),
+            lt.MetriplecticRungeKutta(4),
+            dense=dense,
+            engine="compiled",
+        )
+        for dense in (False, True)
+    )
+    assert together.stats.steps > 100
+    assert together.stats.rejected > 0
+    for name in ("t", "x", "energy", "entropy"):
+        assert np.array_equal(getattr(together, name), getattr(single, name))
+    assert replace(together.stats, wall_time=0.0) == replace(single.stats, wall_time=0.0)
 
 
 @pytest.mark.slow
