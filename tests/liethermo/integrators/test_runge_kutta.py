@@ -8,6 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.engines.stepping import first_state, take_step
 from liethermo.integrators.lobatto import ExplicitTableau, lobatto, trees
 from tests.liethermo.integrators.test_orders import nonlinear_systems
 
@@ -72,6 +73,21 @@ def test_order_conditions(order, stages):
             if n <= q:
                 assert abs(d @ vector) < 1e-14
     assert max(abs(d @ v) for v in trees(A, q + 1)[q + 1]) > 1e-3
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_estimate_is_right_for_a_linear_oscillation(order):
+    """The error of a step of a rotation is along the circle, where no correction takes it away."""
+    system = lt.MetriplecticSystem(mf.Canonical(1), lt.Quadratic(np.eye(2)))
+    method = RK(order).on(system)
+    state = first_state(system, method, jnp.array([1.0, 0.0]))
+    off = []
+    for h in {4: (0.2, 0.1, 0.05), 6: (0.2, 0.1, 0.05), 8: (0.4, 0.2, 0.1)}[order]:
+        new = take_step(system, method, state, h)
+        true = np.linalg.norm(np.asarray(new.x) - [np.cos(h), -np.sin(h)])
+        off.append(float(method.error(system, state.x, state.low, h, new.k)) / true - 1.0)
+    assert 0.0 < off[2] < 0.01
+    assert 3.0 < off[1] / off[2] < 5.0
 
 
 # -- orders -----------------------------------------------------------------------------------------------------------
