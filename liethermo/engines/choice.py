@@ -178,8 +178,6 @@ class Chosen:
 class _Compiled:
     """A compiled run with a pace, that the array engine takes over where it meets what cannot be unrolled."""
 
-    number = 1
-
     def __init__(self, chosen: Chosen, pacing: Pacing, x, t: float, stop: float, length: float):
         self._chosen, self._pacing, self._start = chosen, pacing, (x, t, stop, length)
         try:
@@ -190,9 +188,6 @@ class _Compiled:
     def _take_over(self, error: UnsupportedPrimitive) -> None:
         self._chosen._fall_back(error)
         self._paces = self._chosen._single(self._pacing).begin(*self._start)
-
-    def follow(self, most: int) -> None:
-        self.attempts(most)
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         try:
@@ -208,9 +203,6 @@ class _Compiled:
 
     def write(self, name: str, chosen, values) -> None:
         self._paces.write(name, chosen, values)
-
-    def stepped(self, chosen, h):
-        return self._paces.stepped(chosen, h)
 
 
 def is_small(system: System, most: int) -> bool:

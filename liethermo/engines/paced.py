@@ -35,6 +35,16 @@ from .stepping import State, take_step
 
 
 class Paces(Protocol):
+    """Trajectories with paces of their own."""
+
+    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
+        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
+        ...
+
+    def write(self, name: str, chosen: np.ndarray, values) -> None: ...
+
+
+class ManyPaces(Paces, Protocol):
     """Trajectories that are followed together; each is what it would be alone."""
 
     number: int
@@ -42,12 +52,6 @@ class Paces(Protocol):
     def follow(self, most: int) -> None:
         """So many attempts of each, or as many as it takes until it pauses."""
         ...
-
-    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
-        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
-        ...
-
-    def write(self, name: str, chosen: np.ndarray, values) -> None: ...
 
     def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
         """The fields of the states after steps of these sizes from those that some have."""
@@ -60,7 +64,8 @@ class OnePace(Paces, Protocol):
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         """Make so many attempts, or fewer.
 
-        Returns, after each of them, the time, the size of the step, x, and the numbers of the state; attempts first.
+        Returns, attempts first, the number of the step after each, the time "t" and the size "taken"; after those that
+        others follow all of :data:`.stepping.TELLING` too.
         """
         ...
 
@@ -113,22 +118,13 @@ class SinglePaces(_ArrayPaces):
             self._put(name, np.asarray(others.read(name)).reshape(whole.shape).astype(whole.dtype))
         return self
 
-    def follow(self, most: int) -> None:
-        if self._step is None:
-            number = jnp.asarray(most)
-            self.pace = follow(self.system, self.method, self.pacing, self.pace, number, RULES)
-        else:
-            self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, most)
-
     def attempts(self, most: int) -> dict[str, np.ndarray]:
-        self.follow(1)
-        return {name: self.read(name) for name in (*State._fields, "t", "taken")}
-
-    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
-        del chosen
-        state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))
-        step = self._step or (lambda state, h: _one(self.system, self.method, state, h))
-        return {name: np.asarray(value)[None] for name, value in step(state, jnp.asarray(h[0]))._asdict().items()}
+        del most  # one, which nothing else follows
+        if self._step is None:
+            self.pace = follow(self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES)
+        else:
+            self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
+        return {name: self.read(name) for name in ("step", "t", "taken")}
 
 
 class VmapPaces(_ArrayPaces):
@@ -150,11 +146,6 @@ class VmapPaces(_ArrayPaces):
         state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))
         found = step_all(self.form, self.parameters, self.axes, self.method, state, jnp.asarray(sizes))
         return {name: np.asarray(value)[chosen] for name, value in found._asdict().items()}
-
-
-@program
-def _one(system, method, state, h):
-    return take_step(system, method, state, h)
 
 
 @program

@@ -16,13 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..functions.gradients import EPS
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
 from .growth import FEW, growing, stretch
-from .rules import RULES, Rules
+from .rules import EPS, RULES, Rules
 from .stepping import State, first_state, take_step
 
 GROWTH, EXPLICIT_GROWTH = 3.0, 10.0
@@ -117,9 +116,10 @@ class Pace(NamedTuple):
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
     state, zero = first_state(system, method, x), jnp.zeros(())
-    size, length = jnp.max(jnp.abs(x)), zero + length
-    speed = jnp.max(jnp.abs(system.vector_field(x))) / jnp.where(size > 0.0, size, 1.0)
-    share = jnp.minimum(pacing.allowed(size) / jnp.where(size > 0.0, size, 1.0), 1.0)
+    size = jnp.max(jnp.abs(x))
+    unit = jnp.where(size > 0.0, size, 1.0)
+    speed = jnp.max(jnp.abs(system.vector_field(x))) / unit
+    share = jnp.minimum(pacing.allowed(size) / unit, 1.0)
     # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
     found = 0.5 * share ** (1.0 / method.order) / jnp.where(speed > 0.0, speed, 1.0)
     found = jnp.where((speed > 0.0) & (size > 0.0), jnp.minimum(length, found), 1e-3 * length)

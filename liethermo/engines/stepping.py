@@ -44,6 +44,10 @@ class State(NamedTuple):
     entropy_sensitivity: jax.Array
 
 
+TELLING = tuple(name for name in State._fields if name not in ("low", "k", "before"))
+"""The fields that tell of a run: those that the next step alone needs are left out."""
+
+
 def first_state(system: System, method: OneStepMethod, x) -> State:
     """The state of a run about to start at x."""
     k = method.start(system, x)

@@ -17,7 +17,7 @@ from ..engines import array
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
 from ..engines.paced import step_all
-from ..engines.stepping import State, begin
+from ..engines.stepping import TELLING, begin
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
@@ -35,8 +35,7 @@ ARRAY_BATCH = 65_536
 """Trajectories that the array engine takes at once: bounded memory."""
 
 KEPT_BEFORE = ("x", "energy", "entropy")
-KEPT_AFTER = tuple(name for name in State._fields if name not in ("low", "k", "before"))
-"""Fields of the states of a batch that its record is made from."""
+"""Fields of the states before a batch that its record is made from; after it those of :data:`.stepping.TELLING`."""
 
 
 class Tally:
@@ -122,7 +121,7 @@ def run_compiled(
             if place is not None:
                 record.keep(chosen, place, states)
             tally.add(number * saves * every / course.steps)
-        after = {name: value[:number] for name, value in stepper.fields(blocks, KEPT_AFTER).items()}
+        after = {name: value[:number] for name, value in stepper.fields(blocks, TELLING).items()}
         record.put(chosen, before, after)
 
     by_threads(work, len(record.x0))

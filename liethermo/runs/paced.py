@@ -10,11 +10,12 @@ import numpy as np
 from ..engines.codes import Code
 from ..engines.compiled.form import Form, numbers_of
 from ..engines.compiled.paced import LanePaces, paced_stepper_of
-from ..engines.paced import Guide, Paces, VmapPaces
+from ..engines.paced import Guide, ManyPaces, VmapPaces
 from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
+from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
 from ..tracing.interpret import at_points
-from .batches import ARRAY_BATCH, KEPT_AFTER, KEPT_BEFORE, LANES, Lanes, Tally, by_threads
+from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads
 from .events import Event, located
 from .family import Family
 from .record import Record
@@ -79,7 +80,7 @@ class Many:
             paces = VmapPaces(*given, self.record.x0[chosen], *self._times)
             self._follow(paces, np.arange(chosen.start, chosen.stop), None, lambda: self.interrupted)
 
-    def _follow(self, paces: Paces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
+    def _follow(self, paces: ManyPaces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
         """Trajectories with these places, to the ends of all."""
         record = self.record
         guide = Guide(paces, self.pacing, self.method, self.stops, lambda i: self.family.member(int(places[i])))
@@ -95,7 +96,7 @@ class Many:
             record.rejected[places[ended]] = paces.read("rejected", ended)
 
         def fields_of(chosen: np.ndarray) -> dict[str, np.ndarray]:
-            return {name: paces.read(name, chosen) for name in KEPT_AFTER}
+            return {name: paces.read(name, chosen) for name in TELLING}
 
         try:
             while followed.any() and not stopped():
@@ -127,7 +128,7 @@ class Many:
         if left.size:
             finish(left, np.full(left.size, Code.INTERRUPTED), fields_of(left), paces.read("t", left))
 
-    def _happened(self, paces: Paces, places: np.ndarray, caught: np.ndarray):
+    def _happened(self, paces: ManyPaces, places: np.ndarray, caught: np.ndarray):
         """The fields of the states at events, and their times."""
         assert self.event is not None
         form, h = self.family.form, paces.read("taken", caught)
@@ -156,7 +157,7 @@ class Many:
         everyone = np.arange(caught.size)
         shares = located(value, watched(x, everyone), watched(whole["x"], everyone))
         end = paces.stepped(caught, shares * h)
-        fields = {name: end[name] for name in KEPT_AFTER}
+        fields = {name: end[name] for name in TELLING}
         return fields, paces.read("t", caught) + shares * h
 
 

@@ -17,7 +17,7 @@ from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.paced import Guide
 from ..engines.pacing import CAUGHT
-from ..engines.stepping import State
+from ..engines.stepping import TELLING, State
 from ..errors import InputError
 from .adaptive import UNDERFLOW, Adaptive, pacing_of
 from .events import Event, located
@@ -104,8 +104,8 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
         last: Any = State(*(paces.read(name)[0] for name in State._fields))
         last = last._replace(status=np.int64(0))
         for i in np.flatnonzero(np.diff(rows["step"], prepend=int(outcome.state.step))):  # those that count
-            before, known = outcome.state, {name: rows[name][i] for name in State._fields if name in rows}
-            outcome.state = last if known["step"] == last.step else before._replace(**known)
+            before, whole = outcome.state, rows["step"][i] == last.step
+            outcome.state = last if whole else before._replace(**{name: rows[name][i] for name in TELLING})
             keep(t, float(rows["t"][i]), float(rows["taken"][i]), before, outcome.state)
             t = float(rows["t"][i])
     if code == Code.STEP_LIMIT:

@@ -15,7 +15,7 @@ from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven
 from .adaptive import Adaptive
-from .stepwise import run
+from .stepwise import Outcome, run
 
 
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
@@ -149,12 +149,17 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
         if len(taken) == 30:
             raise _EnoughError
 
-    fastest = max(speed / max(size, 1e-300), rate_of(system, used, x))  # near a rest that is left
-    span = (0.0, 1e6 / fastest)
+    def follow(rate: float) -> Outcome:
+        """Over a span in which what goes at this rate goes far."""
+        taken.clear()
+        iterations[1:] = []
+        return run(engine, state, (0.0, 1e6 / rate), Adaptive(rtol), np.array([1e6 / rate]), None, keep)
+
     with contextlib.suppress(_EnoughError):
-        engine = Chosen(system, used, "auto", 1)
+        engine, rate = Chosen(system, used, "auto", 1), speed / max(size, 1e-300)
         state = engine.begin(x)
-        run(engine, state, span, Adaptive(rtol), np.array([span[1]]), None, keep)
+        if follow(rate).underflow is not None and (growth := rate_of(system, used, x)) > rate:
+            follow(growth)  # from near a rest, where steps are short beside the time that the state takes
     if len(taken) < 2:
         raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < DEADBAND[1] * a), len(taken) - 1)

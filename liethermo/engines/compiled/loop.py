@@ -51,8 +51,8 @@ def step_loop(
     state: Sequence[str],
     varies: np.ndarray,
     lanes: int,
-    explicit: bool = False,
-    kept: Sequence[str] = ("x", "energy", "entropy"),
+    explicit: bool,
+    kept: Sequence[str],
 ) -> MachineCode:
     """The functions ``advance`` and ``begin`` of :class:`_Steps` as machine code.
 

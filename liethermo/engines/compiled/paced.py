@@ -9,16 +9,13 @@ from ...systems import System
 from ...tracing.scalarize import UnsupportedPrimitive
 from ..pacing import Pace, Pacing, begun, fitted, judged, shape_seen
 from ..rules import RULES, Rules
-from ..stepping import State
+from ..stepping import TELLING, State
 from .form import Form, numbers_of
 from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper, stepper_for
 
 OWN = tuple(name for name in Pace._fields if name != "state")
 NAMES = (*FIELDS, *OWN)
 assert not {*NAMES} & {*ITERATION}
-
-VECTORS = ("x", "low", "k", "before")
-"""The fields of a state that are no numbers."""
 
 
 class PacedStepper(Stepper):
@@ -35,7 +32,7 @@ class PacedStepper(Stepper):
     """
 
     names, passed = NAMES, ("reached", "length")
-    kept = ("x", *(name for name in FIELDS if name not in VECTORS), "t", "taken")
+    kept = (*TELLING, "t", "taken")
 
     def __init__(self, form: Form, own: Form, way: Form, parameters, method, seen: tuple, lanes, varies, rules):
         self._way, self._seen, self._skip = way, seen, form.size + own.size
@@ -100,7 +97,7 @@ def paced_stepper_of(
 
 
 class LanePaces:
-    """Trajectories in lanes, each with a pace of its own: what :class:`..paced.Paces` asks for.
+    """Trajectories in lanes, each with a pace of its own: :class:`..paced.ManyPaces`, or :class:`..paced.OnePace`.
 
     Parameters
     ----------

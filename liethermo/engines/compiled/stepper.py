@@ -174,8 +174,10 @@ class Stepper:
     """The fields of a trajectory."""
 
     passed: tuple[str, ...] = ()
-    kept: tuple[str, ...] = ("x", "energy", "entropy")
     """What its programs hand to each other besides."""
+
+    kept: tuple[str, ...] = ("x", "energy", "entropy")
+    """The fields that are written down at each save."""
 
     def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
         """The programs of a step, for what makes more of them."""

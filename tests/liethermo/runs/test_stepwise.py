@@ -59,7 +59,7 @@ def test_the_error_follows_the_tolerance(stages, rtol, exact):
     assert 2.0 < error < 40.0
     assert solution.audit(energy=1e-14).passed, str(solution.audit())
     assert solution.t[-1] == 20.0
-    assert solution.stats.rejected <= 2 + 0.1 * solution.stats.steps  # one or two until the first step is found
+    assert solution.stats.rejected <= 3 + 0.01 * solution.stats.steps
 
 
 @pytest.mark.slow
@@ -230,16 +230,23 @@ def relaxed_body(m):
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
-    ("p", "rtol", "stages"), [(1e-6, 1e-4, 2), (1e-7, 1e-4, 3), (1e-10, 1e-6, 3), (1e-13, 1e-8, 4), (1e-15, 1e-6, 2)]
+    ("p", "rtol", "stages", "most"),
+    [
+        (1e-6, 1e-4, 2, 80),
+        (1e-7, 1e-4, 3, 80),
+        (1e-10, 1e-6, 3, 80),
+        (1e-13, 1e-8, 4, 80),
+        (1e-15, 1e-6, 2, 200),  # while it has hardly moved, its error is judged by the distance that it has gone
+    ],
 )
-def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages):
+def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages, most):
     """However near it starts, and however large the tolerance is beside that."""
     x0 = [p, 1.0, p]
     exact = falls(relaxed_body, x0, lambda t, x: x[0] - 0.5, 600.0)
     method = lt.MetriplecticGauss(stages)
     found = lt.integrate(BODY, x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
     assert found.event_time == pytest.approx(exact, rel=0.005)
-    assert found.stats.steps < 200  # while it has hardly moved, its error is judged by the distance that it has gone
+    assert found.stats.steps < most
 
 
 @pytest.mark.slow
