@@ -15,6 +15,7 @@ from liethermo.engines.compiled import stepper as compiled
 from liethermo.engines.growth import growing
 from liethermo.engines.pacing import after_bad, after_good
 from liethermo.engines.stepping import error_of_step
+from liethermo.tracing.scalarize import UnsupportedPrimitive
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -155,6 +156,28 @@ def test_attempts_together_are_attempts_one_by_one():
     for name in ("t", "x", "energy", "entropy"):
         assert np.array_equal(getattr(together, name), getattr(single, name))
     assert replace(together.stats, wall_time=0.0) == replace(single.stats, wall_time=0.0)
+
+
+def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
+    """Where Newton's method is first needed and cannot be compiled: no step before that is lost."""
+
+    def followed(engine):
+        step, method = lt.Adaptive(0.1, first=1e-3), lt.MetriplecticGauss(3)
+        return lt.integrate(lt.models.free_rigid_body(), [1.0, 0.02, 0.02], (0.0, 400.0), step, method, engine=engine)
+
+    asked = []
+
+    def solver(self):
+        asked.append(1)
+        raise UnsupportedPrimitive("newton", "in this test")
+
+    whole = followed("array")
+    monkeypatch.setattr(compiled.Stepper, "_solver", solver)
+    with pytest.warns(UserWarning, match="newton"):
+        parts = followed("auto")
+    assert len(asked) == 2  # what was done before is handed on first
+    assert len(parts.t) == len(whole.t) > 50
+    assert np.abs(parts.x - whole.x).max() < 1e-13
 
 
 @pytest.mark.slow
