@@ -12,9 +12,10 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Literal, TypeVar
 
-import equinox as eqx
 import jax
 import scipy.sparse
+
+from manifolds._module import Module
 
 from ..functions.energy import Energy
 from ..functions.indices import union
@@ -25,7 +26,7 @@ Law = Literal["conserved", "nondecreasing", "nonincreasing"]
 T = TypeVar("T")
 
 
-class Dissipation(eqx.Module):
+class Dissipation(Module):
     """Base class. A subclass states its laws and gives :meth:`force`; :meth:`prepared` may complete and check it.
 
     Attributes

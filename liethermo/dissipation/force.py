@@ -8,6 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds._module import Module
+
 from ..errors import InputError
 from .base import Dissipation
 from .checks import needed_algebra
@@ -49,7 +51,7 @@ class EulerPoincareForce(Dissipation):
         return system.algebra.ad_star(dH, self.F(dH))
 
 
-class _OnSites(eqx.Module):
+class _OnSites(Module):
     """A map of arrays of one shape, as one of flat arrays."""
 
     function: Callable

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import real_array
+from manifolds._module import Module
 from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
@@ -132,7 +133,7 @@ class DissipationPotential(Dissipation):
 # -- named potentials -------------------------------------------------------------------------------------------------
 
 
-class NamedPotential(eqx.Module):
+class NamedPotential(Module):
     """A sum over the forces, or with ``each=False`` a function of their length: then no choice of axes matters."""
 
     each: bool = eqx.field(static=True, default=False, kw_only=True)

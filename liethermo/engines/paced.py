@@ -31,7 +31,7 @@ from .pacing import (
     reach,
 )
 from .rules import RULES
-from .stepping import State, take_step
+from .stepping import TELLING, State, take_step
 
 
 class Paces(Protocol):
@@ -124,7 +124,7 @@ class SinglePaces(_ArrayPaces):
             self.pace = follow(self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES)
         else:
             self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
-        return {name: self.read(name) for name in ("step", "t", "taken")}
+        return {name: self.read(name) for name in (*TELLING, "t", "taken")}
 
 
 class VmapPaces(_ArrayPaces):

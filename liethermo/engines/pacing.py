@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import Module
+
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
@@ -60,7 +62,7 @@ ARRIVED, LOOKING, CAUGHT, FINISHED = 20, 21, 22, 23
 is to be looked at; an event happens in the step that was tried; it is at its end."""
 
 
-class Pacing(eqx.Module):
+class Pacing(Module):
     """How steps are chosen and what is watched: parameters of a program, as those of a system are.
 
     Attributes
@@ -75,12 +77,12 @@ class Pacing(eqx.Module):
         Otherwise all steps are of the size ``first``, but for those that arrive where they have to.
     """
 
-    rtol: jax.Array
-    atol: jax.Array
-    first: jax.Array
-    largest: jax.Array
-    shortest: jax.Array
-    most: jax.Array
+    rtol: jax.Array | np.ndarray
+    atol: jax.Array | np.ndarray
+    first: jax.Array | np.ndarray
+    largest: jax.Array | np.ndarray
+    shortest: jax.Array | np.ndarray
+    most: jax.Array | np.ndarray
     watched: Any
     falling: bool = eqx.field(static=True)
     adaptive: bool = eqx.field(static=True)

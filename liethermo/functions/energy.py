@@ -19,6 +19,7 @@ import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
+from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import at_points
@@ -32,7 +33,7 @@ COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
 
-class Energy(eqx.Module):
+class Energy(Module):
     """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
 
     Calling one evaluates it: shape (..., n) to shape (...); with a time, shape (...), where it depends on one.
@@ -241,7 +242,7 @@ class TimeDependent(Energy):
         return TimeDependent(_Minus(self.function))
 
 
-class _AtTime(eqx.Module):
+class _AtTime(Module):
     function: Callable
     time: jax.Array
 
@@ -249,7 +250,7 @@ class _AtTime(eqx.Module):
         return self.function(x, self.time)
 
 
-class _Joined(eqx.Module):
+class _Joined(Module):
     function: Callable
 
     def __call__(self, z):
@@ -304,7 +305,7 @@ def _squares(gradients) -> jax.Array:
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
 
 
-class _Minus(eqx.Module):
+class _Minus(Module):
     function: Callable
 
     def __call__(self, x, t):
@@ -375,7 +376,7 @@ class Pullback(Energy):
         return Pullback(-self.term, self.indices if self.function is None else self.function)
 
 
-class _BesideTime(eqx.Module):
+class _BesideTime(Module):
     """Coordinates of a state, and the time behind it."""
 
     coordinates: Callable

@@ -23,6 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import Module
+
 from ..errors import InputError
 from .energy import Energy
 from .frames import frame
@@ -40,7 +42,7 @@ defect is always used. There |d|/L > 2.6e-3, so the quotient's noise is below 1e
 three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even in 1e7 steps."""
 
 
-class DiscreteGradient(eqx.Module):
+class DiscreteGradient(Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
     A sum of energies is treated term by term: discrete gradients add, and each term knows which of the methods below is

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..tracing.interpret import at_points
 from .each import Each
@@ -75,7 +76,7 @@ class Potential(Pullback):
         super().__init__(Function(_Apart(V)), _without_momenta)
 
 
-class _Apart(eqx.Module):
+class _Apart(Module):
     """V(q, S) as a function of one array."""
 
     V: Callable

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 
 import manifolds as mf
+from manifolds._module import Module
 
 from .energy import Energy, Function, Negative, Quadratic, Sum, TimeDependent
 
@@ -37,7 +38,7 @@ def _on_points(term: Energy, space: mf.Space) -> Energy:
     return term if isinstance(term, Quadratic) else OfPoint(term, space)
 
 
-class _OfPointAndTime(eqx.Module):
+class _OfPointAndTime(Module):
     function: Callable
     space: mf.Space = eqx.field(static=True)
 
@@ -70,7 +71,7 @@ def _on_sites(energy: Energy, shape: tuple[int, ...]) -> Energy:
     return energy
 
 
-class _OfSites(eqx.Module):
+class _OfSites(Module):
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)
 

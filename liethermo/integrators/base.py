@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import Module
+
 from ..errors import InputError
 from ..functions.gradients import EPS, compensated
 from ..functions.rounding import with_rounding
@@ -22,7 +24,7 @@ _registry: list[OneStepMethod] = []
 EVERY_SYSTEM = "every system"
 
 
-class OneStepMethod(eqx.Module):
+class OneStepMethod(Module):
     """An implicit one-step method: slopes ``k``, shape (stages, n), that solve ``k = slopes(system, x, low, h, k)``.
 
     The state is ``x + low``, an unevaluated sum: low is what rounding has kept from x in the steps before (compensated

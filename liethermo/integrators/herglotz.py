@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..errors import InputError
@@ -90,7 +90,7 @@ class DiscreteHerglotz(OneStepMethod):
         return h * k[0]
 
 
-class _Midpoint(eqx.Module):
+class _Midpoint(Module):
     lagrangian: Energy
 
     def __call__(self, q0, q1, S0, h):

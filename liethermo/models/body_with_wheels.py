@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 
 from ..systems import EulerPoincareClosedSystem
 from .parameters import positive
 
 
-class _Lagrangian(eqx.Module):
+class _Lagrangian(Module):
     inertia: jax.Array
     wheels: jax.Array
     heat: jax.Array
@@ -27,7 +27,7 @@ class _Lagrangian(eqx.Module):
         return kinetic - self.heat * self.temperature * jnp.exp(S / self.heat)
 
 
-class _InBearings(eqx.Module):
+class _InBearings(Module):
     friction: jax.Array
 
     def __call__(self, xi, S):

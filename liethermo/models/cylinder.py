@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
@@ -17,7 +18,7 @@ from .gas_piston import GAS_CONSTANT, IdealGas
 from .parameters import positive
 
 
-class _UnderPiston(eqx.Module):
+class _UnderPiston(Module):
     """Energy of the gas from (q, S)."""
 
     gas: IdealGas
@@ -76,7 +77,7 @@ def cylinder_rest(pressure, T, area: float = 0.01, moles: float = 1.0, height: f
     return np.array([volume / area, 0.0, gas.entropy(T, volume)], dtype=float)
 
 
-class _Push(eqx.Module):
+class _Push(Module):
     """``-P A``."""
 
     pressure: Callable

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import Module
+
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Subsystem
@@ -19,7 +21,7 @@ GAS_CONSTANT = 8.31446261815324
 """J / (K mol)."""
 
 
-class IdealGas(eqx.Module):
+class IdealGas(Module):
     """``U(S, V) = U_0 exp(S / (c n R)) (V / V_0)^(-1/c)`` with ``U_0 = c n R T_0``: S is counted from (T_0, V_0).
 
     ``T = U / (c n R)``, ``P = n R T / V``.
@@ -47,7 +49,7 @@ class IdealGas(eqx.Module):
         return self.c * nR * jnp.log(T / self.temperature) + nR * jnp.log(V / self.volume)
 
 
-class _InCylinder(eqx.Module):
+class _InCylinder(Module):
     """Energy of a gas left or right of the piston, from (q, S)."""
 
     gas: IdealGas

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..functions.energy import Function, Quadratic
 from ..systems import SimpleClosedSystem
@@ -22,7 +23,7 @@ STARTS = {1: 0.3, 2: 0.1}
 """Where the mass of either case starts, ``x_0 = x_1`` (m), at S_0 = 0; the step is 1e-3 s."""
 
 
-class RoomOfGas(eqx.Module):
+class RoomOfGas(Module):
     """``U(S) = c N R T_0 exp(S / (c N R))`` of an ideal gas in a fixed volume, S counted from T_0.
 
     Attributes

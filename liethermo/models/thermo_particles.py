@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..functions.edges import edges
 from ..functions.energy import Function, Quadratic
@@ -21,7 +22,7 @@ def warmth(x, capacity):
     return capacity * jnp.exp(x[-1] / capacity)
 
 
-class Warmth(eqx.Module):
+class Warmth(Module):
     """The same, of one body."""
 
     capacity: jax.Array

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..errors import InputError
 from ..functions.each import Each
@@ -15,7 +16,7 @@ from ..systems import ComposedSystem, Copies
 from .parameters import positive, whole
 
 
-class Thermospring(eqx.Module):
+class Thermospring(Module):
     """Energy ``e(r^2, S)`` of a spring of length r and entropy S [Romero 2009, §4].
 
     ``e = C u^2 / 2 + b T_0 u + c (T - T_0)`` with ``u = log(r / r_0)`` and ``T = T_0 exp((S - b u) / c)``: stretching

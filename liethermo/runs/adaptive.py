@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import jax.numpy as jnp
+import numpy as np
 
 from ..engines.pacing import Pacing
 from ..errors import InputError
@@ -86,5 +86,5 @@ def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, even
     else:
         numbers = [0.0, 0.0, step, math.inf, 0.0, math.inf]
     watched, falling = (None, False) if event is None else (event.function, event.falling)
-    rtol, atol, first, largest, shortest, most = (jnp.asarray(float(number)) for number in numbers)
+    rtol, atol, first, largest, shortest, most = (np.asarray(float(number)) for number in numbers)
     return Pacing(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import contextvars
 import math
 import os
@@ -53,9 +54,20 @@ class Tally:
 # -- the compiled engine ----------------------------------------------------------------------------------------------
 
 
-def by_threads(work: Callable[[slice, threading.Event], None], size: int) -> None:
-    """Portions of trajectories, dealt out to a thread for each core; Ctrl-C sets the event."""
+SHORT = 20_000
+"""Steps, of all trajectories together, that take less time than starting threads for them."""
+
+
+def by_threads(work: Callable[[slice, threading.Event], None], size: int, steps: float = math.inf) -> None:
+    """Portions of trajectories, dealt out to a thread for each core; Ctrl-C sets the event.
+
+    Where each takes few steps, ``steps`` at most, there is one portion, and no thread.
+    """
     cores, stop = _cores(), threading.Event()
+    if size * steps <= SHORT:
+        with contextlib.suppress(KeyboardInterrupt):
+            work(slice(0, size), stop)
+        return
     portion = min(BATCH, LANES * math.ceil(size / (LANES * 2 * cores)))
     with ThreadPoolExecutor(cores) as pool:
         starts = range(0, size, portion)
@@ -124,7 +136,7 @@ def run_compiled(
         after = {name: value[:number] for name, value in stepper.fields(blocks, TELLING).items()}
         record.put(chosen, before, after)
 
-    by_threads(work, len(record.x0))
+    by_threads(work, len(record.x0), course.steps)
 
 
 def first_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:

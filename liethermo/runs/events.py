@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
 from ..functions.gradients import EPS
@@ -74,7 +75,7 @@ class Event:
         return before > 0.0 >= after or (not self.falling and before < 0.0 <= after)
 
 
-class Excess(eqx.Module):
+class Excess(Module):
     """The entropy production above one."""
 
     tol: jax.Array
@@ -83,7 +84,7 @@ class Excess(eqx.Module):
         return system.entropy_production(x) - self.tol
 
 
-class OfPoints(eqx.Module):
+class OfPoints(Module):
     """A function of what the user sees of a state."""
 
     function: Callable

@@ -24,7 +24,7 @@ from .ending import given_up, stats_of, status_of
 from .events import Event
 from .fluctuations import Fluctuations, Path
 from .presented import Again, presented, provenance_of
-from .stepwise import MOST_KEPT, stops_of
+from .stepwise import MOST_KEPT, Steps, stops_of
 from .stepwise import run as run_stepwise
 from .timetable import Timetable
 
@@ -42,7 +42,7 @@ class Run:
         self.system, self.method, self.table = system, method, table
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
-        self.times = [table.start]
+        self.times = [np.array([table.start])]
         self.states = [np.asarray(x0)[None]]
         self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
@@ -50,10 +50,15 @@ class Run:
         self.step: float | Adaptive = table.h
         self.event_time: float | None = None
         self.dense: Dense | None = None
-        self.longest: list[float] = []  # steps after each state that is kept
+        self.taken: list[np.ndarray] = []  # sizes of steps that are looked at, and whether states after them are kept
         self.noise = noise
         path = None if noise is None or not method.increments else Path(noise, method.increments)
         self.engine = Chosen(system, method, engine, table.steps, path)
+
+    @property
+    def now(self) -> float:
+        """The time of the last state that is kept."""
+        return next(float(times[-1]) for times in reversed(self.times) if len(times))
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -65,7 +70,7 @@ class Run:
             self.values = [np.array([[float(state.energy), float(state.entropy)]])]
             for h, saves, every in self.table.calls(saves=self.engine.portion):
                 state = self._advance(state, h, saves, every)
-                bar.update(self.times[-1])
+                bar.update(self.now)
                 if int(state.status) != Code.COMPLETED:
                     break
                 self._checkpoint(state)
@@ -83,22 +88,19 @@ class Run:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
         start, end, every = self.table.start, self.table.end, self.table.every or 1
         stops, event = stops_of(save_at, start, end), None if until is None else Event(until, self.system)
-        self.step, pieces, last, kept = step, [], None, 0
+        self.step, pieces, last = step, [], None
 
-        def keep(t, reached, h, before, after):
-            nonlocal last, kept
-            last = reached, after
-            if len(self.times) > kept:  # the first step after a state that is kept
-                self.longest.append(h)
-                kept = len(self.times)
-            self.longest[-1] = max(self.longest[-1], h)
+        def keep(steps: Steps):
+            nonlocal last
+            ends = steps.t[1:]
+            kept = np.isin(ends, stops) if save_at is not None else steps.number % every == 0
+            self._append(steps, kept)
+            self.taken.append(np.stack([steps.h, kept]))
+            last = None if kept[-1] else steps
             if dense:
-                pieces.append((t, h, np.asarray(before.x), np.asarray(after.k)))
-            if reached in stops if save_at is not None else int(after.step) % every == 0:
-                self._append(reached, after)
-                last = None
-            bar.update(reached)
-            self._checkpoint(after)
+                pieces.append((steps.t[0], steps.h[0], np.asarray(steps.before.x), np.asarray(steps.after.k)))
+            bar.update(ends[-1])
+            self._checkpoint(steps.after)
 
         state = None
         try:
@@ -118,17 +120,17 @@ class Run:
             event,
             keep,
             most_kept=MOST_KEPT / max(numbers, 1e-9),
-            whole=dense,
+            singly=dense,
         )
         if last is not None:
-            self._append(*last)
+            self._append(last, slice(-1, None))
         self.event_time = outcome.event_time
         if pieces:
             begins, lengths, x, k = (np.array(column) for column in zip(*pieces, strict=True))
             self.dense = Dense(
                 begins, lengths, x, k, self.method.weights, None if self.system.space is None else self._along
             )
-        state, now = outcome.state, self.times[-1]
+        state, now = outcome.state, self.now
         self.stats = dataclasses.replace(stats_of(state), rejected=outcome.rejected)
         steps = int(state.step)
         if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit):
@@ -146,10 +148,10 @@ class Run:
     def _along(self, x, v) -> np.ndarray:
         return np.asarray(_along(self.system, self.method, x, v))
 
-    def _append(self, t: float, state) -> None:
-        self.times.append(t)
-        self.states.append(np.asarray(state.x)[None])
-        self.values.append(np.array([[float(state.energy), float(state.entropy)]]))
+    def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:
+        self.times.append(steps.t[1:][kept])
+        self.states.append(steps.x[kept])
+        self.values.append(np.column_stack([steps.energy, steps.entropy])[kept])
 
     def _advance(self, state, h, saves, every):
         before = int(state.step)
@@ -162,7 +164,7 @@ class Run:
             values = np.append(values, [[float(state.energy), float(state.entropy)]], axis=0)
         self.states.append(states)
         self.values.append(values)
-        self.times.extend(self.table.time(int(n)) for n in steps)
+        self.times.append(self.table.reached(steps))
         return state
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
@@ -176,10 +178,10 @@ class Run:
         except KeyboardInterrupt:
             self.status = Status(Code.INTERRUPTED, "stopped by the user before SciPy returned anything", 0, times[0])
             return
-        self.times, self.states = list(times[: len(x)]), [x]
+        self.times, self.states = [times[: len(x)]], [x]
         self.values = [self._energies(x)]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
-        now = self.times[-1]
+        now = self.now
         bar.update(now)
         if message:
             text = f"SciPy's {self.method.scheme} stopped after t = {now:g}: {message}"
@@ -196,22 +198,28 @@ class Run:
         """What there is so far."""
         x = np.concatenate(self.states)
         energy, entropy = np.concatenate(self.values).T
-        same = [self.table.h if self.table.full else self.table.last] * (len(x) - 1)
         return presented(
             self.system,
             self.method,
             x,
-            t=np.array(self.times),
+            t=np.concatenate(self.times),
             energy=energy,
             entropy=entropy,
-            steps=np.array((self.longest or same)[: len(x) - 1]),
+            steps=self._longest(len(x) - 1),
             again=Again(self.engine),
-            status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.times[-1]),
+            status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.now),
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),
             event_time=self.event_time,
             dense=self.dense,
         )
+
+    def _longest(self, number: int) -> np.ndarray:
+        """Of the steps after each state that is kept."""
+        if not self.taken:
+            return np.full(number, self.table.h if self.table.full else self.table.last)
+        h, kept = np.concatenate(self.taken, axis=1)
+        return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, kept[:-1])))[:number]
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.paced import Guide
 from ..engines.pacing import CAUGHT
-from ..engines.stepping import TELLING, State
+from ..engines.stepping import State
 from ..errors import InputError
 from .adaptive import UNDERFLOW, Adaptive, pacing_of
 from .events import Event, located
@@ -25,6 +25,9 @@ from .timetable import Timetable
 
 TOGETHER = 64
 """Attempts between looks at an adaptive run."""
+
+TOLD = ("x", "energy", "entropy", "step", "t", "taken")
+"""What is read of each attempt."""
 
 MOST_KEPT = 2**28
 """Numbers that an adaptive run keeps at most (2 GiB)."""
@@ -42,6 +45,35 @@ class Outcome:
     limit: str = ""  # what an adaptive run has used up, "steps" or "memory"
 
 
+class Steps(NamedTuple):
+    """Steps one after another.
+
+    Attributes
+    ----------
+    t : array, shape (m + 1,)
+        When they begin, and when the last ends.
+    h : array, shape (m,)
+    x : array, shape (m, n)
+        The states after them, with ``energy`` and ``entropy``, shape (m,).
+    number : array, shape (m,)
+        How many steps the run has with each.
+    before, after : State
+        Of the engine, before the first and after the last.
+    """
+
+    t: np.ndarray
+    h: np.ndarray
+    x: np.ndarray
+    energy: np.ndarray
+    entropy: np.ndarray
+    number: np.ndarray
+    before: State
+    after: State
+
+
+Keep = Callable[[Steps], None]
+
+
 def run(
     engine: Chosen,
     state: State,
@@ -49,9 +81,9 @@ def run(
     step: float | Adaptive,
     stops: np.ndarray,
     event: Event | None,
-    keep: Callable,
+    keep: Keep,
     most_kept: float = MOST_KEPT,
-    whole: bool = True,
+    singly: bool = True,
 ) -> Outcome:
     """Step from the start of the span to its end, an event, a failure or Ctrl-C.
 
@@ -61,17 +93,17 @@ def run(
         As the engine's ``begin`` gives it.
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
-    keep : function of (t, end, h, state before, state after)
-        Told of every step taken, between the times t and its end.
+    keep : function of Steps
+        Told of every step taken.
     most_kept : float
         Adaptive steps after which there is no room for more.
-    whole : bool
-        Whether the states that keep is told of need their stages; after most adaptive steps they have none otherwise.
+    singly : bool
+        Whether it is told of each step by itself; of many adaptive ones together otherwise.
     """
     outcome, stops = Outcome(state), stops[stops > span[0]]
     try:
         if isinstance(step, Adaptive):
-            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept, 1 if whole else TOGETHER)
+            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept, 1 if singly else TOGETHER)
         else:
             _fixed(engine, outcome, span, step, stops, event, keep)
     except KeyboardInterrupt:
@@ -99,15 +131,14 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
         if int(outcome.state.step) >= most_kept:
             outcome.limit = "memory"
             return
-        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(outcome.state.step)))))
+        before = outcome.state
+        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
         outcome.rejected = int(told("rejected"))
-        last: Any = State(*(paces.read(name)[0] for name in State._fields))
-        last = last._replace(status=np.int64(0))
-        for i in np.flatnonzero(np.diff(rows["step"], prepend=int(outcome.state.step))):  # those that count
-            before, whole = outcome.state, rows["step"][i] == last.step
-            outcome.state = last if whole else before._replace(**{name: rows[name][i] for name in TELLING})
-            keep(t, float(rows["t"][i]), float(rows["taken"][i]), before, outcome.state)
-            t = float(rows["t"][i])
+        after: Any = State(*(paces.read(name)[0] for name in State._fields))
+        outcome.state = after._replace(status=np.int64(0))
+        if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
+            x, energy, entropy, number, ends, h = (rows[name][taken] for name in TOLD)
+            keep(Steps(np.append(t, ends), h, x, energy, entropy, number, before, outcome.state))
     if code == Code.STEP_LIMIT:
         outcome.limit = "steps"
     elif code == Code.STEP_UNDERFLOW:
@@ -131,8 +162,13 @@ def _fixed(engine, outcome: Outcome, span, step: float, stops, event, keep) -> N
             if event and event.happens(value, after):
                 _happened(engine, outcome, event, keep, t, h, shortest)
                 return
-            keep(t, reached, h, state, new)
+            keep(_single(t, reached, h, state, new))
             t, outcome.state, value = reached, new, after
+
+
+def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:
+    x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in TOLD[:4])
+    return Steps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)
 
 
 def _happened(engine, outcome: Outcome, event: Event, keep, t: float, h: float, shortest: float) -> None:
@@ -154,7 +190,7 @@ def _happened(engine, outcome: Outcome, event: Event, keep, t: float, h: float, 
     share = float(located(value, *ends)[0])
     if share * h > shortest:
         outcome.state = whole if share == 1.0 else engine.step(state, share * h)
-        keep(t, t + share * h, share * h, state, outcome.state)
+        keep(_single(t, t + share * h, share * h, state, outcome.state))
     outcome.event_time = t + share * h
 
 

@@ -15,7 +15,7 @@ from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import DrivenSystem, System, driven
 from .adaptive import Adaptive
-from .stepwise import Outcome, run
+from .stepwise import Outcome, Steps, run
 
 
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
@@ -143,9 +143,9 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
     taken: list[float] = []
     iterations = [0]
 
-    def keep(t, reached, h, before, after):
-        taken.append(h)
-        iterations.append(int(after.fixed_point) + int(after.newton))
+    def keep(steps: Steps):
+        taken.append(float(steps.h[0]))
+        iterations.append(int(steps.after.fixed_point) + int(steps.after.newton))
         if len(taken) == 30:
             raise _EnoughError
 

@@ -56,6 +56,10 @@ class Timetable:
         """The time after so many steps."""
         return self.end if step >= self.steps else self.start + step * self.h
 
+    def reached(self, steps: np.ndarray) -> np.ndarray:
+        """The times after so many steps."""
+        return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
+
     @property
     def counts(self) -> np.ndarray:
         """Steps after which states are kept, 0 (the start) and the last among them."""
@@ -65,7 +69,7 @@ class Timetable:
     @property
     def times(self) -> np.ndarray:
         """The times at :attr:`counts`."""
-        return np.array([self.time(int(n)) for n in self.counts])
+        return self.reached(self.counts)
 
     def calls(self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES) -> Iterator[tuple[float, int, int]]:
         """The run in calls ``(h, saves, every)`` of an engine: so many saves, each after so many steps of size h.

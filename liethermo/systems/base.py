@@ -15,6 +15,7 @@ import scipy.sparse
 
 import manifolds as mf
 from manifolds._arrays import real_array
+from manifolds._module import Module
 
 from ..dissipation.base import Dissipation, Law
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
@@ -30,7 +31,7 @@ SCALES = (1.0, 1e-4, 1e4)
 """Of the random points at which the system is asked which functions it conserves."""
 
 
-class System(eqx.Module):
+class System(Module):
     """A metriplectic system on R^n or on a manifold [BFM §2.3]; see the subclasses for how to build one.
 
     On a manifold states, covectors and velocities are the arrays of the space, flat and real

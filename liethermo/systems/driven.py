@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 
 from ..dissipation.base import Carried, Several
 from ..errors import InputError
@@ -221,7 +222,7 @@ class _OnBody(Carried):
         return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, 2)))
 
 
-class _Clock(eqx.Module):
+class _Clock(Module):
     """From a state with clock and work to x and t."""
 
     dim: int = eqx.field(static=True)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Dissipation
@@ -111,7 +112,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         return self.evaluated(lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
 
 
-class _LegendreAtTime(eqx.Module):
+class _LegendreAtTime(Module):
     """The Hamiltonian of a Lagrangian ``l(xi, t)``, a function of mu and t."""
 
     lagrangian: Energy

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 from manifolds.matrices.linear import inverse
 
 from ..errors import InputError
@@ -192,7 +192,7 @@ def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
     return Quadratic(shift.T @ raised - rest, -c @ raised - b.at[moving].set(0.0), 0.5 * c @ inverted @ c - L.c)
 
 
-class _InverseMetric(eqx.Module):
+class _InverseMetric(Module):
     metric: Callable
 
     def __call__(self, q):

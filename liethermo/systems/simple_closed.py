@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
@@ -248,7 +248,7 @@ class _WithLedger(mf.PoissonStructure):
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-class _Joined(eqx.Module):
+class _Joined(Module):
     """L(q, v, S) as a function of one array."""
 
     function: Callable
@@ -258,7 +258,7 @@ class _Joined(eqx.Module):
         return self.function(x[:n], x[n : 2 * n], x[2 * n])
 
 
-class _Steady(eqx.Module):
+class _Steady(Module):
     """A function of (q, v, S) as one of (q, v, S, t)."""
 
     function: Callable
@@ -268,7 +268,7 @@ class _Steady(eqx.Module):
         return self.function(q, v, S)
 
 
-class _Constant(eqx.Module):
+class _Constant(Module):
     value: jax.Array
 
     def __call__(self, q, v, S, t):
@@ -276,7 +276,7 @@ class _Constant(eqx.Module):
         return self.value
 
 
-class _Linear(eqx.Module):
+class _Linear(Module):
     """``-R v``."""
 
     R: jax.Array

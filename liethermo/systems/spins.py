@@ -12,6 +12,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import real_array
+from manifolds._module import Module
 
 from ..dissipation.base import Dissipation
 from ..dissipation.landau_lifshitz import LandauLifshitz
@@ -134,7 +135,7 @@ class SpinSystem(System):
         return found
 
 
-class HeatBaths(eqx.Module):
+class HeatBaths(Module):
     """Baths, each with an energy that is a function of its own entropy y: by default ``U = c T exp(y / c)``.
 
     That is a constant heat capacity c, and the temperature T at y = 0.
@@ -176,7 +177,7 @@ def _warmth(y, capacity, temperature):
     return capacity * temperature * jnp.exp(y[0] / capacity)
 
 
-class _OfEntropy(eqx.Module):
+class _OfEntropy(Module):
     energy: Callable
 
     def __call__(self, y):
@@ -192,7 +193,7 @@ def _of_spins(term: Energy, lattice: tuple[int, ...]) -> Energy:
     return term
 
 
-class _OfSpins(eqx.Module):
+class _OfSpins(Module):
     """A function of spins on their sites, as one of states."""
 
     function: Callable

@@ -20,6 +20,9 @@ KEPT = 64
 BYTES = 2**28
 """Largest size of the arrays that they were found for, together."""
 
+COMPARED = 2**20
+"""Largest size of arrays that are compared by content: comparing larger ones takes longer than a call should."""
+
 
 class Latest(Generic[Found]):
     """Results by their keys, those last used.
@@ -65,11 +68,17 @@ class Latest(Generic[Found]):
 
 
 def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
-    """Decorator: call a function of pytrees once for the same objects; they are told apart by identity.
+    """Decorator: call a function of pytrees once for the same objects, or for others of the same content.
 
     Objects with leaves that could change in place, as NumPy arrays can, or that are being traced, are not remembered.
     """
     known: Latest[tuple[tuple, Found]] = Latest(KEPT, BYTES)
+    alike: Latest[Found] = Latest(KEPT, BYTES)
+
+    def by_content(arguments: tuple, size: int) -> Found:
+        content = fingerprint(arguments) if size <= COMPARED else None
+        make = functools.partial(function, *arguments)
+        return make() if content is None else alike.find(content, make, size)
 
     @functools.wraps(function)
     def call(*arguments) -> Found:
@@ -81,7 +90,7 @@ def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
             return function(*arguments)
         size = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
         # the arguments are held on to, so that no other object takes their identity
-        return known.find(identities, lambda: (arguments, function(*arguments)), size)[1]
+        return known.find(identities, lambda: (arguments, by_content(arguments, size)), size)[1]
 
     return call
 
@@ -91,7 +100,9 @@ def fingerprint(tree: Any) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(tree)
     try:
         parts = tuple(
-            (leaf.shape, np.asarray(leaf).tobytes()) if isinstance(leaf, jax.Array | np.ndarray | np.generic) else leaf
+            (leaf.shape, leaf.dtype, np.asarray(leaf).tobytes())
+            if isinstance(leaf, jax.Array | np.ndarray | np.generic)
+            else (type(leaf), leaf)
             for leaf in leaves
         )
         hash(key := (structure, parts))

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from manifolds._module import Module
+
 from ..errors import FunctionError
 from .keys import key
 from .lifting import Lifting
@@ -71,7 +73,7 @@ class _Label:
         return 0
 
 
-class Traced(eqx.Module):
+class Traced(Module):
     """A function of arrays, traced once, as a pytree of the numbers that it was written with.
 
     Attributes

@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._module import Module
 
-class BlockDiagonal(eqx.Module):
+
+class BlockDiagonal(Module):
     """The linear map of a block diagonal matrix, some of whose blocks are repeated.
 
     Attributes
@@ -34,7 +36,7 @@ class BlockDiagonal(eqx.Module):
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 
-class Diagonal(eqx.Module):
+class Diagonal(Module):
     """The linear map of a diagonal matrix, shape (n,) of its entries, or () for a multiple of the identity."""
 
     entries: jax.Array

@@ -12,11 +12,11 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._module import Module
 from ..matrices.linear import inverse
 from ..spaces import Power, Product
 from .retraction import Chart
@@ -39,7 +39,7 @@ class Place(NamedTuple):
     lower: Callable
 
 
-class Coordinates(eqx.Module):
+class Coordinates(Module):
     """Coordinates c of the points ``chart.point(z, sum_a c_a E_a)`` around z, E the orthonormal frame of z.
 
     Made by :func:`coordinates_around`.

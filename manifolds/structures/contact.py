@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import real_components
+from .._module import Module
 from ..errors import ParameterError, ShapeError
 from ..matrices.linear import determinant, inverse, solve
 from .poisson import PoissonStructure
 
 
-class ContactStructure(eqx.Module):
+class ContactStructure(Module):
     """A contact structure; subclasses give :meth:`form`, and whatever they know in closed form.
 
     Attributes

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import real_components
+from .._module import Module
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ParameterError, ShapeError
 
 
-class PoissonStructure(eqx.Module):
+class PoissonStructure(Module):
     """A Poisson structure on R^n; subclasses give :meth:`tensor`, and :meth:`sharp` where it is cheaper.
 
     Attributes

@@ -12,6 +12,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ...tracing.remembered import remembered
+
 
 @dataclass(frozen=True)
 class Form:
@@ -30,13 +32,14 @@ class Form:
     shapes: tuple[tuple[int, ...], ...]
     rebuild: Callable[[list], Any] = field(compare=False)
 
-    @classmethod
-    def of(cls, system: eqx.Module) -> Form:
+    @staticmethod
+    @remembered
+    def of(system: eqx.Module) -> Form:
         """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
         dynamic, static = eqx.partition(system, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         functions, outline = jax.tree_util.tree_flatten(static)
-        return cls(
+        return Form(
             (outline, tuple(functions)),
             tuple(np.shape(leaf) for leaf in leaves),
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),

@@ -66,12 +66,12 @@ class CompiledEngine:
         return self._run(state, h, 1, 1, noise)[0]
 
     def _run(self, state: State, h, saves: int, every: int, noise) -> tuple[State, np.ndarray]:
-        blocks = self._stepper.blocks({name: np.asarray(getattr(state, name))[None] for name in FIELDS})
+        blocks = self._stepper.block_of(state)
         out = self._stepper.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
         return self._state(blocks), out
 
     def _state(self, blocks: np.ndarray) -> State:
-        return State(*(value[0] for value in self._stepper.fields(blocks).values()))
+        return self._stepper.state_in(blocks)
 
 
 class Spec(NamedTuple):
@@ -169,6 +169,8 @@ class Stepper:
         shapes |= {name: self._shapes.get(name, ()) for name in working}
         # Newton's method is handed these in the block; without it they stay in registers
         self._layout = Layout(shapes, working if method.explicit else ())
+        rows, sizes = self._layout.rows, self._layout.sizes
+        self._places = [(rows[name], rows[name] + sizes[name], self.shape(name)) for name in FIELDS]
 
     names: tuple[str, ...] = FIELDS
     """The fields of a trajectory."""
@@ -223,12 +225,6 @@ class Stepper:
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields of :class:`.stepping.State`, trajectories first."""
-        if len(fields["x"]) == self.lanes == 1 and not self._varies.any():  # nothing to rearrange
-            whole = np.zeros((1, self._layout.height))
-            for name, values in fields.items():
-                first = self._layout.rows[name]
-                whole[0, first : first + self._layout.sizes[name]] = np.ravel(values[0])
-            return whole
         number, rows = len(fields["x"]), self._layout.rows
         whole = np.zeros((number, self._layout.height))
         for name, values in fields.items():
@@ -236,6 +232,18 @@ class Stepper:
         if self._varies.any() and "p" not in fields:
             whole[:, rows["p"] : rows["p"] + self._layout.sizes["p"]] = parameters[:, self._varies]
         return self.of_rows(whole)
+
+    def block_of(self, state: State) -> np.ndarray:
+        """The only block of a trajectory by itself."""
+        whole = np.zeros((1, self._layout.height))
+        for (first, end, shape), value in zip(self._places, state, strict=True):
+            whole[0, first:end] = np.reshape(value, -1) if shape else value
+        return whole
+
+    def state_in(self, blocks: np.ndarray) -> State:
+        """The state in the only block of a trajectory by itself."""
+        row = blocks[0]
+        return State(*(row[first:end].reshape(shape) if shape else row[first] for first, end, shape in self._places))
 
     def of_rows(self, whole: np.ndarray) -> np.ndarray:
         """Blocks of trajectories from all their rows, shape (trajectories, rows)."""

@@ -16,13 +16,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...systems import SimpleClosedSystem
 
 
-class FiniteDifference(eqx.Module):
+class FiniteDifference(Module):
     """The finite difference map of the alpha family, in the form of its q-, v- and S-representatives [GBY 3.5, §5.1].
 
         phi(q_0, q_1, S_0, S_1) = ((1 - alpha) q_0 + alpha q_1, V; (1 - beta) S_0 + beta S_1, s)
@@ -106,7 +107,7 @@ class Pair(NamedTuple):
     s: jax.Array
 
 
-class DiscreteSystem(eqx.Module):
+class DiscreteSystem(Module):
     """A discrete thermodynamical system [GBY 3.2]: ``L_d``, ``F_d``, ``P_d`` of one step.
 
     Attributes

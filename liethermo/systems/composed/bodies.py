@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import Module
+
 from ...dissipation.checks import semidefinite
 from ...errors import InputError
 from ...functions.checks import check_scalar, recognised
@@ -18,7 +20,7 @@ from ...functions.energy import Energy, Quadratic, as_energy
 from ...tracing.traced import converted
 
 
-class Subsystem(eqx.Module):
+class Subsystem(Module):
     """One body of a composed system: its energy in its own state (q, p, S), and its friction.
 
     Parameters
@@ -61,7 +63,7 @@ class Subsystem(eqx.Module):
         return self.energy.on(np.arange(start, start + self.dim))
 
 
-class Copies(eqx.Module):
+class Copies(Module):
     """Many bodies of one kind in a composed system: ``H_a(q_a, p_a, S_a)`` is one function with parameters of its own.
 
     What it costs to trace and to compile does not grow with their number, so there can be 1e5 of them.

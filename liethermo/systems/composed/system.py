@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 import manifolds as mf
+from manifolds._module import Module
 from manifolds.structures.contact import Places
 
 from ...dissipation.base import Dissipation
@@ -262,7 +263,7 @@ def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     return (TimeDependent(joined) if needed == 3 else Function(joined)).on(np.concatenate([q, S]))
 
 
-class _Apart(eqx.Module):
+class _Apart(Module):
     """V(q, S), or V(q, S, t), as a function of one array, and of t."""
 
     V: Callable

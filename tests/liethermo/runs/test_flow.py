@@ -310,3 +310,17 @@ def test_the_derivative_at_an_equilibrium(method):
     exact = scipy.linalg.expm(h * np.asarray(jax.jacfwd(system.vector_field)(x)))
     assert np.abs(found - exact).max() <= 0.02 * h ** (method.order + 1)
     assert np.abs(exact - np.eye(3)).max() > 0.01
+
+
+def test_a_system_has_the_parameters_of_the_object_whose_method_is_its_energy():
+    """So one program serves many of them, and their derivatives are known."""
+
+    def end(factor):
+        system = lt.LiePoissonSystem(mf.so(3), energy=lt.Quadratic(jnp.diag(factor / jnp.array([3.0, 2.0, 1.0]))).value)
+        return lt.flow(system, jnp.array([0.3, 0.5, 0.2]), (0.0, 0.3), 0.1)
+
+    found = jax.jacfwd(end)(jnp.ones(3))
+    h = 1e-6
+    columns = [(end(jnp.ones(3) + h * e) - end(jnp.ones(3) - h * e)) / (2 * h) for e in np.eye(3)]
+    assert np.abs(found - np.stack(columns, axis=1)).max() < 1e-9
+    assert np.abs(found).max() > 1e-3

@@ -24,9 +24,18 @@ def counted():
 
 def test_the_same_objects_are_found_again():
     function, calls = counted()
-    first, second = lt.models.rigid_body(), lt.models.rigid_body()
+    first, second = lt.models.rigid_body(), lt.models.rigid_body(rate=2.0)
     assert [function(first), function(second), function(first), function(first, second)] == [1, 2, 1, 3]
     assert len(calls) == 3
+
+
+def test_others_of_the_same_content_are_found_too():
+    """A method that is written out in each call costs what one that is kept does."""
+    function, calls = counted()
+    assert [function(lt.models.rigid_body(), lt.MetriplecticTaylor(n)) for n in (6, 6, 8, 6)] == [1, 1, 2, 1]
+    one = (jnp.zeros(2), jnp.zeros(2, dtype=int), jnp.zeros((1, 2)), 1, 1.0, True)
+    assert [function(a) for a in one] == [3, 4, 5, 6, 7, 8], "types and shapes are content"
+    assert len(calls) == 8
 
 
 def test_no_object_takes_the_place_of_another():
