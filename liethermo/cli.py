@@ -302,7 +302,7 @@ def _draw_study(store: Path, measure: str | None, file: Path) -> None:
     """Draw a measure of a store into a file, and tell of it; where none can be drawn, why."""
     os.environ.setdefault("MPLBACKEND", "agg")
     from .errors import InputError
-    from .results.study_plot import study as draw
+    from .results.plot import study as draw
     from .studies.stored import load_study
 
     try:

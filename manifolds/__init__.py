@@ -32,18 +32,17 @@ from .errors import (
 )
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
 from .groups.matrix_group import MatrixGroup, registered_groups
-from .retractions.coordinates import Coordinates, Place, coordinates_around
-from .retractions.retraction import (
+from .retractions.charts import (
     CayleyRetraction,
-    Chart,
     EuclideanRetraction,
     GroupRetraction,
     MidpointRetraction,
     ProjectionRetraction,
-    Retraction,
     RiemannianRetraction,
     retraction,
 )
+from .retractions.coordinates import Coordinates, Place, coordinates_around
+from .retractions.retraction import Chart, Retraction
 from .spaces import (
     SPD,
     Euclidean,

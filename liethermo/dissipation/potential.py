@@ -14,7 +14,7 @@ from manifolds._module import Module
 from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
-from ..functions.energy import needed_arguments
+from ..functions.arguments import needed_arguments
 from .base import Dissipation
 from .checks import zero_state
 from .factor import Factor

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
+
 from ..errors import InputError
-from .energy import is_traced
 
 
 class Condition(NamedTuple):

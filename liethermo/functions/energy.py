@@ -7,7 +7,6 @@ midpoint is one already; a general term gets a correction of its own, along its 
 
 from __future__ import annotations
 
-import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -18,19 +17,17 @@ import numpy as np
 import scipy.sparse
 
 import manifolds as mf
-from manifolds._arrays import real_array
+from manifolds._arrays import is_traced, real_array
 from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
-from ..tracing.interpret import at_points
+from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
+from .coordinates import check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
 
 LARGEST_CLIQUE = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
-
-COORDINATE_TOLERANCE = 1e-10
-"""How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
 
 class Energy(Module):
@@ -230,31 +227,16 @@ class TimeDependent(Energy):
         return True
 
     def at_time(self, t) -> Energy:
-        return Function(_AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
+        return Function(AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
 
     def with_time(self) -> Energy:
-        return WithTime(Function(_Joined(self.function)))
+        return WithTime(Function(Joined(self.function)))
 
     def value(self, x) -> jax.Array:
         raise InputError("this energy depends on time, so its value is known at a time only: energy(x, t)")
 
     def __neg__(self) -> Energy:
-        return TimeDependent(_Minus(self.function))
-
-
-class _AtTime(Module):
-    function: Callable
-    time: jax.Array
-
-    def __call__(self, x):
-        return self.function(x, self.time)
-
-
-class _Joined(Module):
-    function: Callable
-
-    def __call__(self, z):
-        return self.function(z[:-1], z[-1])
+        return TimeDependent(Minus(self.function))
 
 
 class WithTime(Energy):
@@ -305,13 +287,6 @@ def _squares(gradients) -> jax.Array:
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
 
 
-class _Minus(Module):
-    function: Callable
-
-    def __call__(self, x, t):
-        return -jnp.asarray(self.function(x, t))
-
-
 class Pullback(Energy):
     """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
 
@@ -360,7 +335,7 @@ class Pullback(Energy):
         return cliques([np.array(self.indices) % dim], dim)
 
     def check_places(self, dim: int, role: str) -> None:
-        _check_coordinates(self, dim, role)
+        check_coordinates(self, dim, role)
 
     @property
     def depends_on_time(self) -> bool:
@@ -370,19 +345,10 @@ class Pullback(Energy):
         return eqx.tree_at(lambda e: e.term, self, self.term.at_time(t)) if self.depends_on_time else self
 
     def with_time(self) -> Energy:
-        return Pullback(self.term.with_time(), _BesideTime(self.of))
+        return Pullback(self.term.with_time(), BesideTime(self.of))
 
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.indices if self.function is None else self.function)
-
-
-class _BesideTime(Module):
-    """Coordinates of a state, and the time behind it."""
-
-    coordinates: Callable
-
-    def __call__(self, z):
-        return jnp.append(self.coordinates(z[:-1]), z[-1])
 
 
 class Negative(Energy):
@@ -467,52 +433,6 @@ def as_energy(function, role: str) -> Energy:
     if callable(function):
         return TimeDependent(function) if needed_arguments(function) == 2 else Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
-
-
-def needed_arguments(function: Callable) -> int | None:
-    """How many arguments a function needs by position; None where it does not tell."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return None
-    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)
-
-
-def is_traced(tree) -> bool:
-    """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
-
-
-def _check_coordinates(term: Pullback, dim: int, role: str) -> None:
-    if term.function is None:
-        outside = [i for i in term.indices if not -dim <= i < dim]
-        if outside:  # JAX would read the last component instead
-            raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
-        return
-    if is_traced(term):
-        return
-    try:
-        start, end, step = at_points(_chord, term, np.random.default_rng(0).standard_normal((1, 2 * dim)))
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
-    if start.ndim != 2:
-        raise FunctionError(
-            f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"
-        )
-    size = max(1.0, float(np.abs(start).max() + np.abs(end).max()))
-    defect = float(np.abs(end - start - step).max())
-    if not defect <= COORDINATE_TOLERANCE * size:
-        raise InputError(
-            f"the coordinates of a term of {role} are not a quadratic function of the state: they miss "
-            f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * size:.1g}), which would "
-            "cost the exactness of the energy. Let the term take, say, the square of a distance and root it itself"
-        )
-
-
-def _chord(term: Pullback, ends):
-    """The coordinates of two random states, and their difference as a quadratic map would have it."""
-    x, d = jnp.split(ends, 2)
-    return term.of(x), term.of(x + d), jax.jvp(term.of, (x + 0.5 * d,), (d,))[1]
 
 
 class InChart(Energy):

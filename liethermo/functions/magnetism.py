@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from manifolds._arrays import real_array
+from manifolds._arrays import is_traced, real_array
 from manifolds.structures.spins import cross
 
 from ..errors import InputError
 from .each import Each
 from .edges import edges
-from .energy import Energy, Sum, is_traced
+from .energy import Energy, Sum
 from .indices import cliques
 
 

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 
 from ..tracing.interpret import at_points
 from .each import Each
-from .energy import Energy, Function, Pullback, Quadratic, is_traced
+from .energy import Energy, Function, Pullback, Quadratic
 
 
 class Kinetic(Energy):

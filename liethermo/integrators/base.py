@@ -51,6 +51,8 @@ class OneStepMethod(Module):
     systems: ClassVar[str] = EVERY_SYSTEM
     fixed: ClassVar[str] = "it does not estimate the error of its steps"
 
+    # -- every method gives -------------------------------------------------------------------------------------------
+
     @property
     @abstractmethod
     def stages(self) -> int: ...
@@ -63,47 +65,30 @@ class OneStepMethod(Module):
     @abstractmethod
     def preserves(self) -> frozenset[str]: ...
 
+    @abstractmethod
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
+
+    @abstractmethod
+    def increment(self, h, k) -> jax.Array:
+        """``x' - x``, shape (n,), from the solved slopes."""
+
+    # -- it may say more of its step ----------------------------------------------------------------------------------
+
     @property
     def explicit(self) -> bool:
         """Whether the slopes do not depend on k, so that there is nothing to iterate: see :meth:`missed`."""
         return False
-
-    @property
-    def evaluations(self) -> int:
-        """Of the vector field, in one iteration."""
-        return self.stages
-
-    @property
-    def increments(self) -> int:
-        """Random numbers that a step is driven by: none of a method for equations without noise."""
-        return 0
-
-    def driven_by(self, dW) -> OneStepMethod:
-        """The method for one step, with its :attr:`increments`, shape (increments,)."""
-        del dW
-        return self
-
-    @abstractmethod
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
 
     def missed(self, system: System, x, low, h, k) -> jax.Array:
         """Of an explicit method, what the slopes miss of what they are to do, of the size of a slope."""
         del system, x, low, h
         return jnp.zeros_like(jnp.max(k))
 
-    def change(self, system: System, x, low, h, k, d) -> jax.Array:
-        """The derivative of ``slopes - k`` by k in the direction d, shape (stages, n), for Newton's method."""
-        return jax.jvp(lambda k: self.slopes(system, x, low, h, k) - k, (k,), (d,))[1]
-
-    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
-        """The matrix of :meth:`change`, shape (stages * n, stages * n)."""
-        columns = jax.vmap(lambda d: self.change(system, x, low, h, k, d.reshape(k.shape)).ravel())(jnp.eye(k.size))
-        return columns.T
-
-    @abstractmethod
-    def increment(self, h, k) -> jax.Array:
-        """``x' - x``, shape (n,), from the solved slopes."""
+    @property
+    def evaluations(self) -> int:
+        """Of the vector field, in one iteration."""
+        return self.stages
 
     def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
         """The state at the end of the step as x' + low', the increment added with its rounding error caught."""
@@ -117,22 +102,32 @@ class OneStepMethod(Module):
         """Those w for which ``h sum_i w_i k_i`` displaces the state by a share theta of a step, shape (..., stages)."""
         return integrated(self.stages, theta)
 
-    def on(self, system: System) -> OneStepMethod:
-        """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold."""
-        return self
+    def start(self, system: System, x) -> jax.Array:
+        """Slopes to begin the iteration of a first step with."""
+        return jnp.tile(system.vector_field(x), (self.stages, 1))
+
+    def predict(self, k, before) -> jax.Array:
+        """Slopes to begin the next step with, extrapolated from those of the last two steps."""
+        return 2.0 * k - before
+
+    def error(self, system: System, x, low, h, k) -> jax.Array:
+        """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
+        raise InputError(f"{self} has no error estimate: {self.fixed}")
+
+    def judged(self, system: System, x) -> tuple[System, jax.Array]:
+        """The part of the system, and of the state, that the estimate of the error is about."""
+        return system, x
 
     def velocities(self, system: System, x, low, h, k) -> jax.Array:
         """The gradients of the energy that the step uses at its stages, shape (stages, n)."""
         raise InputError(f"{self} does not say which velocities it moves with, so attitudes cannot be reconstructed")
 
-    def suited(self, tolerance: float | None) -> OneStepMethod:
-        """The method for adaptive steps of a relative tolerance, or None for steps of given sizes: itself, mostly."""
-        del tolerance
-        return self
+    def explain(self, system: System, x, k, h) -> str:
+        """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
+        del system, x, k, h
+        return ""
 
-    def pulled(self, local) -> OneStepMethod:
-        """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
-        return self
+    # -- and of what it runs on ---------------------------------------------------------------------------------------
 
     def check(self, system: System) -> None:
         """Raise InputError where the method cannot be used on a system; called when a run starts."""
@@ -148,26 +143,39 @@ class OneStepMethod(Module):
             return casimir and quadratic and by_force
         return casimir and "casimirs" in self.preserves
 
-    def explain(self, system: System, x, k, h) -> str:
-        """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
-        del system, x, k, h
-        return ""
+    def suited(self, tolerance: float | None) -> OneStepMethod:
+        """The method for adaptive steps of a relative tolerance, or None for steps of given sizes: itself, mostly."""
+        del tolerance
+        return self
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
-        """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
-        raise InputError(f"{self} has no error estimate: {self.fixed}")
+    def on(self, system: System) -> OneStepMethod:
+        """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold."""
+        return self
 
-    def judged(self, system: System, x) -> tuple[System, jax.Array]:
-        """The part of the system, and of the state, that the estimate of the error is about."""
-        return system, x
+    def pulled(self, local) -> OneStepMethod:
+        """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
+        return self
 
-    def start(self, system: System, x) -> jax.Array:
-        """Slopes to begin the iteration of a first step with."""
-        return jnp.tile(system.vector_field(x), (self.stages, 1))
+    @property
+    def increments(self) -> int:
+        """Random numbers that a step is driven by: none of a method for equations without noise."""
+        return 0
 
-    def predict(self, k, before) -> jax.Array:
-        """Slopes to begin the next step with, extrapolated from those of the last two steps."""
-        return 2.0 * k - before
+    def driven_by(self, dW) -> OneStepMethod:
+        """The method for one step, with its :attr:`increments`, shape (increments,)."""
+        del dW
+        return self
+
+    # -- what follows -------------------------------------------------------------------------------------------------
+
+    def change(self, system: System, x, low, h, k, d) -> jax.Array:
+        """The derivative of ``slopes - k`` by k in the direction d, shape (stages, n), for Newton's method."""
+        return jax.jvp(lambda k: self.slopes(system, x, low, h, k) - k, (k,), (d,))[1]
+
+    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+        """The matrix of :meth:`change`, shape (stages * n, stages * n)."""
+        columns = jax.vmap(lambda d: self.change(system, x, low, h, k, d.reshape(k.shape)).ravel())(jnp.eye(k.size))
+        return columns.T
 
     def __str__(self) -> str:
         return type(self).__name__

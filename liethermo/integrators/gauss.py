@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 
 from ..dissipation.base import Dissipation, portions
 from ..errors import InputError
-from ..functions.energy import Energy, is_traced
+from ..functions.energy import Energy
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
 from ..systems import ChartSystem, System

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from manifolds._arrays import is_traced
+
 from ..errors import InputError
-from ..functions.energy import is_traced
 from ..systems import ComposedSystem, Copies
 from .parameters import positive, whole
 from .thermo_particles import warmth

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds.errors import warn
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
 from ..errors import InputError
 from ..functions.conditions import require
-from ..functions.energy import Quadratic, is_traced
+from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
 
 PUBLISHED = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))

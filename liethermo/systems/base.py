@@ -3,35 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 
-import manifolds as mf
-from manifolds._arrays import real_array
-from manifolds._module import Module
+from manifolds._arrays import is_traced, real_array
 
-from ..dissipation.base import Dissipation, Law
+from ..dissipation.base import Dissipation
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, as_energy, is_traced
+from ..functions.energy import Energy, as_energy
 from ..functions.on_spaces import on_points, on_sites
-from ..functions.spheres import Spheres
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
+from .kinds import Kind
 
 SCALES = (1.0, 1e-4, 1e4)
 """Of the random points at which the system is asked which functions it conserves."""
 
 
-class System(Module):
+class System(Kind):
     """A metriplectic system on R^n or on a manifold [BFM §2.3]; see the subclasses for how to build one.
 
     On a manifold states, covectors and velocities are the arrays of the space, flat and real
@@ -54,28 +50,6 @@ class System(Module):
     space : manifolds.Space or None
         The state space, where it is not R^n.
     """
-
-    poisson: mf.PoissonStructure
-    energy: Energy
-    entropy: Energy | None
-    dissipation: Dissipation | None
-    momentum_maps: dict[str, Energy]
-    dim: int = eqx.field(static=True)
-    space: mf.Space | None = eqx.field(static=True)
-
-    production_name: ClassVar[str] = "dS/dt"
-    domain: ClassVar[str] = ""
-    """What a state of the system has to have beyond finite components, in words."""
-
-    @property
-    def sites(self) -> tuple[int, ...]:
-        """The sites of a system of many equal ones, whose states are shown as arrays of shape ``(*sites, d)``."""
-        return ()
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
-        return (*self.sites, self.dim // math.prod(self.sites))
 
     def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
@@ -122,49 +96,7 @@ class System(Module):
 
         return settled(dissipation, force, (self.dim,), is_leaf=lambda part: isinstance(part, Energy))
 
-    @property
-    def kind(self) -> str:
-        """What it is, for messages."""
-        return type(self).__name__
-
-    @property
-    def unrollable(self) -> bool:
-        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
-        return self.space is None or (self.space.smooth and self.space.dtype.kind != "c")
-
-    @property
-    def smooth(self) -> bool:
-        """Whether the vector field can be differentiated twice and more."""
-        return self.space is None or self.space.smooth
-
-    def sparsity(self) -> scipy.sparse.csr_array | None:
-        """Which components of the field depend on which of the state, discrete gradients included; None if not known.
-
-        A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
-        """
-        return None
-
-    def weights(self, x) -> jax.Array:
-        """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
-
-        Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
-        """
-        return jnp.ones_like(x)
-
-    def sizes(self, k) -> jax.Array:
-        """The size that components of slopes, shape (..., n), are measured by, for differences: the largest for all."""
-        size = jnp.max(jnp.abs(k))
-        return jnp.full_like(k, jnp.where(size > 0.0, size, 1.0))
-
     # -- dynamics -------------------------------------------------------------------------------------------------
-
-    def field(self, x, dH, dS, dL=()) -> jax.Array:
-        """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
-
-        This is the one definition of the dynamics; integrators differ in the gradients they hand it.
-        """
-        motion = self.poisson.sharp(x, dH)
-        return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
     def vector_field(self, x, t=None) -> jax.Array:
         """``x'`` at a state or a batch of states, shape (..., n); at a time, where the energy depends on one."""
@@ -219,38 +151,7 @@ class System(Module):
         at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result}")
         return at(x, jnp.asarray(t, dtype=jnp.float64))
 
-    # -- the manifold ---------------------------------------------------------------------------------------------
-
-    def points(self, x) -> jax.Array:
-        """State vectors, shape (..., n), as they are shown: of shape ``(*sites, d)``, or as points of the space."""
-        if self.space is not None:
-            return self.space.from_vector(x)
-        x = jnp.asarray(x)
-        return x.reshape(*x.shape[:-1], *self.shape) if self.sites else x
-
-    def raised(self, x, alpha) -> jax.Array:
-        """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
-        if self.space is None:
-            return alpha
-        return self.space.to_vector(self.space._sharp(self.points(x), self.points(alpha).conj()))
-
-    def lowered(self, x, v) -> jax.Array:
-        """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
-        if self.space is None:
-            return v
-        return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
-
-    def tangent(self, x, w) -> jax.Array:
-        """The tangent vector nearest to an array, shape (n,); itself on R^n."""
-        if self.space is None:
-            return w
-        return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
-
-    def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
-        """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
-        if self.space is None:
-            return scale * np.random.default_rng(seed).standard_normal((count, self.dim))
-        return np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+    # -- other forms of the same system -------------------------------------------------------------------------------
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
         """This system near a state in as many coordinates as it has dimensions, and those of the state.
@@ -271,36 +172,16 @@ class System(Module):
         shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
         return dataclasses.replace(found, **shown)
 
-    def seen(self, x) -> jax.Array:
-        """The part of a state that is the user's, as points: what the functions of an event are functions of."""
-        return self.points(x)
-
-    def pulled(self, energy: Energy) -> Energy:
-        """A function of the states that the user sees, as one of the states here."""
-        return energy
-
     def here(self, x) -> System:
         """The same system, for use at one state: what its Pi and K have in common there is computed once."""
         return self
+
+    # -- functions and laws -------------------------------------------------------------------------------------------
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
         """The functions that the dissipation, or one of its summands, is told to preserve besides the energy."""
         return () if self.dissipation is None else self.dissipation.preserve
-
-    def casimirs(self) -> dict[str, Energy]:
-        """Casimirs of the Poisson structure that are known, by name."""
-        return {}
-
-    @property
-    def has_all_casimirs(self) -> bool:
-        """Whether every Casimir is known to be a function of :meth:`casimirs`."""
-        return False
-
-    @property
-    def spheres(self) -> Spheres | None:
-        """Which vectors of the state have constant lengths, too many for a function each; None where none are known."""
-        return None
 
     def functions(self) -> dict[str, Energy]:
         """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name."""
@@ -325,18 +206,6 @@ class System(Module):
             kept = [False] * len(others) if is_traced(self) else self.conserves(tuple(others.values()))
         return frozenset(claimed | {name for name, constant in zip(others, kept, strict=True) if constant})
 
-    @property
-    def energy_law(self) -> Law | None:
-        """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
-        return "conserved" if self.dissipation is None else self.dissipation.energy_law
-
-    @property
-    def entropy_law(self) -> Law | None:
-        """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
-        if self.entropy is None:
-            return None
-        return "conserved" if self.dissipation is None else self.dissipation.entropy_law
-
     def invariants(self) -> dict[str, tuple[Energy, bool]]:
         """Functions worth recording along a run, by name, each with whether the system conserves it."""
         kept = self.first_integrals()
@@ -357,16 +226,6 @@ class System(Module):
             each = (np.abs(rates) <= AXIOM_TOLERANCE * sizes).all(axis=1)
             together = np.abs(rates.sum(axis=1)) <= AXIOM_TOLERANCE * np.abs(rates).max(axis=1)
         return [bool(use.any() and kept[use].all()) for use, kept in zip(inside.T, (each | together).T, strict=True)]
-
-    @property
-    def ledger(self) -> dict[str, Energy]:
-        """What the system receives from outside, recorded along a run, by name."""
-        return {}
-
-    @property
-    def balance(self) -> tuple[str, ...]:
-        """Which entries of the ledger a solution has in its energy, and its laws are stated without."""
-        return ()
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -427,16 +286,6 @@ class System(Module):
             ``.passed``, ``.rows`` (axiom, residual, tolerance, passed, note).
         """
         return check_system(self, points, samples, seed, scale, times)
-
-    def outside(self, x) -> str:
-        """Why a state lies outside the domain of the system, in words; empty where it does not."""
-        del x
-        return ""
-
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
-        del x
-        return {}
 
     def _validate(self) -> None:
         """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
@@ -17,7 +18,7 @@ from ..dissipation.base import Dissipation
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
 from ..functions.checks import check_scalar
-from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy, is_traced
+from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy
 from .lie_poisson import LiePoissonSystem
 
 NEWTON_STEPS = 50

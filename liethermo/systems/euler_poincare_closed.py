@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
 from ..functions.checks import check_scalar, check_shape, recognised
-from ..functions.energy import Energy, as_energy, is_traced
+from ..functions.energy import Energy, as_energy
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .base import System

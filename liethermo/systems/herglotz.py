@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import inverse
 
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, Quadratic, as_energy, is_traced
+from ..functions.energy import Energy, Quadratic, as_energy
 from ..functions.mechanics import Kinetic, is_free_of_momenta, is_mechanical
 from ..tracing.interpret import at_points
 from ..tracing.programs import program

@@ -16,9 +16,10 @@ from manifolds.matrices.linear import solve
 from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
+from ..functions.arguments import needed_arguments
 from ..functions.checks import check_shape
 from ..functions.conditions import require
-from ..functions.energy import Energy, Quadratic, needed_arguments
+from ..functions.energy import Energy, Quadratic
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities

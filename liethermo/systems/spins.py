@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import real_array
+from manifolds._arrays import is_traced, real_array
 from manifolds._module import Module
 
 from ..dissipation.base import Dissipation
@@ -19,7 +19,7 @@ from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.each import Each
-from ..functions.energy import Energy, Function, Negative, Sum, TimeDependent, as_energy, is_traced
+from ..functions.energy import Energy, Function, Negative, Sum, TimeDependent, as_energy
 from ..functions.magnetism import checked_sites, spins_of
 from ..functions.spheres import Spheres, Squares
 from ..functions.spins_and_baths import SpinsAndBaths

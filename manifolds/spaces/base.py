@@ -1,22 +1,20 @@
-"""What a state space is: points, tangent vectors, a metric and its geodesics."""
+"""A state space as its users see it: points, tangent vectors, a metric and its geodesics, all of them checked."""
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import as_numeric, at, first, is_traced
-from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError, SpaceError
+from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
+from .maps import Maps
 
-__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "makes", "register", "registered_spaces", "safe_sqrt"]
+__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "makes", "register", "registered_spaces"]
 
 CUT_MARGIN = 1e-8
 """A logarithm is taken up to this relative distance from the cut locus; beyond, its direction is decided by noise."""
@@ -40,7 +38,7 @@ def registered_spaces() -> Iterator[Space]:
         yield constructor(*arguments)
 
 
-class Space(ABC):
+class Space(Maps):
     """A Riemannian manifold in an ambient space of arrays; leading axes of all arguments are batches, and broadcast.
 
     A point is an array of the given shape, a tangent vector at it an array of the same shape, with the components of
@@ -68,27 +66,6 @@ class Space(ABC):
     dtype : numpy.dtype
         Of a point: float64 or complex128.
     """
-
-    metric: str = "induced"
-    bi_invariant: bool = False
-    """Whether the space is a group whose exponential is the Riemannian one."""
-    exp_of_group: bool = False
-    """Whether the space is a group and :meth:`exp` the exponential of it, as with a bi-invariant metric."""
-    smooth: bool = True
-    """Whether its maps have derivatives of every order, not of the first alone."""
-    dtype: np.dtype = np.dtype(np.float64)
-
-    @property
-    @abstractmethod
-    def name(self) -> str: ...
-
-    @property
-    @abstractmethod
-    def dim(self) -> int: ...
-
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, ...]: ...
 
     # -- points ---------------------------------------------------------------------------------------------------
 
@@ -142,11 +119,6 @@ class Space(ABC):
         size : tuple of int
         """
         return self._compiled("_random", random_key(key_or_seed), static=(tuple(size),))
-
-    @property
-    def size(self) -> int:
-        """Number of real components of a point."""
-        return math.prod(self.shape) * (2 if self.dtype.kind == "c" else 1)
 
     def to_vector(self, x) -> jax.Array:
         """Points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary ones."""
@@ -271,14 +243,6 @@ class Space(ABC):
         """
         return self._compiled("_transport", *self._checked_vectors(x, v=v, u=u))
 
-    def injectivity_radius(self, x=None) -> float:
-        """Radius of the ball of tangent vectors at x that ``exp`` maps one to one, with ``log`` its inverse.
-
-        The same at every point of a native space, which is then not needed.
-        """
-        del x
-        return math.inf
-
     def reach(self, x, v) -> jax.Array:
         """Length of v over the injectivity radius, shape (...): below 1, ``log`` recovers v from ``exp(x, v)``.
 
@@ -286,132 +250,6 @@ class Space(ABC):
         the factors.
         """
         return self._compiled("_reach", *self._checked_vectors(x, v=v))
-
-    # -- what a subclass gives ------------------------------------------------------------------------------------
-
-    @abstractmethod
-    def _project(self, x):
-        """A point of the space, x itself where it is one; NaN where there is none."""
-
-    def _residual(self, x):
-        y = self._project(x)
-        return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
-
-    def _random(self, key, size):
-        return self._project(self.from_vector(jax.random.normal(key, (*size, self.size))))
-
-    def _tangents(self, x):
-        """A basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size): of what _project lets by.
-
-        By Gram and Schmidt's process, the longest rest first.
-        """
-        push = jax.linearize(self._project, x)[1]
-        axes = self.from_vector(jnp.eye(self.size))
-        rest = jax.vmap(lambda axis: self.to_vector(push(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(axes)
-        basis: list[jax.Array] = []
-        for _ in range(self.dim):
-            best = jnp.argmax((rest**2).sum(axis=-1), axis=-1)[..., None] == jnp.arange(self.size)
-            e = jnp.where(best[..., None], rest, 0.0).sum(axis=-2)
-            e = e / jnp.sqrt((e**2).sum(axis=-1, keepdims=True))
-            rest = rest - (rest * e[..., None, :]).sum(axis=-1, keepdims=True) * e[..., None, :]
-            basis.append(e)
-        return jnp.stack(basis, axis=-2)
-
-    def _project_tangent(self, x, w):
-        basis, flat = self._tangents(x), self.to_vector(w)
-        weights = (basis * flat[..., None, :]).sum(axis=-1, keepdims=True)
-        return self.from_vector((weights * basis).sum(axis=-2))
-
-    def _frame(self, x):
-        frame: list[jax.Array] = []
-        for v in jnp.moveaxis(self.from_vector(self._tangents(x)), -1 - len(self.shape), 0):
-            for e in frame:
-                v = v - self._scale(self._inner(x, e, v), e)
-            frame.append(self._scale(1.0 / jnp.sqrt(self._inner(x, v, v)), v))
-        return jnp.stack(frame, axis=-1 - len(self.shape))
-
-    def _inner(self, x, u, v):
-        return self._pair(u.conj(), v + jnp.zeros_like(x))
-
-    def _flat(self, x, v):
-        x, v = jnp.broadcast_arrays(x, v)
-        return jax.grad(lambda w: self._inner(x, v, w).sum())(jnp.zeros_like(v))
-
-    @property
-    def geodesics(self) -> bool:
-        """Whether the space knows its geodesics: has :meth:`exp`, :meth:`log`, :meth:`transport` and what follows."""
-        return type(self)._exp is not Space._exp
-
-    def _exp(self, x, v):
-        raise SpaceError(
-            f"{self.name} does not say what its geodesics are: give _exp, _log and _transport, or go by a chart that "
-            "needs none, such as manifolds.ProjectionRetraction(space)"
-        )
-
-    def _log(self, x, y):
-        """NaN where it is not defined."""
-        return self._exp(x, y)  # raises
-
-    def _transport(self, x, v, u):
-        return self._exp(x, v)  # raises
-
-    def _coordinates(self, x, v):
-        return self._pair(self._frame(x), self._over_frame(self._flat(x, v)))
-
-    def _from_coordinates(self, x, c):
-        weights = c.reshape(*c.shape, *(1,) * len(self.shape))
-        return (weights * self._frame(x)).sum(axis=-1 - len(self.shape))
-
-    def _sharp(self, x, alpha):
-        return self._from_coordinates(x, self._pair(self._frame(x), self._over_frame(alpha)))
-
-    def _norm(self, x, v):
-        return safe_sqrt(self._inner(x, v, v))
-
-    # These two are made of compiled maps, as a logarithm can be long to compile.
-
-    def _distance(self, x, y):
-        return self._compiled("_norm", x, self._compiled("_log", x, y))
-
-    def _midpoint(self, x, y):
-        return self._compiled("_exp", x, 0.5 * self._compiled("_log", x, y))
-
-    def _reach(self, x, v):
-        return self._norm(x, v) / self.injectivity_radius()
-
-    # What retractions other than the Riemannian one are made of, where a space has it.
-
-    def _straight_reach(self, x, v):
-        """Length of v over that up to which ``x + v`` is sure to stay in a space that is an open set of arrays."""
-        raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
-
-    def _group_exp(self, x, v):
-        """``x exp(x^-1 v)``."""
-        raise SpaceError(f"{self.name} is not a group: it has no group exponential and no Cayley map")
-
-    def _group_log(self, x, y):
-        """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
-        return self._group_exp(x, y)  # raises
-
-    def _left_carry(self, x, y, u):
-        """``y x^-1 u``."""
-        return self._group_exp(x, u)  # raises
-
-    def _cayley(self, x, v):
-        """``x cayley(x^-1 v)``."""
-        return self._group_exp(x, v)  # raises
-
-    def _inverse_cayley(self, x, y):
-        return self._group_exp(x, y)  # raises
-
-    def _why_no_log(self, x, y) -> str:
-        """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
-        if not self.geodesics:
-            return "the chart around x does not reach y; go by a point between them"
-        return (
-            "y is at the cut locus of x or beyond it (injectivity radius "
-            f"{self.injectivity_radius():.6g}), where no one geodesic is the shortest; go by a point between them"
-        )
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -487,26 +325,6 @@ class Space(ABC):
 
     # -- helpers --------------------------------------------------------------------------------------------------
 
-    @property
-    def _axes(self) -> tuple[int, ...]:
-        """The axes of one point."""
-        return tuple(range(-len(self.shape), 0))
-
-    def _pair(self, alpha, v):
-        """``Re sum(alpha * v)`` over the axes of one point."""
-        return (alpha * v).sum(axis=self._axes).real
-
-    def _scale(self, factor, v):
-        """Vectors times numbers, one for each point."""
-        return factor.reshape(*factor.shape, *(1,) * len(self.shape)) * v
-
-    def _over_frame(self, v):
-        """``v`` with an axis of length 1 for the vectors of a frame."""
-        return jnp.expand_dims(v, -1 - len(self.shape))
-
-    def _compiled(self, kernel: str, *arrays, static: tuple = ()):
-        return run(self, kernel, static, *arrays)
-
     def __repr__(self) -> str:
         return f"<{self.name}: dim {self.dim}, points of shape {self.shape}, {self.metric} metric>"
 
@@ -529,17 +347,6 @@ def makes(operation: str) -> Callable[[type[Space]], type[Space]]:
         return space
 
     return entered
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def run(space: Space, kernel: str, static: tuple, *arrays) -> Any:
-    return getattr(space, kernel)(*arrays, *static)
-
-
-def safe_sqrt(z):
-    """``sqrt(max(z, 0))``, with the derivative 0 where z <= 0."""
-    positive = z > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
 
 
 def random_key(key_or_seed):

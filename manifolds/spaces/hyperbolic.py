@@ -10,7 +10,8 @@ import numpy as np
 
 from .._sizes import checked_size
 from ..matrices.stumpff import hyperbolic_arc, hyperbolic_stumpff
-from .base import Space, register, safe_sqrt
+from .base import Space, register
+from .maps import safe_sqrt
 
 
 @register((2,))

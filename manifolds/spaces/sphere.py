@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from .._sizes import checked_size
 from ..matrices.linear import complement
 from ..matrices.stumpff import arc, stumpff
-from .base import CUT_MARGIN, Space, register, safe_sqrt
+from .base import CUT_MARGIN, Space, register
+from .maps import safe_sqrt
 
 
 @register((1,), (2,), (3,))

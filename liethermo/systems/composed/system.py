@@ -12,15 +12,17 @@ import numpy as np
 import scipy.sparse
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.structures.contact import Places
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
 from ...errors import InputError
+from ...functions.arguments import needed_arguments
 from ...functions.checks import check_scalar
 from ...functions.edges import Edges, edges, parts
-from ...functions.energy import Energy, Function, TimeDependent, is_traced, needed_arguments
+from ...functions.energy import Energy, Function, TimeDependent
 from ...functions.indices import as_pattern, pattern, union
 from ...functions.mechanics import is_free_of, is_mechanical
 from ..base import System

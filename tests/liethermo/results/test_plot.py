@@ -16,7 +16,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.results.plot import BLUE, GREEN, GREY, RED, _LevelSurface, _quadric_through, _sphere
+from liethermo.results.plot.figures import BLUE, GREEN, GREY, RED
+from liethermo.results.plot.surfaces import _LevelSurface, _quadric_through, _sphere
 
 SIZE_OF_A_PICTURE = 5_000  # bytes; an empty one is smaller
 
@@ -232,7 +233,7 @@ def test_a_solid_hides_what_is_behind_it():
 
 
 def test_long_trajectories_are_thinned_but_keep_their_ends(body, relaxed, monkeypatch):
-    monkeypatch.setattr(lt.plot, "MOST_SEGMENTS", 50)
+    monkeypatch.setattr("liethermo.results.plot.surfaces.MOST_SEGMENTS", 50)
     segments = path_in_space(lt.plot.momentum_sphere(relaxed, body))
     assert len(segments) == 50
     assert any((segment[0] == relaxed.x[0]).all() for segment in segments)

@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from ..errors import FileError, InputError
+from ...errors import FileError, InputError
 
 SUFFIXES = (".pdf", ".png", ".svg")
 DPI = 150

@@ -13,7 +13,7 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from ..errors import InputError
+from ...errors import InputError
 from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, finished, writable
 
 if TYPE_CHECKING:

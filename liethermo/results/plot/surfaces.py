@@ -1,4 +1,4 @@
-"""Pictures of a run: its path on the energy surface, and its laws along time."""
+"""The path of a run on its energy surface and its Casimir surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from contourpy import contour_generator
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -19,15 +18,10 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
-from ..errors import InputError
-from ..systems import System
-from .audit import EPS, LAW_FAILS, Audit
-from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, finished, writable
-from .solution import Solution
-from .sphere_plot import sphere_field
-from .study_plot import study
-
-__all__ = ["laws", "momentum_sphere", "sphere_field", "study"]
+from ...errors import InputError
+from ...systems import System
+from ..solution import Solution
+from .figures import BLUE, DPI, GREY, ORANGE, finished, writable
 
 MOST_SEGMENTS = 20_000
 """A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""
@@ -35,9 +29,6 @@ MOST_SEGMENTS = 20_000
 TIME_MAP = plt.get_cmap("viridis")
 
 Function = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
-
-
-# -- the path on the energy surface -------------------------------------------------------------------------------
 
 
 def momentum_sphere(
@@ -340,107 +331,3 @@ def _look_at(state: np.ndarray, ax: Axes3D) -> None:
     ax.view_init(elev=22.0, azim=azimuth)
     if _viewpoint(ax) @ state < 0.0:
         ax.view_init(elev=-22.0, azim=azimuth)
-
-
-# -- the laws along time ------------------------------------------------------------------------------------------
-
-
-def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
-    """Energy error, entropy and entropy production along a run, with the verdict of the audit above them.
-
-    The production is the difference quotient of the saved entropies, on a logarithmic axis. Increments below the
-    rounding of the entropy itself (the tolerance of the audit) are marked at that level in grey, falls beyond it in red
-    at their size. A solution without entropy has the first panel only.
-
-    Parameters
-    ----------
-    solution : Solution
-    path : path, optional
-        Write the figure to this .pdf, .png or .svg file, and close it.
-
-    Raises
-    ------
-    InputError
-        If the suffix of ``path`` is another.
-    FileError
-        If the file cannot be written.
-    """
-    path = writable(path)
-    panels, audit = 1 if solution.entropy is None else 3, solution.audit()
-    figure, axes = plt.subplots(
-        panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
-    )
-    _draw_energy(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
-    if solution.entropy is not None:
-        _draw_entropy(axes[1, 0], solution.t, solution.entropy)
-        _draw_production(axes[2, 0], solution.t, solution.entropy, _rounding(audit))
-    for ax in axes[:, 0]:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.margins(x=0.0)
-    axes[-1, 0].set_xlabel("time")
-    figure.align_ylabels()
-    figure.suptitle(_verdict(audit), color="black" if audit.passed else RED, fontsize="medium")
-    return finished(figure, path)
-
-
-def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, less: str) -> None:
-    first = float(H[0])
-    error = (H - first) / (abs(first) or 1.0)
-    largest = float(np.abs(error).max())
-    ax.axhline(0.0, color=GREY, linewidth=0.8)
-    if largest < 20 * EPS:  # beside one unit of rounding
-        ax.axhspan(-EPS, EPS, color="0.93", linewidth=0)
-        ax.set_ylim(-1.4 * max(largest, EPS), 1.4 * max(largest, EPS))
-    ax.plot(t, error, color=BLUE, linewidth=0.8)
-    ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
-    ax.set_ylabel(rf"$(H{less} - H_0)\,/\,|H_0|$" if first else f"$H{less} - H_0$")
-
-
-def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
-    ax.plot(t, S, color=BLUE, linewidth=1.5)
-    ax.set_ylabel("entropy $S$")
-    change = float(np.ptp(S))
-    if change <= 1e-9 * float(np.abs(S).max()):  # constant: do not magnify its rounding
-        width = 0.01 * abs(float(S[0])) or 1.0
-        ax.set_ylim(S[0] - width, S[0] + width)
-    tail = S[t >= t[-1] - 0.1 * (t[-1] - t[0])]
-    if len(tail) > 2 and float(np.ptp(tail)) <= 1e-4 * change:
-        ax.axhline(S[-1], color=GREY, linewidth=0.8, linestyle="--", zorder=1)
-        across = ax.get_yaxis_transform()  # x in units of the axes, y of the data
-        style: dict[str, Any] = {"ha": "right", "va": "top", "color": "0.3", "fontsize": "small"}
-        ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), across, "offset points", **style)
-
-
-def _rounding(audit: Audit) -> float:
-    """Fall of the entropy in one step that the audit allows."""
-    return next((-row.tolerance for row in audit.rows if row.law == "least entropy increment" and row.tolerance), 0.0)
-
-
-def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) -> None:
-    dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
-    rounding = rounding or 4 * EPS * float(np.abs(S).max())
-    risen, fallen = dS > rounding, dS < -rounding
-    still = ~(risen | fallen)
-    ax.set_yscale("log")
-    ax.plot(t, np.where(risen, dS / dt, np.nan), color=GREEN, linewidth=1.5, marker="." if len(t) < 50 else "")
-    if still.any():
-        level = rounding / float(dt.max())
-        ax.plot(t[still], np.full(still.sum(), level), ".", color=GREY, markersize=2, label="at or below rounding")
-        if still.all():
-            ax.set_ylim(level / 10, level * 10)
-    if fallen.any():
-        ax.plot(t[fallen], -dS[fallen] / dt[fallen], "v", color=RED, markersize=4, label="falling: $-dS/dt$")
-    if still.any() or fallen.any():
-        ax.legend(frameon=False, fontsize="small", markerscale=2)
-    ax.set_ylabel("production $dS/dt$")
-
-
-def _verdict(audit: Audit) -> str:
-    failing = [row for row in audit.rows if row.passed is False]
-    if failing:
-        law = audit.verdict == LAW_FAILS
-        return ("A law fails: " if law else f"{audit.verdict.capitalize()}: ") + "; ".join(
-            f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in failing
-        )
-    shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
-    return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in shown)

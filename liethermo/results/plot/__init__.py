@@ -1,0 +1,8 @@
+"""Pictures of runs and of studies: ``lt.plot``."""
+
+from .along_time import laws
+from .fields import sphere_field
+from .studies import study
+from .surfaces import momentum_sphere
+
+__all__ = ["laws", "momentum_sphere", "sphere_field", "study"]

@@ -1,0 +1,184 @@
+"""What the author of a kind of system says of it: all that the library does not find out by itself."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+import manifolds as mf
+from manifolds._module import Module
+
+from ..dissipation.base import Dissipation, Law
+from ..functions.energy import Energy
+from ..functions.spheres import Spheres
+
+
+class Kind(Module):
+    """A kind of system: its data, and answers that a subclass may replace; :class:`System` has what follows from them.
+
+    The attributes are those of :class:`System`.
+    """
+
+    poisson: mf.PoissonStructure
+    energy: Energy
+    entropy: Energy | None
+    dissipation: Dissipation | None
+    momentum_maps: dict[str, Energy]
+    dim: int = eqx.field(static=True)
+    space: mf.Space | None = eqx.field(static=True)
+    production_name: ClassVar[str] = "dS/dt"
+    domain: ClassVar[str] = ""
+    """What a state of the system has to have beyond finite components, in words."""
+
+    @property
+    def kind(self) -> str:
+        """What it is, for messages."""
+        return type(self).__name__
+
+    @property
+    def sites(self) -> tuple[int, ...]:
+        """The sites of a system of many equal ones, whose states are shown as arrays of shape ``(*sites, d)``."""
+        return ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
+        return (*self.sites, self.dim // math.prod(self.sites))
+
+    # -- dynamics -----------------------------------------------------------------------------------------------------
+
+    def field(self, x, dH, dS, dL=()) -> jax.Array:
+        """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
+
+        This is the one definition of the dynamics; integrators differ in the gradients they hand it.
+        """
+        motion = self.poisson.sharp(x, dH)
+        return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
+
+    def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
+        """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
+        if self.space is None:
+            return scale * np.random.default_rng(seed).standard_normal((count, self.dim))
+        return np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+
+    def outside(self, x) -> str:
+        """Why a state lies outside the domain of the system, in words; empty where it does not."""
+        del x
+        return ""
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
+        del x
+        return {}
+
+    # -- laws ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def energy_law(self) -> Law | None:
+        """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
+        return "conserved" if self.dissipation is None else self.dissipation.energy_law
+
+    @property
+    def entropy_law(self) -> Law | None:
+        """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
+        if self.entropy is None:
+            return None
+        return "conserved" if self.dissipation is None else self.dissipation.entropy_law
+
+    def casimirs(self) -> dict[str, Energy]:
+        """Casimirs of the Poisson structure that are known, by name."""
+        return {}
+
+    @property
+    def has_all_casimirs(self) -> bool:
+        """Whether every Casimir is known to be a function of :meth:`casimirs`."""
+        return False
+
+    @property
+    def spheres(self) -> Spheres | None:
+        """Which vectors of the state have constant lengths, too many for a function each; None where none are known."""
+        return None
+
+    @property
+    def ledger(self) -> dict[str, Energy]:
+        """What the system receives from outside, recorded along a run, by name."""
+        return {}
+
+    @property
+    def balance(self) -> tuple[str, ...]:
+        """Which entries of the ledger a solution has in its energy, and its laws are stated without."""
+        return ()
+
+    # -- states as users see them -------------------------------------------------------------------------------------
+
+    def points(self, x) -> jax.Array:
+        """State vectors, shape (..., n), as they are shown: of shape ``(*sites, d)``, or as points of the space."""
+        if self.space is not None:
+            return self.space.from_vector(x)
+        x = jnp.asarray(x)
+        return x.reshape(*x.shape[:-1], *self.shape) if self.sites else x
+
+    def seen(self, x) -> jax.Array:
+        """The part of a state that is the user's, as points: what the functions of an event are functions of."""
+        return self.points(x)
+
+    def pulled(self, energy: Energy) -> Energy:
+        """A function of the states that the user sees, as one of the states here."""
+        return energy
+
+    # -- the metric of the space --------------------------------------------------------------------------------------
+
+    def raised(self, x, alpha) -> jax.Array:
+        """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
+        if self.space is None:
+            return alpha
+        return self.space.to_vector(self.space._sharp(self.points(x), self.points(alpha).conj()))
+
+    def lowered(self, x, v) -> jax.Array:
+        """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
+        if self.space is None:
+            return v
+        return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
+
+    def tangent(self, x, w) -> jax.Array:
+        """The tangent vector nearest to an array, shape (n,); itself on R^n."""
+        if self.space is None:
+            return w
+        return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
+
+    # -- for the engines ----------------------------------------------------------------------------------------------
+
+    @property
+    def unrollable(self) -> bool:
+        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
+        return self.space is None or (self.space.smooth and self.space.dtype.kind != "c")
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the vector field can be differentiated twice and more."""
+        return self.space is None or self.space.smooth
+
+    def sparsity(self) -> scipy.sparse.csr_array | None:
+        """Which components of the field depend on which of the state, discrete gradients included; None if not known.
+
+        A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
+        """
+        return None
+
+    def weights(self, x) -> jax.Array:
+        """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
+
+        Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
+        """
+        return jnp.ones_like(x)
+
+    def sizes(self, k) -> jax.Array:
+        """The size that components of slopes, shape (..., n), are measured by, for differences: the largest for all."""
+        size = jnp.max(jnp.abs(k))
+        return jnp.full_like(k, jnp.where(size > 0.0, size, 1.0))

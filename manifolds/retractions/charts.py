@@ -1,0 +1,259 @@
+"""The charts of spaces that retractions are made of, and retractions by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from ..errors import ParameterError, SpaceError
+from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup
+from ..matrices.linear import solve
+from ..spaces import GroupSpace
+from ..spaces.base import Space
+from .retraction import Chart, Retraction
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class RiemannianRetraction(Chart):
+    """``R_h(z, v) = (z, exp_z(h v))`` with the exponential map of the space, that of its metric [BFM §4.4].
+
+    On every space that has geodesics. The domain is the ball of the injectivity radius.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf
+
+    def _point(self, z, v):
+        return self.space._exp(z, v)
+
+    def _vector(self, z, x):
+        return self.space._log(z, x)
+
+    def _middle(self, x, y):
+        return self.space._midpoint(x, y)
+
+    def _carry(self, z, v, u):
+        return self.space._transport(z, v, u)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class EuclideanRetraction(Chart):
+    """``R_h(z, v) = (z, z + h v)``, on spaces that are open sets of arrays: Euclidean ones, SPD(n) and their products.
+
+    On SPD(n) the step is bounded to length 1 in the affine-invariant metric, where z + h v is positive definite for
+    sure.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf if self.space.exp_of_group else 1
+
+    def _point(self, z, v):
+        return z + v
+
+    def _vector(self, z, x):
+        return x - z
+
+    def _middle(self, x, y):
+        return 0.5 * (x + y)
+
+    def _carry(self, z, v, u):
+        return u + jnp.zeros_like(v)
+
+    def _reach(self, z, v):
+        return self.space._straight_reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return 0.5 * self.space._straight_reach(z, v)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class ProjectionRetraction(Chart):
+    """``R_h(z, v) = (z, project(z + h v))``, on every space, also on one that does not know its geodesics.
+
+    Its inverse is found by Newton's method in the frame of z. Of first order with any projection, of second with the
+    nearest point [Absil & Malick 2012].
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return 1
+
+    def _point(self, z, v):
+        return self.space._project(z + v)
+
+    def _vector(self, z, x):
+        space = self.space
+        z, x = jnp.broadcast_arrays(z, x)
+
+        def rest(c):
+            return self._point(z, space._from_coordinates(z, c)) - x
+
+        def newton(_, c):
+            missed, push = jax.linearize(rest, c)
+            axes = jnp.broadcast_to(jnp.eye(space.dim), (*c.shape, space.dim))
+            columns = jax.vmap(lambda axis: space._coordinates(z, push(axis)), in_axes=-1, out_axes=-1)(axes)
+            return c - solve(columns, space._coordinates(z, missed)[..., None])[..., 0]
+
+        c = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
+        missed = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
+        size = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
+        return jnp.where(missed <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
+
+
+_NEWTON_STEPS = 8
+
+
+class _GroupChart(Chart):
+    def _middle(self, x, y):
+        return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
+
+    def _carry(self, z, v, u):
+        return self.space._left_carry(z, self._point(z, v), u)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class GroupRetraction(_GroupChart):
+    """``R_h(z, v) = (z, z exp(h z^-1 v))`` with the exponential of the group, on groups and their products.
+
+    On SO(n) and SU(n) it is the Riemannian one, and on a GroupSpace that of the space. On SE(n) it follows screw
+    motions, to first order the same.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return math.inf if self.space.exp_of_group else 1
+
+    def _point(self, z, v):
+        return self.space._group_exp(z, v)
+
+    def _vector(self, z, x):
+        return self.space._group_log(z, x)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class CayleyRetraction(_GroupChart):
+    """``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups that Cayley's map stays in, and products.
+
+    Rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers all of the group
+    but the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
+    turn.
+    """
+
+    space: Space
+
+    @property
+    def order(self):
+        return 2 if self.space.exp_of_group else 1
+
+    def _point(self, z, v):
+        return self.space._cayley(z, v)
+
+    def _vector(self, z, x):
+        return self.space._inverse_cayley(z, x)
+
+    def _reach(self, z, v):
+        return 0.0 * self.space._reach(z, v)
+
+    def _midpoint_reach(self, z, v):
+        return math.pi / 4.0 * self.space._reach(z, v)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class MidpointRetraction(Retraction):
+    """``R_h(z, v) = (point(z, -h v/2), point(z, h v/2))``, with z in the middle of the step [BFM 4.8].
+
+    With the Riemannian chart this is the paper's ``exp~_h``, and z the midpoint of the geodesic from x to y.
+
+    Parameters
+    ----------
+    chart : Chart
+    """
+
+    chart: Chart
+    symmetric = True
+
+    def __post_init__(self):
+        if not isinstance(self.chart, Chart):
+            raise SpaceError(
+                f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
+            )
+
+    @property
+    def space(self) -> Space:  # type: ignore[override]
+        return self.chart.space
+
+    @property
+    def order(self):
+        return self.chart.order
+
+    def _ends(self, z, v):
+        return self.chart._point(z, -0.5 * v), self.chart._point(z, 0.5 * v)
+
+    def _base(self, x, y):
+        z = self.chart._middle(x, y)
+        return z, self.chart._vector(z, y) - self.chart._vector(z, x)
+
+    def _reach(self, z, v):
+        return self.chart._midpoint_reach(z, v)
+
+    def __repr__(self) -> str:
+        return f"MidpointRetraction({self.chart!r})"
+
+
+_BY_NAME: dict[str, Callable[[Space], Retraction]] = {
+    "midpoint": lambda space: MidpointRetraction(RiemannianRetraction(space)),
+    "exp": RiemannianRetraction,
+    "euclidean": EuclideanRetraction,
+    "group_exp": GroupRetraction,
+    "cayley": CayleyRetraction,
+    "projection": ProjectionRetraction,
+    "midpoint_euclidean": lambda space: MidpointRetraction(EuclideanRetraction(space)),
+    "midpoint_group_exp": lambda space: MidpointRetraction(GroupRetraction(space)),
+    "midpoint_cayley": lambda space: MidpointRetraction(CayleyRetraction(space)),
+}
+
+
+def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction:
+    """A retraction of a space by name.
+
+    Parameters
+    ----------
+    space : Space or MatrixGroup
+        A group stands for ``GroupSpace(group)``.
+    kind : str
+        ``"midpoint"`` is the paper's (4.8), with the Riemannian chart. ``"exp"``, ``"euclidean"``, ``"group_exp"``,
+        ``"cayley"`` and ``"projection"`` have their base point at the start of the step; ``"midpoint_euclidean"``,
+        ``"midpoint_group_exp"`` and ``"midpoint_cayley"`` have it in the middle.
+
+    Raises
+    ------
+    SpaceError
+        If the space does not have what it takes, such as a group structure or geodesics.
+    LieAlgebraError
+        If Cayley's map leaves the group.
+    ParameterError
+    """
+    space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
+    if kind not in _BY_NAME:
+        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(_BY_NAME)}")
+    return _BY_NAME[kind](space)
