@@ -46,21 +46,26 @@ class Iteration(NamedTuple):
     update: jax.Array
     best: jax.Array
     stalled: jax.Array  # iterations in a row that did not shrink the update
-    rate: jax.Array
+    previous: jax.Array  # update that the last one is compared with; over it, it is the rate of contraction
     made: jax.Array  # iterations so far
 
     @classmethod
     def begin(cls, k) -> Iteration:
-        infinite, zero, none = jnp.asarray(jnp.inf), jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
-        return cls(k, infinite, infinite, none, zero, none)
+        infinite, none = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
+        return cls(k, infinite, infinite, none, infinite, none)
 
     def after(self, k, rules: Rules) -> Iteration:
         update = rules.size(k.shape[-1])(k - self.k)
-        rate = jnp.where(self.made > 0, update / jnp.where(self.update > 0.0, self.update, 1.0), 0.0)
-        if k.shape[-1] > rules.large:
-            rate = jnp.where(self.made > 1, jnp.sqrt(rate * self.rate), rate)
+        previous = self.update
+        if k.shape[-1] > rules.large:  # the rate is a geometric mean
+            mean = jnp.sqrt(update) * jnp.sqrt(self.previous)
+            previous = jnp.where(self.made > 1, mean, previous)
         stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
-        return Iteration(k, update, jnp.fmin(update, self.best), stalled, rate, self.made + 1)
+        return Iteration(k, update, jnp.fmin(update, self.best), stalled, previous, self.made + 1)
+
+    def slower(self, rate: float) -> jax.Array:
+        """Whether updates shrink by less than a rate of contraction."""
+        return self.update > rate * self.previous
 
     def settled(self, scale, rules: Rules, misfit=jnp.inf, noise=0.0) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
@@ -72,7 +77,7 @@ class Iteration(NamedTuple):
 
     def stands(self, scale, rules: Rules, noise=0.0) -> tuple[jax.Array, jax.Array]:
         """How a fixed-point iteration stands: whether it has converged, and whether to go on."""
-        slow = (self.made >= 3) & (self.rate > rules.slow) & (self.best > rules.plateau * jnp.maximum(scale, noise))
+        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * jnp.maximum(scale, noise))
         finite = jnp.isfinite(self.update)
         hopeless = slow | ((self.made > 0) & ~finite)
         settled = self.settled(scale, rules, self.update, noise)
@@ -156,7 +161,7 @@ def solve_stages(
 
         def goes_on(carry):
             inner, found, used = carry
-            fresh = (used == 0) | ((used < rules.reuse) & (inner.rate < rules.stale))
+            fresh = (used == 0) | ((used < rules.reuse) & ~inner.slower(rules.stale))
             return fresh & unsolved(inner, found) & ~lost(inner, damped)
 
         s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))

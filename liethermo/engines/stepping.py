@@ -40,11 +40,12 @@ class State(NamedTuple):
     largest_energy_increment: jax.Array
     integral: jax.Array  # over time, of what relaxes: see relaxing()
     first_energy: jax.Array
+    steering: jax.Array  # what the end of the next step is to be shifted by: see steering()
     energy_sensitivity: jax.Array  # the largest over all steps: the size at which the function is rounded
     entropy_sensitivity: jax.Array
 
 
-TELLING = tuple(name for name in State._fields if name not in ("low", "k", "before"))
+TELLING = tuple(name for name in State._fields if name not in ("low", "k", "before", "steering"))
 """The fields that tell of a run: those that the next step alone needs are left out."""
 
 
@@ -74,6 +75,7 @@ def first_state(system: System, method: OneStepMethod, x) -> State:
         largest_energy_increment=jnp.asarray(-jnp.inf),
         integral=zero,
         first_energy=energy,
+        steering=zero,
         energy_sensitivity=sizes[0],
         entropy_sensitivity=sizes[1],
     )
@@ -113,7 +115,11 @@ def equations(
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved, rules: Rules = RULES) -> State:
     """The state after a step whose equations are solved, or as it was, with a status, where they are not."""
     x, low = state.x, state.low
-    new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k, state.first_energy)
+    new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k)
+    pending = state.steering
+    if holds_energy(system, method):  # by what the last step left: so no step waits for its own
+        new_low = shifted(system, new, new_low, pending)
+        pending = steering(system, new, new_low, energy, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
     size = jnp.maximum(rules.size(x.size)(x), h * solved.noise)
@@ -141,6 +147,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         largest_energy_increment=jnp.maximum(state.largest_energy_increment, energy - state.energy),
         integral=state.integral + h * mean,
         first_energy=state.first_energy,
+        steering=pending,
         energy_sensitivity=jnp.fmax(state.energy_sensitivity, sizes[0]),
         entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, sizes[1]),
     )
@@ -158,32 +165,39 @@ def _error(system, method, x, low, h, k):
     return method.error(system, x, low, h, k)
 
 
-def finish(system: System, method: OneStepMethod, x, low, h, k, first_energy):
+def finish(system: System, method: OneStepMethod, x, low, h, k):
     """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are.
 
     And the sizes at which energy and entropy are rounded there.
     """
     new, new_low = method.move(system, x, low, h, k)
     energy, entropy = values(system, new)
-    if system.energy_law == "conserved" and "energy" in method.preserves:
-        new_low = new_low + _steering(system, new, new_low, energy, first_energy)
     return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy, *sensitivities(system, new)
 
 
-def _steering(system: System, x, low, energy, first_energy):
-    """A shift of the state far below its rounding, at most ``eps |x| / 4``, along the gradient of the energy.
+def holds_energy(system: System, method: OneStepMethod) -> bool:
+    """Whether rounding is all that moves the energy, so that it can be steered back."""
+    return system.energy_law == "conserved" and "energy" in method.preserves
+
+
+def steering(system: System, x, low, energy, first_energy) -> jax.Array:
+    """How far along the gradient of the energy a state is to be shifted back: by ``eps |x| / 4`` at most.
 
     Each step is exact but for a few roundings, whose sum walks at random: by 1e-13 in 1e6 steps for a general energy.
-    Where it has come to more than a few roundings of H itself, it is taken back.
+    Where it has come to more than a few roundings of H itself, it is taken back, far below the rounding of the state.
     """
     gradient = system.energy.gradient(x)
     error = (energy - first_energy) + jnp.dot(gradient, low)
     size = system.energy.sensitivity(x)
     most = 0.25 * EPS * size
     amount = jnp.where(jnp.abs(error) > RULES.steered * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
-    direction = system.raised(x, gradient)
-    square = jnp.dot(gradient, direction)
-    return -direction * (jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0))
+    square = jnp.dot(gradient, system.raised(x, gradient))
+    return jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0)
+
+
+def shifted(system: System, x, low, amount) -> jax.Array:
+    """``low`` of a state that is shifted back along the gradient of the energy."""
+    return low - amount * system.raised(x, system.energy.gradient(x))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..engines import implicit
 from ..engines.stages import explicit, newton_steps, noise_of, scale_of, solve_stages
-from ..engines.stepping import finish
+from ..engines.stepping import finish, holds_energy, shifted, steering
 from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import DrivenSystem, System, driven
@@ -92,7 +92,11 @@ def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...]
         new = jnp.where(solved.converged, solved.k, jnp.nan)
     else:
         new = _stages(system, method, x, low, h, method.predict(k, before))
-    after, after_low, *_ = finish(system, method, x, low, h, new, system.energy.value(x))
+    after, after_low, energy, *_ = finish(system, method, x, low, h, new)
+    if holds_energy(system, method):
+        after_low = shifted(
+            system, after, after_low, steering(system, after, after_low, energy, system.energy.value(x))
+        )
     return after, after_low, new, k
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,38 @@ class Program:
             else:
                 degrees[target] = math.inf if any(found) else 0
         return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
+
+    def factored(self, varying: Sequence[int]) -> Program:
+        """The same, with products ``(v a) b`` written ``v (a b)`` where a and b do not depend on some of the inputs.
+
+        In a loop over those, ``a b`` is then computed once.
+
+        Parameters
+        ----------
+        varying : sequence of int
+            Places of those inputs.
+        """
+        depends: set[Scalar] = {name for i in varying for name in self.inputs[i]}
+        products: dict[Scalar, tuple[Scalar, Scalar]] = {}
+        factors: dict[tuple[Scalar, Scalar], str] = {}
+        instructions: list[Instruction] = []
+        for instruction in self.instructions:
+            changing = [a for a in instruction.args if a in depends]
+            if changing:
+                depends.add(instruction.target)
+            if instruction.op == "mul" and len(changing) == 1:
+                first, second = instruction.args
+                v, b = (first, second) if first in depends else (second, first)
+                if v in products:
+                    v, a = products[v]
+                    if (a, b) not in factors:
+                        factors[a, b] = f"{instruction.target}_factor"
+                        instructions.append(Instruction(factors[a, b], "mul", (a, b)))
+                    b = factors[a, b]
+                products[instruction.target] = v, b
+                instruction = instruction._replace(args=(v, b))
+            instructions.append(instruction)
+        return replace(self, instructions=tuple(instructions))
 
     def split(self, late: Sequence[int]) -> tuple[Program, Program]:
         """What can be computed without some of the inputs, and the rest.

@@ -158,7 +158,7 @@ class _Steps(Writer):
 
         with self.repeated(lambda: self.any(build.load(truth["active"]))):
             active = build.load(truth["active"])
-            self.run("iterate", active)
+            self.run("iterate", active if self.lanes > 1 else None)
             going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
             build.store(build.and_(active, going), truth["active"])
         if not self.explicit:

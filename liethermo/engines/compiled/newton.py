@@ -33,7 +33,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
 
     def fresh(k):
         one = jnp.ones(())
-        return k, one * jnp.inf, one * jnp.inf, 0 * one, 0 * one, 0 * one, one * rules.reuse, one, one, 0 * one
+        return k, one * jnp.inf, one * jnp.inf, 0 * one, one * jnp.inf, 0 * one, one * rules.reuse, one, one, 0 * one
 
     def begin(p, k, before):
         return fresh(both(p)[1].predict(k, before))
@@ -64,15 +64,15 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
     def halved(k, step, factor, length):
         return k + 0.5 * factor * step, 0.5 * factor, 0.5 * length
 
-    def judge(x, h, k, old, update, best, stalled, rate, made, used, factor, found, missed, noise, regular):
-        s = Iteration(old, update, best, stalled, rate, made).after(k, rules)
+    def judge(x, h, k, old, update, best, stalled, previous, made, used, factor, found, missed, noise, regular):
+        s = Iteration(old, update, best, stalled, previous, made).after(k, rules)
         scale = scale_of(x, h, k, rules)
         defined = jnp.isfinite(found + scale) & (regular > 0.0)
         plain, used = s.settled(scale, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
         converged = defined & (plain | s.settled(scale, rules, missed, noise))
         goes_on = defined & ~converged & (s.made < rules.newton)
         uncertain = defined & ~converged & (s.stalled >= 2) & (noise == 0.0)
-        renew = (used >= rules.reuse) | (s.rate >= rules.stale)
+        renew = (used >= rules.reuse) | s.slower(rules.stale)
         return (
             *s[1:],
             used,
@@ -90,7 +90,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
     def count(made, newtons, update, defined):
         return newtons + made, jnp.where(defined > 0.0, update, jnp.nan)
 
-    iteration = "guess update best stalled rate made"
+    iteration = "guess update best stalled previous made"
     start = (*iteration.split(), "used", "renew", "goes_on", "noise")
     judged = (*iteration.split()[1:], "used", "goes_on", "renew", "converged", "defined", "uncertain", "noise")
     # of a derivative, what is the same in every direction is computed once a Jacobian
@@ -107,7 +107,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
         "worse": piece(worse, "x h guess damped found sought factor length", ("worse",)),
         "halved": piece(halved, "guess direction factor length", ("guess", "factor", "length")),
         "judge": piece(
-            judge, "x h guess old update best stalled rate made used factor found missed noise regular", judged
+            judge, "x h guess old update best stalled previous made used factor found missed noise regular", judged
         ),
         "sound": piece(sound, "p x", ("noise",)),
         "settle": piece(settle, "missed noise goes_on", ("converged", "goes_on")),

@@ -31,7 +31,7 @@ from .machine_code import MachineCode
 from .newton import newton_pieces, solver
 
 FIELDS = State._fields
-ITERATION = ("guess", "update", "best", "stalled", "rate", "made")
+ITERATION = ("guess", "update", "best", "stalled", "previous", "made")
 
 
 class CompiledEngine:
@@ -124,7 +124,7 @@ class Stepper:
 
         def prepare(p, k, before):
             zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
-            iteration = both(p)[1].predict(k, before), infinite, infinite, zero, zero, zero
+            iteration = both(p)[1].predict(k, before), infinite, infinite, zero, infinite, zero
             return *iteration, zero, zero + 1.0, zero  # of Newton's method: iterations, defined, noise
 
         def driven(p, dW) -> tuple[System, OneStepMethod]:
@@ -135,8 +135,8 @@ class Stepper:
             system, method = driven(p, dW)
             if method.explicit:
                 solved = explicit(system, method, x, low, h, iteration[0], rules)
-                _, _, best, stalled, rate, made = iteration
-                s = Iteration(solved.k, solved.residual, best, stalled, rate, made + 1.0)
+                _, _, best, stalled, previous, made = iteration
+                s = Iteration(solved.k, solved.residual, best, stalled, previous, made + 1.0)
                 return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
             s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
             converged, going = s.stands(scale_of(x, h, s.k, rules), rules)
@@ -161,6 +161,9 @@ class Stepper:
             "conclude": Spec(concluded, f"p {solved} {' '.join(FIELDS)}", FIELDS),
         }
         self._pieces = {name: self._piece(*spec) for name, spec in self._programs(programs).items()}
+        loop = self._pieces["iterate"]
+        changing = [i for i, name in enumerate(loop.arguments) if name in ITERATION]
+        self._pieces["iterate"] = loop._replace(program=loop.program.factored(changing))
         own_size = int(varies.sum())
         working = (*ITERATION, *after, "defined", "newtons", "noise")
         shapes = {name: self._shapes.get(name, ()) for name in (*self.names, "h", "dW", *self.passed)} | {

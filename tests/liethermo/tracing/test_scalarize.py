@@ -609,3 +609,22 @@ def test_compiled_su3_with_killing_dissipation():
     program = program_of(f, *args)
     assert len(program.instructions) < 800  # a dense loop would need some 4000
     check(program, args, jax_values(f, *args), compiled(program)(*args))
+
+
+def test_factors_that_do_not_change_are_multiplied_first():
+    """So a loop over x computes ``a b`` once; the number of products with x falls, and the values stay."""
+
+    def f(a, b, x):
+        return b * (a * x) + 0.5 * (a * x) * b, x * (x * a)
+
+    program = scalarize(jax.make_jaxpr(f)(*[jax.ShapeDtypeStruct((), jnp.float64)] * 3))
+    found = program.factored([2])
+    values = 1.3, -0.7, 2.1
+    for one, other in zip(program.evaluate(*values), found.evaluate(*values), strict=True):
+        assert np.abs(one - other) < 4e-16 * np.abs(one)
+    (x,) = found.inputs[2]
+    factors = [i.args for i in found.instructions if i.target.endswith("_factor")]
+    assert factors
+    assert all(x not in args for args in factors)
+    assert sum(x in i.args for i in found.instructions) > sum(x in i.args for i in program.instructions)
+    assert program.factored([0, 1, 2]).operations == program.operations, "nothing to take out where all of them change"
