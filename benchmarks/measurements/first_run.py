@@ -62,7 +62,7 @@ def run(quick: bool) -> Report:
         totals |= {(title, name): times[3] for name, times in best.items()}
     table = Table("1000 steps of size 0.1, the whole of it in a new process.", COLUMNS, rows)
     targets = []
-    for name, bound in ("compiled engine, cold", 3.0), ("compiled engine, cached", 1.5):
+    for name, bound in ("compiled engine, cold", 2.0), ("compiled engine, cached", 1.1):
         worst = max(total for (_, which), total in totals.items() if which == name)
         targets.append(Target(f"first trajectory in a new process, {name}", bound, worst, "seconds"))
     text = "From the start of the Python process to the end of its first trajectory; the slower system counts."

@@ -38,7 +38,8 @@ def run(quick: bool) -> Report:
         f"The run of the paper's figure: one call for {few} steps (rate 1), every state kept. Here the times are "
         "mostly what a call costs before and after its steps."
     )
-    calls, _ = contest(caption, short, few, 3 * rounds, C)
+    calls, of_calls = contest(caption, short, few, 3 * rounds, C)
+    beside = of_calls["compiled engine"] - few * times[QUADRATIC] / steps
 
     text = (
         "The metriplectic midpoint scheme on one relaxed rigid body, with the same rules for the iteration, "
@@ -51,9 +52,10 @@ def run(quick: bool) -> Report:
             f"{difference(_program(1.0), body(1.0)):.0e}."
         )
     targets = [
-        Target(f"midpoint scheme, one relaxed rigid body, against C ({name})", 2.5, ratio(times[name], times.get(C)))
+        Target(f"midpoint scheme, one relaxed rigid body, against C ({name})", 1.3, ratio(times[name], times.get(C)))
         for name in (PLAIN, QUADRATIC)
     ]
+    targets.append(Target(f"a call of {few} steps beside them, every state kept", 1.5e-4, beside, "seconds"))
     return Report("One body", text, [table, calls], targets, skipped)
 
 
