@@ -25,6 +25,7 @@ from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
 from .coordinates import check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
+from .rounding import with_rounding
 
 LARGEST_CLIQUE = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
@@ -52,6 +53,13 @@ class Energy(Module):
         """
         return jax.lax.stop_gradient(jnp.linalg.norm(self.gradient(x)) * jnp.linalg.norm(x))
 
+    def rounded(self, x) -> jax.Array:
+        """The size at which the value at x is rounded: that of the largest terms inside, though they cancel in it.
+
+        Near q = 0 the value of ``1 - cos q`` is rounding, of the size of 1.
+        """
+        return jax.lax.stop_gradient(with_rounding(self.value, x)[1])
+
     @property
     def terms(self) -> tuple[Energy, ...]:
         """The summands, none of them a sum itself."""
@@ -70,9 +78,12 @@ class Energy(Module):
         """Those of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
 
-    def in_chart(self, coordinates: mf.Coordinates, space: mf.Space) -> Energy:
-        """A function of state vectors of a space, as one of coordinates."""
-        return InChart(self, coordinates, space)
+    def in_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
+        """A function of state vectors of a space, as one of coordinates.
+
+        Where it is for one step, ``start`` is the state vector from which that leads.
+        """
+        return InChart(self, coordinates, space, start)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         """The pattern of the Hessian: which components of the gradient depend on which of the state; None if unknown.
@@ -435,15 +446,26 @@ def as_energy(function, role: str) -> Energy:
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
 
 
+CHART_ROUNDINGS = 4.0
+"""Of each component of a point that a chart computes."""
+
+
 class InChart(Energy):
     """A function of state vectors, as one of coordinates."""
 
     energy: Energy
     coordinates: mf.Coordinates
     space: mf.Space = eqx.field(static=True)
+    start: jax.Array | None = None
 
     def value(self, x) -> jax.Array:
         return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
+
+    def rounded(self, x) -> jax.Array:
+        """At the start of the step, where that is known: so it is found once, not at every iteration."""
+        if self.start is None:
+            return super().rounded(x)
+        return self.energy.rounded(self.start) + CHART_ROUNDINGS * self.energy.sensitivity(self.start)
 
 
 def quadratic_of(polynomial: mf.Polynomial) -> Quadratic:

@@ -29,7 +29,6 @@ from ..errors import InputError
 from .energy import Energy
 from .frames import frame
 from .path import Finer, Path
-from .rounding import with_rounding
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -145,7 +144,7 @@ class CoordinateIncrement(DiscreteGradient):
         along, slope = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
         second = along[:, 0] + along[:, 2] - 2.0 * along[:, 1]
         mean = along[:, 1] + (5 / 18) * second
-        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1]) + _rounded(term, x)
+        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1]) + term.rounded(x)
         found = values[1:] - values[:-1]
         defect = _gated_defect(found, sizes, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
         return mean + _divide(defect, d)
@@ -286,7 +285,7 @@ class Change(NamedTuple):
         # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
         difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
         slope = jnp.max(jnp.linalg.norm(ends, axis=1))
-        size = jnp.abs(before) + jnp.abs(after) + _rounded(term, x)
+        size = jnp.abs(before) + jnp.abs(after) + term.rounded(x)
         noise = DIFFERENCE_NOISE * size + 4 * EPS * slope * jnp.linalg.norm(x)
         return cls(difference, noise, gradients)
 
@@ -322,15 +321,6 @@ def _values(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
-def _rounded(term: Energy, x) -> jax.Array:
-    """The size at which the value at x is rounded: that of the largest terms inside, though they cancel in the value.
-
-    Near q = 0 the value of ``1 - cos q`` is rounding, of the size of 1. It needs nothing of the step, so that it is
-    found once, not at every iteration.
-    """
-    return jax.lax.stop_gradient(with_rounding(term.value, x)[1])
-
-
 def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array]:
     """``H(x + low + d) - H(x + low)``, and the size at which it is rounded; ``gradient`` is one in between.
 
@@ -339,7 +329,7 @@ def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array
     """
     new, new_low = compensated(x, low + d)
     before, after = _values(term, jnp.stack([x, new]))
-    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after) + _rounded(term, x)
+    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after) + term.rounded(x)
 
 
 def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale):

@@ -124,13 +124,13 @@ class InCharts(OneStepMethod):
 
     def _step(self, system: System, x, low, h, k) -> _Step:
         """The step in coordinates around z."""
-        chart, space, x = self.retraction.chart, self.retraction.space, system.points(x)
+        chart, space, start, x = self.retraction.chart, self.retraction.space, x, system.points(x)
         vectors = space.from_vector(k)
         around = mf.coordinates_around(chart, x)
         own = jax.vmap(around.components)(vectors)
         low = around.components(system.points(low))
         if isinstance(self.retraction, mf.Chart):
-            local = ChartSystem(system, around)
+            local = ChartSystem(system, around, start=start)
 
             def back(slopes):
                 return space.to_vector(jax.vmap(around.vector)(slopes))
@@ -148,10 +148,10 @@ class InCharts(OneStepMethod):
         def back_there(c):
             return space.to_vector(chart._carry(z, -carried, around_z.vector(c)))
 
-        local = ChartSystem(system, around_z, around_z.centre() if self.stages == 1 else None)
+        local = ChartSystem(system, around_z, around_z.centre() if self.stages == 1 else None, start)
         own = jax.vmap(there)(own)
-        start = -0.5 * self.method.increment(h, own)
-        return _Step(local, self.method.pulled(local), start, there(low), own, jax.vmap(back_there))
+        begin = -0.5 * self.method.increment(h, own)
+        return _Step(local, self.method.pulled(local), begin, there(low), own, jax.vmap(back_there))
 
     def predict(self, k, before) -> jax.Array:
         return k if self.explicit else 2.0 * k - before  # whatever the method's own: the chart has changed

@@ -27,15 +27,18 @@ class ChartSystem(System):
     coordinates : manifolds.Coordinates
     place : manifolds.Place, optional
         Where Pi and K are taken, in place of the point that they are asked for at.
+    start : array, optional
+        Of a system for one step, the state vector from which that leads.
     """
 
     manifold: System
     coordinates: mf.Coordinates
     place: mf.Place | None
+    start: jax.Array | None
 
-    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None = None):
+    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None = None, start=None):
         assert system.space is not None
-        self.manifold, self.coordinates, self.place = system, coordinates, place
+        self.manifold, self.coordinates, self.place, self.start = system, coordinates, place, start
         self.dim, self.space, self.momentum_maps = system.space.dim, None, {}
         self.energy = self.pulled(system.energy)
         self.entropy = None if system.entropy is None else self.pulled(system.entropy)
@@ -54,7 +57,7 @@ class ChartSystem(System):
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
         assert self.manifold.space is not None
-        terms = tuple(term.in_chart(self.coordinates, self.manifold.space) for term in energy.terms)
+        terms = tuple(term.in_chart(self.coordinates, self.manifold.space, self.start) for term in energy.terms)
         return terms[0] if len(terms) == 1 else Sum(terms)
 
     @property
@@ -62,7 +65,11 @@ class ChartSystem(System):
         return self.manifold.smooth
 
     def here(self, x) -> System:
-        return self if self.place is not None else ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x))
+        return (
+            self
+            if self.place is not None
+            else ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x), self.start)
+        )
 
     def field(self, x, dH, dS, dL=()):
         place = _Place(self.manifold, self.coordinates, self.place, x)

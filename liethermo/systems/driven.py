@@ -251,7 +251,7 @@ class _MinusWork(Energy):
     def sensitivity(self, x) -> jax.Array:
         return jax.lax.stop_gradient(jnp.abs(self.value(x)))
 
-    def in_chart(self, coordinates, space):
+    def in_chart(self, coordinates, space, start=None):
         slope = jnp.zeros(space.dim).at[-1].set(-1.0 / self.unit)
         return Quadratic(jnp.zeros(space.dim), slope, self.value(space.to_vector(coordinates.centre().point)))
 
@@ -271,8 +271,8 @@ class _OnSpaceAndTime(Energy):
     def _joined(self, x):
         return jnp.append(x[:-2], x[-2] / self.unit)
 
-    def in_chart(self, coordinates, space):
-        local = WithTime(_InChartAndTime(InChart(self, coordinates, space), self.unit))
+    def in_chart(self, coordinates, space, start=None):
+        local = WithTime(_InChartAndTime(InChart(self, coordinates, space, start), self.unit))
         return Pullback(local, _Clock(space.dim - 2, self.unit))
 
 
