@@ -189,6 +189,9 @@ class _Compiled:
         self._chosen._fall_back(error)
         self._paces = self._chosen._single(self._pacing).begin(*self._start)
 
+    def state(self) -> State:
+        return self._paces.state()
+
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         try:
             return self._paces.attempts(most)

@@ -61,6 +61,10 @@ class ManyPaces(Paces, Protocol):
 class OnePace(Paces, Protocol):
     """One trajectory, whose attempts can be looked at."""
 
+    def state(self) -> State:
+        """As it stands."""
+        ...
+
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         """Make so many attempts, or fewer.
 
@@ -117,6 +121,9 @@ class SinglePaces(_ArrayPaces):
             whole = self._field(name)
             self._put(name, np.asarray(others.read(name)).reshape(whole.shape).astype(whole.dtype))
         return self
+
+    def state(self) -> State:
+        return State(*(self.read(name)[0] for name in State._fields))
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         del most  # one, which nothing else follows

@@ -187,7 +187,7 @@ def _missed(step: _Step, before: np.ndarray, after: np.ndarray) -> float:
 
 def spread(count: int, most: int) -> np.ndarray:
     """At most so many places among ``count``, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)) if count else np.zeros(0, dtype=int)
+    return np.arange(count) if count <= most else np.arange(most) * (count - 1) // (most - 1)
 
 
 def _largest(values: np.ndarray) -> list[float]:

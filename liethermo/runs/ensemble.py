@@ -201,7 +201,7 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
 def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
     """Initial states, shape (trajectories, n), and those among them that are none, and why."""
     try:
-        return np.atleast_2d(np.asarray(member.state(x0s, batch=True))), {}
+        return np.atleast_2d(member.numbers(x0s, batch=True)), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiub" or not len(rows):
@@ -210,7 +210,7 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
 
     def look(first: int, last: int) -> None:
         """Halves, as far as there is something to find."""
-        complaint = why_not(lambda: member.state(rows[first:last], batch=True))
+        complaint = why_not(lambda: member.numbers(rows[first:last], batch=True))
         if complaint and last - first == 1:
             bad[first] = complaint
         elif complaint:
@@ -223,4 +223,4 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
         raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")
     filled = rows.copy()
     filled[list(bad)] = rows[good[0]]
-    return np.asarray(member.state(filled, batch=True)), bad
+    return member.numbers(filled, batch=True), bad

@@ -127,7 +127,7 @@ def integrate(
     elif isinstance(system, DrivenSystem):
         x = system.begin(x0, table.start)
     else:
-        x = system.state(x0)
+        x = system.numbers(x0)
     if reason := system.outside(x):
         raise InputError(f"the run cannot start at this x0: {reason}")
     run = Run(system, method, x, table, save_to, engine, noise)

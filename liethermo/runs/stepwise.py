@@ -134,7 +134,7 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
         before = outcome.state
         rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
         outcome.rejected = int(told("rejected"))
-        after: Any = State(*(paces.read(name)[0] for name in State._fields))
+        after: Any = paces.state()
         outcome.state = after._replace(status=np.int64(0))
         if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
             x, energy, entropy, number, ends, h = (rows[name][taken] for name in TOLD)

@@ -239,6 +239,11 @@ class System(Kind):
         ------
         InputError, manifolds.OffManifoldError
         """
+        numbers = self.numbers(x, batch)
+        return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)
+
+    def numbers(self, x, batch: bool = False) -> Any:
+        """What :meth:`state` makes of x, as an array of NumPy where its values are known."""
         if not isinstance(x, jax.Array):
             try:
                 x = np.asarray(x)
@@ -259,14 +264,14 @@ class System(Kind):
                 expected = f"({shown}), or flat {expected}"
             raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
         if isinstance(x, jax.core.Tracer):
-            return x.astype(jnp.float64)
-        numbers = np.asarray(x)
+            return x
+        numbers = np.asarray(x, dtype=np.float64)
         if not np.isfinite(numbers).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
             raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
         if self.space is not None:
             self.space.point(self.points(numbers))
-        return real_array(x)
+        return numbers
 
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.

@@ -155,10 +155,10 @@ class SimpleClosedSystem(OnVelocities):
         """Whether work or heat comes from outside, so that the state has a ledger."""
         return self.external is not None or self.heat_power is not None
 
-    def state(self, x, batch: bool = False) -> jax.Array:
+    def numbers(self, x, batch: bool = False):
         if self.receives and np.ndim(x) > 0 and np.shape(x)[-1] == 2 * self.degrees_of_freedom + 1:
             x = jnp.concatenate([jnp.asarray(x), jnp.zeros((*np.shape(x)[:-1], LEDGER))], axis=-1)
-        return super().state(x, batch)
+        return super().numbers(x, batch)
 
     def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """q, v, S and t of one state; t = 0 where it has none."""

@@ -90,7 +90,7 @@ class SpinSystem(System):
         a, b, c = self.poisson.turned(x, dH)
         return self.poisson.joined((a + damped[0], b + damped[1], c + damped[2]), warmed)
 
-    def state(self, x, batch: bool = False) -> jax.Array:
+    def numbers(self, x, batch: bool = False):
         """A state in one row; also from the spins alone, with every bath at entropy zero.
 
         The spins have the shape ``(*sites, 3)``; a single one may have the shape (3,).
@@ -105,7 +105,7 @@ class SpinSystem(System):
             raise InputError(
                 f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {given}"
             )
-        return super().state(x, batch)
+        return super().numbers(x, batch)
 
     def spins(self, x) -> jax.Array:
         """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""

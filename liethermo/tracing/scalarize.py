@@ -89,18 +89,23 @@ class Program:
 
         With ``batch`` inputs and outputs have one axis more in front, the same for all.
         """
-        arrays = tuple(np.asarray(x, dtype=np.float64) for x in arrays)
-        front = arrays[0].shape[:1] if batch else ()
         values: dict[Scalar, Any] = {}
+        front: tuple[int, ...] = ()
         for names, x in zip(self.inputs, arrays, strict=True):
-            values.update(zip(names, np.moveaxis(x.reshape(*front, -1), -1, 0), strict=True))
+            x = np.asarray(x, dtype=np.float64)
+            if batch:
+                front = x.shape[:1]
+                x = x.reshape(*front, len(names)).T
+            values.update(zip(names, x if batch else x.ravel(), strict=True))
         with np.errstate(all="ignore"):
             for target, op, args in self.instructions:
                 values[target] = OPERATIONS[op](*(values[a] if type(a) is str else a for a in args))
 
         def gathered(entries, shape):
-            columns = [np.broadcast_to(values[a] if type(a) is str else a, front) for a in entries]
-            return np.stack(columns, axis=-1).reshape((*front, *shape)) if columns else np.zeros((*front, *shape))
+            found = np.empty((*front, len(entries)))
+            for i, a in enumerate(entries):
+                found[..., i] = values[a] if type(a) is str else a
+            return found.reshape((*front, *shape))
 
         return [gathered(entries, shape) for entries, shape in zip(self.outputs, self.shapes, strict=True)]
 

@@ -120,6 +120,9 @@ class LanePaces:
     def follow(self, most: int) -> None:
         self.stepper.run(self.first, self.blocks, 0.0, 1, most)
 
+    def state(self) -> State:
+        return self.stepper.state_in(self.blocks.copy())
+
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         """Make so many attempts of the only trajectory, or fewer: see :class:`..paced.OnePace`."""
         before, out = self.read("tried")[0], np.empty((1, most, self.stepper.width))

@@ -239,8 +239,12 @@ class Stepper:
     def block_of(self, state: State) -> np.ndarray:
         """The only block of a trajectory by itself."""
         whole = np.zeros((1, self._layout.height))
+        row = whole[0]
         for (first, end, shape), value in zip(self._places, state, strict=True):
-            whole[0, first:end] = np.reshape(value, -1) if shape else value
+            if shape:
+                row[first:end].reshape(shape)[...] = value
+            else:
+                row[first] = value
         return whole
 
     def state_in(self, blocks: np.ndarray) -> State:
