@@ -27,9 +27,9 @@ def run(quick: bool) -> Report:
     table, times = contest(caption, works, steps, rounds, C)
     text = (
         "A quartic energy and a logarithmic entropy on so(3)*, given to the library as plain functions and to C with "
-        "derivatives by hand. *C* evaluates the library's form of Gonzalez's gradient (three gradients and one value "
-        "an iteration), *C, textbook gradient* the formula as printed (one gradient and one value), which loses itself "
-        "in rounding noise when a system comes to rest. Times are of the processor."
+        "derivatives by hand. *C* evaluates the library's form of Gonzalez's gradient: three gradients and one value "
+        "an iteration. *C, textbook gradient* evaluates the formula as printed, one gradient and one value, which "
+        "loses itself in rounding noise when a system comes to rest. Times are of the processor."
     )
     if C in works:
         text += (

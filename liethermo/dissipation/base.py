@@ -103,7 +103,7 @@ class Dissipation(Module):
     def factor(self, system: Geometry, x, dH, dL) -> Factor | None:
         """A matrix B with ``B B^T = K``, of the friction matrix K that the force is K dS with; None where it has none.
 
-        Of a dissipation that lowers the energy the force is ``-K dH``. Noise is made with B, and so are potentials of
+        Where a dissipation lowers the energy, the force is ``-K dH``. Noise is made with B, and so are potentials of
         forces; ``B^T dH = 0`` and ``B^T dL = 0`` for whatever gradients it is handed, where these are conserved.
         """
         del system, x, dH, dL
@@ -113,7 +113,7 @@ class Dissipation(Module):
         """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].
 
         ``turned`` is ``[dH, dS]``. Such an F joins the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
-        action in the place of two. None where the force is of another form.
+        action instead of two. None where the force is of another form.
         """
         del dH, turned
         return None

@@ -36,7 +36,7 @@ class Factor(NamedTuple):
         return jax.linear_transpose(self.times, jax.ShapeDtypeStruct((self.size,), jnp.float64))(alpha)[0]
 
     def scaled(self, rate) -> Factor:
-        """Of ``rate * K``, the rate a number, which may depend on the state."""
+        """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
         root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)  # zero has a derivative too
         return self._replace(times=lambda w: root * self.times(w))
 

@@ -69,7 +69,7 @@ class FourBracket(Dissipation):
         return jnp.einsum("ijkl,j,k,l->i", form_at(self.tensor, x), dH, dS, dH)
 
     def factor(self, system, x, dH, dL):
-        """Of R as a form on pairs of covectors, which has to be semidefinite: ``R = sum A (x) A``, columns ``A dH``."""
+        """Columns ``A dH``, where ``R = sum A (x) A``: as a form on pairs of covectors R has to be semidefinite."""
         i, j = np.triu_indices(system.dim, 1)
         form = form_at(self.tensor, x)[i, j][:, i, j]
         _check_on_pairs(form)

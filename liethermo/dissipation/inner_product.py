@@ -124,6 +124,6 @@ class KillingDissipation(OfBracket):
 
 
 def _factor(system, dH, form) -> Factor | None:
-    """Of ``ad*_dH 𝒦 ad_dH``: ``div ad*_dH F = C[a, b, c] H_ab F_c = 0``, C being skew in a, b, the Hessian not."""
+    """The factor;  ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes: C is skew in a, b, H_ab not."""
     root, g = root_of(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

@@ -266,8 +266,8 @@ def after_bad(error, h, power) -> jax.Array:
 def reach(method: OneStepMethod) -> float:
     """Largest product of a step and a rate of growth: what grows near the state then does so to :data:`GROWTH_ERROR`.
 
-    A one-step method that solves a linear equation of rate r multiplies it by R(h r) in a step instead of exp(h r), and
-    one that damps or keeps what it does not resolve, as implicit ones do, sleeps through an instability in long steps.
+    A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
+    Implicit ones damp or keep what they do not resolve, so they sleep through an instability in long steps.
     R is taken to be the diagonal Padé approximation of the method's order.
     """
     s = max(1, method.order // 2)

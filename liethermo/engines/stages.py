@@ -181,7 +181,7 @@ def solve_stages(
 
 
 def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The guess, or a step of nothing where that solves the equations better, and the misfit there.
+    """The guess, or a step of size zero where that solves the equations better, and the misfit there.
 
     Far out Newton may wander.
     """

@@ -292,7 +292,7 @@ class WithTime(Energy):
 
 
 def _squares(gradients) -> jax.Array:
-    """Of gradients, shape (s, m), the squares of the part by the state, for each of its components, and by the time."""
+    """Squares of gradients, shape (s, m): that by the state, for each of its components, and that by the time."""
     size = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(size > 0.0, size, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
@@ -447,7 +447,7 @@ def as_energy(function, role: str) -> Energy:
 
 
 CHART_ROUNDINGS = 4.0
-"""Of each component of a point that a chart computes."""
+"""Roundings of each component of a point that a chart computes."""
 
 
 class InChart(Energy):

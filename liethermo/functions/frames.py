@@ -14,7 +14,7 @@ DEPENDENT = 1e-24
 
 
 class Frame(NamedTuple):
-    """Orthonormal vectors that span what given ones span; zero in the place of one that depends on those before it.
+    """Orthonormal vectors that span what given ones span; zero instead of one that depends on those before it.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Frame(NamedTuple):
 def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None) -> Frame:
     """The frame of some vectors by Gram and Schmidt.
 
-    ``like`` are vectors whose dependence decides in the place of the given ones. Discrete gradients of C and exp(C)
+    ``like`` are vectors whose dependence decides instead of the given ones. Discrete gradients of C and exp(C)
     differ by a multiple of the slope alone, and to project off both would stop the motion: the gradients tell.
     """
     found, plain = Frame([], []), Frame([], [])

@@ -207,7 +207,7 @@ def stage_gradients(
 
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
-    """Of one term; ``along`` says which components of the slopes to correct along, by default all.
+    """Gradients of one term; ``along`` names the components of the slopes to correct along, all by default.
 
     It may give them weights, shape (m,), and may be a function of the gradients at the stages, shape (s, m).
     """
@@ -276,7 +276,7 @@ class Change(NamedTuple):
 
     @classmethod
     def of(cls, term: Energy, x, low, d, points: list[jax.Array]) -> Change:
-        """Of the step from x + low to x + low + d."""
+        """The change over the step from x + low to x + low + d."""
         new, new_low = compensated(x, low + d)
         # one map for all points, as one is what a compiler has to work on
         found = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))

@@ -125,7 +125,7 @@ def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
 
 
 def _is_semidefinite(G: np.ndarray) -> bool:
-    """Of matrices, shape (..., n, n)."""
+    """Whether all of these matrices, shape (..., n, n), are positive semidefinite."""
     eigenvalues = np.linalg.eigvalsh(G)
     return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
 

@@ -15,7 +15,7 @@ from .variational.lie import LieVariational
 from .variational.schemes import VariationalIntegrator
 
 DEFAULT_METHOD = MetriplecticGauss(1)
-"""Of order 2; where energy and entropy are quadratic it is the midpoint scheme."""
+"""The method has order 2; where energy and entropy are quadratic it is the midpoint scheme."""
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods(special=True)} | {
     "Reference": Reference

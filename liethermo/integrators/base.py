@@ -38,8 +38,8 @@ class OneStepMethod(Module):
     ----------
     order : int
     preserves : frozenset of str
-        Guarantees that hold to rounding at every step, among ``"energy"`` (its law, exactly), ``"entropy_law"``
-        (for every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"casimirs"`` (those known to be
+        Guarantees that hold to rounding at every step. They are among ``"energy"`` (its law), ``"entropy_law"`` (for
+        every entropy), ``"entropy_law_quadratic"`` (for a quadratic one), ``"casimirs"`` (those known to be
         conserved) and ``"quadratic_casimirs"`` (quadratic ones, where the dissipation keeps them by construction).
     stages : int
     systems : str
@@ -81,13 +81,13 @@ class OneStepMethod(Module):
         return False
 
     def missed(self, system: System, x, low, h, k) -> jax.Array:
-        """Of an explicit method, what the slopes miss of what they are to do, of the size of a slope."""
+        """How far an explicit method misses the levels that its step has to end on, as a length of a slope."""
         del system, x, low, h
         return jnp.zeros_like(jnp.max(k))
 
     @property
     def evaluations(self) -> int:
-        """Of the vector field, in one iteration."""
+        """How often one iteration evaluates the vector field."""
         return self.stages
 
     def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
@@ -210,7 +210,7 @@ ONE_SIZE = (
 
 
 def checked_stages(stages) -> int:
-    """A number of Gauss nodes that there is a tableau for."""
+    """How many Gauss nodes, where there is a tableau for them."""
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
         raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
     return stages

@@ -78,8 +78,8 @@ class ExplicitMethod(OneStepMethod):
     Vectors of constant length, such as many spins, are held one by one, in work and memory that grow with their number:
     each is brought back to its sphere along its radius, and the corrections above are made along the spheres.
 
-    Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
-    by its own quadrature.
+    Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
+    quadrature.
 
     A subclass says what the step is before it is corrected: :meth:`uncorrected`.
 

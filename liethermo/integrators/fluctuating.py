@@ -17,7 +17,7 @@ from .base import OneStepMethod
 from .midpoint import MetriplecticMidpoint
 
 MISFIT = 1e-10
-"""Of ``B B^T`` and the friction matrix, relative to that."""
+"""Largest difference of ``B B^T`` from the friction matrix, relative to that."""
 
 
 class Fluctuating(OneStepMethod):
@@ -30,7 +30,7 @@ class Fluctuating(OneStepMethod):
 
     at the midpoint z, with K_d and B_d rebuilt from the discrete gradient of H: that is in the kernel of both, so the
     energy is exact on every path, and what noise and friction keep by construction is too. A summand of the dissipation
-    that lowers the energy fluctuates with ``k T`` in the place of k, T the temperature of the bath that takes it.
+    that lowers the energy fluctuates with ``k T`` instead of k, T the temperature of the bath that takes it.
 
     Mean-square order 1/2 (1 where the noise commutes), weak order 1 or better. It keeps no entropy law on paths. Made
     by :func:`liethermo.integrate` from the method that it is given and the ``noise``.

@@ -227,7 +227,7 @@ class MetriplecticGauss(GaussMethod):
 
 
 class Gradients(NamedTuple):
-    """Of a function at the stages, shape (s, n), or at one: discrete ones, and those that they tend to."""
+    """Gradients of a function at the stages, shape (s, n), or at one: discrete ones, and their limits."""
 
     discrete: jax.Array
     plain: jax.Array

@@ -33,7 +33,7 @@ class MetriplecticMidpoint(OneStepMethod):
     gradient : {"gonzalez", "mean_value", "coordinate_increment", "symmetric_coordinate_increment"} or DiscreteGradient
     retraction : str or manifolds.Retraction, optional
         On a manifold: ``"midpoint"`` by default, the paper's ``exp~_h`` (4.8); or as :func:`manifolds.retraction` names
-        them. Of those with z at the start of the step the chart's own midpoint is taken, so that the order is 2 still.
+        them. Where z is at the start of the step, the chart's own midpoint is taken, so the order is 2 too.
     """
 
     gradient: DiscreteGradient

@@ -94,7 +94,7 @@ class WithAttitude(OneStepMethod):
         return system.join(momenta, algebra.hat(_inverse_dexp(algebra, algebra.vee(moved), xi, self.order)))
 
     def increment(self, h, k) -> jax.Array:
-        """Of momentum and, unless by ``"cayley"``, in the algebra."""
+        """The increment of the momentum and, unless by ``"cayley"``, of the attitude in the algebra."""
         return self.method.increment(h, k)
 
     def move(self, system: AttitudeSystem, x, low, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]

@@ -31,8 +31,8 @@ class MetriplecticRungeKutta(ExplicitMethod):
     quadrature are nonnegative, so that the entropy never falls; the quadrature is of the order p of the method, 4, 6 or
     8, so that x' - y is O(h^{p+1}). How x' is found: :class:`.explicit.ExplicitMethod`.
 
-    Of a system whose energy falls and whose entropy is conserved, as with double bracket dissipation, the energy falls
-    by its own quadrature.
+    Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
+    quadrature.
 
     A step costs 4, 7 or 11 evaluations of the field; and with four corrections, five values of what each function
     changes by. There is nothing to iterate, so it is many times as fast as an implicit step; but stiff systems ask for
@@ -90,7 +90,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return Unlawful(h * (t.b @ slopes), h * (t.b @ rates), jnp.asarray(t.d) @ slopes, ends)
 
     def weights(self, theta) -> np.ndarray:
-        """Of the cubic through both ends with the slopes there, which is O(h^4) between."""
+        """Weights of the cubic through both ends with the slopes there; its error between them is O(h^4)."""
         theta = np.asarray(theta, dtype=np.float64)
         found = np.zeros((*theta.shape, self.stages))
         found[..., SLOPE] = theta**2 * (3.0 - 2.0 * theta)

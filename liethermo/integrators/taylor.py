@@ -110,7 +110,7 @@ class MetriplecticTaylor(ExplicitMethod):
         return Unlawful(jnp.sum(c, axis=0), h * (b @ rates), defect / (self.order + 1), c / h)
 
     def weights(self, theta) -> np.ndarray:
-        """Of the polynomial, and of what brings its end to the state there, which grows as its first term left out."""
+        """Weights of the polynomial and of its correction, which grows like the first term that is left out."""
         theta = np.asarray(theta, dtype=np.float64)[..., None]
         last = theta ** (self.order + 1)
         found = np.zeros((*theta.shape[:-1], self.stages))
@@ -121,8 +121,8 @@ class MetriplecticTaylor(ExplicitMethod):
     def error(self, system: System, x, low, h, k) -> jax.Array:
         """From how far the polynomial X misses the field at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
-        Of X' the first term left out is p + 1 times that of X. So it is right to a factor that tends to 1; and it sees
-        too where a test has been decided otherwise on the way.
+        The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
+        also sees where a test has been decided otherwise on the way.
         """
         del system, x, low
         return h * jnp.max(jnp.abs(k[ERROR]))

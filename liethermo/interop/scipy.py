@@ -1,4 +1,4 @@
-"""The call of SciPy's ``solve_ivp`` with a system in the place of a function: ``lt.scipy.solve_ivp``."""
+"""The call of SciPy's ``solve_ivp`` with a system instead of a function: ``lt.scipy.solve_ivp``."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class QuantisedSphere:
 
     @cached_property
     def _tridiagonal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of minus the Laplacian: its main diagonals, and what couples entry i to i + 1, shapes (N, N) as [i, m]."""
+        """Minus the Laplacian: the main diagonals, and what couples entry i to i + 1; shapes (N, N) as [i, m]."""
         N, s = self.N, (self.N - 1) / 2.0
         i, m = np.indices((N, N))
         z = s - np.arange(N)  # of S_z

@@ -97,7 +97,10 @@ def spin_lattice(
 
 
 def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_constant: float = 0.0, field=0.0):
-    """Of a small wave on a ring of spins along the third axis: ``2 J (1 - cos q) + 2 K + B``, q an angle per site."""
+    """The frequency of a small wave on a ring of spins along the third axis, ``2 J (1 - cos q) + 2 K + B``.
+
+    The wave number q is an angle per site.
+    """
     return 2.0 * exchange_constant * (1.0 - np.cos(wave_number)) + 2.0 * anisotropy_constant + field
 
 

@@ -307,7 +307,7 @@ def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
 
 
 def _rounding(series: np.ndarray, sensitivity: float | None, terms: float | None) -> Rounding:
-    """Of a function with this series; the largest of its values stands in for a sensitivity that is not known."""
+    """How a function with this series is rounded; its largest value replaces a sensitivity that is not known."""
     largest = float(np.abs(series).max()) if sensitivity is None else sensitivity
     return Rounding(abs(float(series[0])), largest, _or(terms, 0.0))
 

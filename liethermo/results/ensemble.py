@@ -87,7 +87,7 @@ class Ensemble(Saved):
         Time reached.
     rejected : ndarray of int64, shape (B,)
         Adaptive steps that were tried and were too long.
-    x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` in the place of n
+    x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` instead of n
         Initial states.
     laws : Laws
     engine : str
@@ -226,7 +226,7 @@ class Ensemble(Saved):
         work = None if self.work is None else self.work[i]
 
         def series(values, first):
-            """Of the times kept; or of both ends."""
+            """The values at the times kept, or at both ends."""
             return values[i][reached] if path else np.stack([first, values[i]])
 
         assert self.x is not None
@@ -371,7 +371,7 @@ class Ensemble(Saved):
 
 
 SERIES = ("energy", "entropy", "work")
-"""Of the times kept."""
+"""What is known at each of the times kept."""
 
 NUMBERS = tuple(
     "status steps residual energy_drift largest_energy_increment least_entropy_increment entropy_scale "

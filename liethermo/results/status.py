@@ -92,9 +92,9 @@ class Laws:
     """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
 
     ``conserved`` names those that the method promises to keep to rounding, ``unpromised`` those that it does not: an
-    audit shows how far these drift, without a verdict. ``ledger`` names those of the recorded functions that say what
-    comes from outside, ``balance`` those of them that the energy of a solution contains and its law is stated without
-    (``dH = work``), and ``inexact`` which of the two laws ("energy", "entropy") the method makes no claim to keep: an
+    audit shows how far these drift, without a verdict. ``ledger`` names the recorded functions that say what comes from
+    outside. ``balance`` names those of them that the energy of a solution contains, and its law is stated without
+    (``dH = work``). ``inexact`` says which of the two laws ("energy", "entropy") the method makes no claim to keep: an
     audit judges them all the same, and says so. ``mean`` names those of the two laws that fluctuations leave for the
     mean alone: on paths both may rise and fall.
     """

@@ -58,7 +58,7 @@ def ensemble(
     ----------
     system : System, or function from one set of parameters to a System
     x0s : array, shape (n,) or (B, n)
-        Initial states; one for all, or one each. Of a system on sites ``(*sites, d)`` may stand in the place of n; the
+        Initial states; one for all, or one each. For a system on sites, ``(*sites, d)`` may replace n; the
         states of an ensemble are flat, and ``system.points`` shows them on the sites.
     t_span, step, method, save_every, save_at, until
         As for :func:`integrate`: with ``lt.Adaptive(rtol, atol)`` every trajectory has steps of its own, the same as

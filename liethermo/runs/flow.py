@@ -48,7 +48,7 @@ def flow(
 
     Returns
     -------
-    array, shape (n,), or (times, n); ``(*sites, d)`` in the place of n, of a system on sites
+    array, shape (n,), or (times, n); ``(*sites, d)`` instead of n, of a system on sites
         NaN from where a step could not be solved: inside a compiled function nothing can be raised.
 
     Raises

@@ -29,9 +29,9 @@ and to cut it off changes their variance by 1e-8."""
 class Fluctuations:
     """Noise that belongs to the dissipation: ``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW``, ``B B^T = K``.
 
-    Of a dissipation that keeps the energy every path has the energy of its start, exactly, and the measure that the
-    states tend to is ``exp(S / k)`` on that level of the energy (and of whatever else motion and noise keep), where the
-    motion keeps volumes: on duals of unimodular algebras and in canonical coordinates it does. With a ``temperature``,
+    Where the dissipation keeps the energy, every path has the energy of its start, exactly. The measure that the states
+    tend to is ``exp(S / k)`` on that level of the energy, and of whatever else motion and noise keep. That holds where
+    the motion keeps volumes, as on duals of unimodular algebras and in canonical coordinates. With a ``temperature``,
     for dissipations that lower the energy (:class:`DoubleBracket`, :class:`Friction`), it is ``exp(-H / (k T))``: that
     of a body in a bath, Langevin's equation.
 

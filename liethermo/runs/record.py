@@ -75,7 +75,7 @@ class Record:
             self.path[chosen, 0] = np.column_stack([x, energy, entropy])
 
     def keep(self, chosen: Part, first: int, states: np.ndarray) -> None:
-        """States at the kept times from the so-manieth on, with energy and entropy, shape (trajectories, m, n + 2)."""
+        """States at the kept times from a first one on, with energy and entropy, shape (trajectories, m, n + 2)."""
         if self.path is not None:
             self.path[chosen, first : first + states.shape[1]] = states
 

@@ -215,7 +215,7 @@ class Run:
         )
 
     def _longest(self, number: int) -> np.ndarray:
-        """Of the steps after each state that is kept."""
+        """The longest of the steps after each state that is kept."""
         if not self.taken:
             return np.full(number, self.table.h if self.table.full else self.table.last)
         h, kept = np.concatenate(self.taken, axis=1)

@@ -87,7 +87,7 @@ class Array:
         return cls(name, dims, shape, tuple(chunks), metadata["data_type"], metadata["attributes"])
 
     def path(self, index: Sequence[int]) -> str:
-        """Of a chunk, within the store."""
+        """The path of a chunk within the store."""
         return "/".join([self.name, "c", *map(str, index)])
 
     # -- chunks ---------------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ BATCH, BATCH_NUMBERS = 1024, 2**15
 """Trajectories that the array engine takes at once, always as many; fewer where their states are large."""
 
 PATH_BYTES = 2**27
-"""Of the trajectories that are held at once."""
+"""Most bytes of the trajectories that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Solver:
         return [part for half in halves for part in self._halved(points, x0s, attitudes, half, reasons)]
 
     def _ensemble(self, points, x0s, attitudes, chosen: np.ndarray) -> tuple[Any, np.ndarray, Ensemble]:
-        """Of some points; filled up with the last, as what is compiled must not depend on how many there are."""
+        """An ensemble of some points, filled up with the last: the compiled program must not depend on their number."""
         task = self.task
         if self.members.family is None:
             rows = chosen

@@ -1,7 +1,6 @@
 """The store of a study: a group of Zarr v3 that can be read at any time.
 
-Of each chunk of points there is a file in each array. That of ``status`` is written last and is the mark that the
-chunk is done.
+Each chunk of points has a file in each array. The file in ``status`` is written last: it marks the chunk as done.
 """
 
 from __future__ import annotations
@@ -273,7 +272,7 @@ class Store:
     # -- what there is ------------------------------------------------------------------------------------------------
 
     def marks(self) -> Iterator[tuple[int, np.ndarray | None]]:
-        """Of each chunk its number and the status of its points; None where it has no mark, or a damaged one."""
+        """The number of each chunk and the status of its points; None where its mark is missing or damaged."""
         for number in range(math.prod(self.grid)):
             index = self.index(number)
             try:

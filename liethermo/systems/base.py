@@ -24,7 +24,7 @@ from .check import AXIOM_TOLERANCE, CheckReport, check_system
 from .kinds import Kind
 
 SCALES = (1.0, 1e-4, 1e4)
-"""Of the random points at which the system is asked which functions it conserves."""
+"""Scales of the random points at which the system is asked which functions it conserves."""
 
 
 class System(Kind):
@@ -110,7 +110,7 @@ class System(Kind):
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
         """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
 
-        Of the dissipation of the system, or of another, such as one of its summands.
+        The dissipation is that of the system, or another, such as one of its summands.
         """
         x, system = self.state(x), self if t is None else self.at_time(t)
         part = self.dissipation if dissipation is None else dissipation
@@ -232,7 +232,7 @@ class System(Kind):
     def state(self, x, batch: bool = False) -> jax.Array:
         """``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
-        Of a system on sites it may have the shape ``(*sites, d)`` too; on a manifold the shape of points, and has to be
+        On sites it may have the shape ``(*sites, d)`` too. On a manifold it may have the shape of points, and has to be
         one.
 
         Raises

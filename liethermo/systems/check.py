@@ -185,7 +185,7 @@ def _indefiniteness(K: np.ndarray) -> float:
 def _residuals(system: Subject, x: jax.Array) -> dict[str, jax.Array]:
     """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix.
 
-    Of a system whose energy depends on time at a point with the time behind it.
+    Where the energy depends on time, the point has the time behind it.
     """
     if system.is_driven:
         return _residuals(system.at_time(x[-1]), x[:-1])

@@ -67,8 +67,8 @@ class EvolutionSystem(OnContactManifold):
 
     For ``H = lt.Kinetic(G) + lt.Potential(V)``, that is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite, it holds, and
     the metriplectic schemes keep it exactly: ``S' - S = h sum b_i p_i . G p_i >= 0`` at every step, for every V and h
-    (not with the coordinate increment as printed, unless G is diagonal). Of the same H written as one plain function
-    they keep the energy as exactly, but the entropy may fall where a step is coarse.
+    (not with the coordinate increment as printed, unless G is diagonal). Where the same H is written as one
+    plain function, they keep the energy exactly too, but the entropy may fall at a coarse step.
 
     Parameters
     ----------

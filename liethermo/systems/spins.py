@@ -113,7 +113,7 @@ class SpinSystem(System):
         return x[..., : self._size].reshape(*x.shape[:-1], *self.lattice, 3)
 
     def temperatures(self, x) -> jax.Array:
-        """Of the baths in states, shape (..., n) to (..., m)."""
+        """The temperatures of the baths: states of shape (..., n) give (..., m)."""
         x = jnp.asarray(x)
         return jnp.vectorize(self.energy.gradient, signature="(n)->(n)")(x)[..., self._size :]
 

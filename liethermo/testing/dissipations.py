@@ -16,7 +16,7 @@ from .runs import METHODS, follow_laws, start_of, step_of
 
 
 def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra | None = None, seed: int = 0) -> Report:
-    """The laws of a dissipation: for discrete gradients in the place of gradients, at points, and along runs.
+    """The laws of a dissipation: for discrete gradients instead of gradients, at points, and along runs.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
         made = min(made, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
         size = max(size, scale)
     if acting.energy_law == "conserved" and system.space is None:
-        suite.small("any vector in the place of grad H is in the kernel", lost, 1.0, 1e-12)
+        suite.small("any vector instead of grad H is in the kernel", lost, 1.0, 1e-12)
     if acting.entropy_law == "nondecreasing" and acting.energy_law == "conserved" and system.space is None:
         suite.small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
     suite.true("it acts", size > 0.0)

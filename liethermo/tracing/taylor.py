@@ -53,8 +53,8 @@ def check_series(function: Callable, x) -> None:
 def solution(field: Callable, x, h, order: int) -> jax.Array:
     """The coefficients ``c_1 ... c_order``, shape (order, n), of ``x(h s) = x + c_1 s + c_2 s^2 + ...``.
 
-    Of the solution of ``x' = field(x)`` that begins at x, shape (n,). They are found one after another by a loop, whose
-    body is the same for all.
+    This x(h s) is the solution of ``x' = field(x)`` that begins at x, shape (n,). A loop finds one coefficient after
+    another, with the same body for all.
 
     Raises
     ------

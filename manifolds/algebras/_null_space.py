@@ -106,7 +106,8 @@ def numerical_rank(singular: np.ndarray, scale: float, name: str) -> int:
 def row_echelon(rows: np.ndarray, modulus: int = 0, tolerance: float = 0) -> tuple[np.ndarray, list[int]]:
     """The nonzero rows of the reduced row echelon form and their leading columns.
 
-    Of integers modulo a prime below 2**31; or, without modulus, of fractions or floats, where ``tolerance`` is zero.
+    The entries are integers modulo a prime below 2**31; or, without modulus, fractions or floats, and what is below
+    ``tolerance`` is zero.
     """
     rows = reduced(rows.copy(), modulus)
     pivots: list[int] = []

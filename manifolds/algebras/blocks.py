@@ -222,7 +222,7 @@ class DirectSum(OnDemand):
     def site_casimirs(self, degree: int) -> list[SiteCasimirs]:
         """The Casimirs of the blocks, each a function of the whole mu with a value for every copy.
 
-        Of copies on sites the values have the shape ``(..., *sites)``.
+        Those of copies on sites have values of shape ``(..., *sites)``.
         """
         return [self._on_copies(F, g, count, start) for g, count, start in self._starts() for F in g.casimirs(degree)]
 

@@ -309,7 +309,7 @@ def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
 
 
 def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
-    """Of ``J X(mu)``, where the matrices keep one form J alone, up to a factor, and it is symmetric: so(p, q)."""
+    """The Pfaffian of ``J X(mu)``, where the matrices keep one form J alone, up to a factor, and J is symmetric."""
     m = X.shape[1]
     if m % 2 or m > LARGEST_COMMUTANT:
         return None

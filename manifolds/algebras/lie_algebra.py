@@ -286,7 +286,7 @@ class LieAlgebra:
     def killing_inner_product(self) -> Operator:
         """The form ``-kappa(x, theta y)`` as a matrix, theta a Cartan involution; ``-kappa`` where there is none.
 
-        Of a semisimple algebra it is positive definite. ``form @ x`` is the covector that it makes of x, shape (dim,).
+        On a semisimple algebra it is positive definite. ``form @ x`` is the covector that it makes of x, shape (dim,).
         """
         if not self.is_semisimple():
             return -self.killing_form()

@@ -160,24 +160,24 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def unitary_defect(g) -> jax.Array:
-    """Of ``g^H g`` from I, or of ``det g`` from 1."""
+    """Distance of ``g^H g`` from I, or of ``det g`` from 1."""
     return jnp.maximum(largest(unitary_inverse(g) @ g - jnp.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
 
 def rigid_defect(g) -> jax.Array:
-    """Of the linear part from the rotations, or of the last row from (0, …, 0, 1)."""
+    """Distance of the linear part from the rotations, or of the last row from (0, …, 0, 1)."""
     last = jnp.abs(g[..., -1, :] - jnp.eye(g.shape[-1])[-1]).max(axis=-1)
     return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last)
 
 
 def unimodular_defect(g) -> jax.Array:
-    """Of ``det g`` from 1, over the product of the norms of the rows: so far a relative change of g moves it."""
+    """Distance of ``det g`` from 1, over the norms of the rows, multiplied: a relative change of g moves it so far."""
     rows = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
     return jnp.abs(determinant(g) - 1.0) / jnp.maximum(rows, 1.0)
 
 
 def symplectic_defect(g) -> jax.Array:
-    """Of ``-J g^T J g`` from I."""
+    """Distance of ``-J g^T J g`` from I."""
     size = jnp.maximum(largest(g) ** 2, 1.0)
     return largest(symplectic_inverse(g) @ g - jnp.eye(g.shape[-1])) / size
 
@@ -189,7 +189,7 @@ def invertible_defect(g) -> jax.Array:
 
 
 def heisenberg_defect(g) -> jax.Array:
-    """Of the entries outside the first row and the last column from those of I."""
+    """Distance of the entries outside the first row and the last column from those of I."""
     return largest(jnp.where(_free(g), 0.0, g - jnp.eye(g.shape[-1])))
 
 

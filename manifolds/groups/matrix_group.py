@@ -180,8 +180,8 @@ class MatrixGroup:
         array, shape (..., dim)
             Accurate to rounding; where the logarithm itself is ill-conditioned, as for a pair of eigenvalues at the
             angles +-(pi - d) in a noncompact group, to about 1e-15/d. Its derivative is that of x along the group:
-            changes of g that leave the group are projected out. Of the two logarithms of a half turn, pi times an axis
-            and its negative, the one is returned whose first component that is not zero (1e-8 of the axis) is positive.
+            changes of g that leave the group are projected out. A half turn has two logarithms, pi times an axis and
+            its negative: the one is returned whose first component that is not zero (1e-8 of the axis) is positive.
             That holds up to 1e-8 from the half turn, where the angle may be larger than pi by as much. More than one
             plane turned by pi, and -I in SU(2), have a continuum of logarithms with nothing to choose one by.
 

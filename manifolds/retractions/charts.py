@@ -83,7 +83,7 @@ class EuclideanRetraction(Chart):
 class ProjectionRetraction(Chart):
     """``R_h(z, v) = (z, project(z + h v))``, on every space, also on one that does not know its geodesics.
 
-    Its inverse is found by Newton's method in the frame of z. Of first order with any projection, of second with the
+    Its inverse is found by Newton's method in the frame of z. The order is one with any projection, and two with the
     nearest point [Absil & Malick 2012].
     """
 

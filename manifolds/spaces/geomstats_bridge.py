@@ -31,7 +31,7 @@ _STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 """Weights of f(x + k h) - f(x - k h) in h f'(x), to order 8."""
 
 _STEP = 0.02
-"""Of the differences, as a length in the metric: the error h^8 f^(9)/630 is below the rounding eps/h for smooth f."""
+"""Step of the differences, a length in the metric: for smooth f their error h^8 f^(9)/630 is below rounding, eps/h."""
 
 
 def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsSpace:

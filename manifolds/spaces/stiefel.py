@@ -17,7 +17,7 @@ from ..matrices.symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
 
 _MOST_STEPS = 30
-"""Of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
+"""Iterations of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
 
 
 @register((4, 2))

@@ -155,7 +155,7 @@ class ContactForm(ContactStructure):
 class SplitContact(ContactStructure):
     """A contact structure whose bivector is a Poisson bivector and a rest: ``Lambda = Lambda_0 + Delta ^ R`` [SML 6].
 
-    Of the brackets, ``[f, g] = {f, g}_0 + {f, g}_Delta``: a reversible part, for which S is a Casimir function, and
+    The brackets are ``[f, g] = {f, g}_0 + {f, g}_Delta``: a reversible part, for which S is a Casimir function, and
     the thermodynamic one. Delta is the Liouville field ``p d/dp`` on T*Q x R [SML 2].
     """
 

@@ -85,10 +85,10 @@ def step_loop(
 class _Steps(Writer):
     """Writes ``advance(p, blocks, done, count, saves, every, out, most, noise, newton)``.
 
-    Every block from its step ``done`` to step ``saves * every``, what is kept of each so-manieth state in ``out``; the
-    increments that drive the steps are read from ``noise``, block by block. No further than ``most`` steps, or to where
-    a block needs Newton's method and ``newton`` is null: the number of that block is returned, and another call goes on
-    there; otherwise the number of blocks.
+    It advances each block from its step ``done`` to step ``saves * every`` and keeps states in ``out``, one in
+    ``every``. It reads the increments that drive the steps from ``noise``, block by block. A call takes ``most`` steps
+    at most, and ends where a block needs Newton's method and ``newton`` is null. It then returns the number of that
+    block, and another call goes on there; otherwise it returns the number of blocks.
     """
 
     def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool, kept):
@@ -169,7 +169,7 @@ class _Steps(Writer):
         self.run("conclude", build.load(truth["running"]))
 
     def drive(self, number: ir.Value) -> None:
-        """The increments of a step, from the so-manieth row of ``noise``."""
+        """The increments of a step, from the row of ``noise`` with this number."""
         build, slots = self.builder, self.slots["dW"]
         row = build.mul(number, self.whole_number(len(slots) * self.lanes))
         for j, slot in enumerate(slots):
@@ -238,7 +238,7 @@ class _Steps(Writer):
                 self.builder.store(self.builder.load(slot), self.place(self.layout.rows[name] + i), align=8)
 
     def keep(self, i: ir.Value, number: ir.Value) -> None:
-        """What is written down, as the so-manieth of block i in ``out``."""
+        """Write down what is kept, as the row of block i in ``out`` with this number."""
         build, argument = self.builder, self.argument
         kept = [slot for name in self.kept for slot in self.slots[name]]
         row = build.add(build.mul(i, argument["saves"]), build.sub(number, self.whole_number(1)))

@@ -207,7 +207,7 @@ class MachineCode:
             self._engine.finalize_object()
 
     def address(self, name: str) -> int:
-        """Of a function."""
+        """The address of a function."""
         return self._engine.get_function_address(name)
 
 

@@ -123,7 +123,7 @@ def solver(
     Parameters
     ----------
     pieces : mapping
-        ``begin``, a guess from the slopes of the steps before, and ``rest``, a step of nothing; ``misfit``, what the
+        ``begin``, a guess from the slopes of the steps before, and ``rest``, a step of size zero; ``misfit``, what the
         equations miss there; ``linearise``, what their derivative needs in every direction, and ``along``, the
         derivative in one; ``moved``, the guess after a step; ``halved``, after half of it is taken back; ``judge`` and,
         with the ``sound`` of the motion, ``settle``, whether it goes on; ``count``, what it took.
@@ -193,7 +193,7 @@ class _Solve(Writer):
     def _attempt(self) -> None:
         """Newton's method with whole steps, or with halved ones."""
         build = self.builder
-        # From the prediction, or from a step of nothing where that solves the equations better: far out Newton may
+        # From the prediction, or from a step of size zero where that solves the equations better: far out Newton may
         # wander.
         self._call("begin", "misfit")
         predicted = build.load(self._array("found"))
@@ -267,7 +267,7 @@ class _Solve(Writer):
                     )
 
     def _substitute(self, b: ir.Value) -> None:
-        """The solution of ``A y = b``, in the place of b, from the factors."""
+        """Replace b by the solution of ``A y = b``, from the factors."""
         build, m, matrix, order = (
             self.builder,
             self.whole_number(self.unknowns),

@@ -51,7 +51,7 @@ class CompiledEngine:
 
     @property
     def operations(self) -> int:
-        """Of a step."""
+        """How many scalar operations a step takes."""
         return self._stepper.operations
 
     def begin(self, x) -> State:
@@ -223,7 +223,7 @@ class Stepper:
         return whole[:, first : first + self._layout.sizes[name]]
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Of a field of one trajectory."""
+        """The shape of a field of one trajectory."""
         return self._shapes.get(name, ())
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:

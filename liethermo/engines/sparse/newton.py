@@ -197,7 +197,7 @@ def _noise(system: System, x) -> Any:
 
 @program
 def _better_start(system: System, method: OneStepMethod, state: State, h):
-    """The predicted slopes, or a step of nothing where that solves the equations better; with misfit and scale."""
+    """The predicted slopes, or a step of size zero where that solves the equations better; with misfit and scale."""
     misfit, guess, scale = _equations(system, method, state, h)
     k, found = better_start(misfit, guess)
     return k, found, scale(k)

@@ -64,7 +64,7 @@ class FiniteDifference(Module):
         return V
 
     def entropy(self, S0, s, h) -> jax.Array:
-        """Of two entropies; of two times likewise."""
+        """The entropy between two; a time between two is found in the same way."""
         return S0 + (self.beta * h) * s
 
     def ends(self, q0, V, h, F) -> tuple[jax.Array, jax.Array]:

@@ -44,7 +44,8 @@ def study(
     Parameters
     ----------
     dataset : xarray.Dataset
-        ``study.results``. Of more axes choose first: ``results.sel(rate=0.1, method="nearest")``.
+        ``study.results``, with two axes at most. Choose points on other axes first:
+        ``results.sel(rate=0.1, method="nearest")``.
     variable : str, optional
         The measure; by default the first with one number for each point.
     path : path, optional
@@ -116,7 +117,7 @@ def _is_geometric(places: np.ndarray) -> bool:
 
 
 def _edges(places: np.ndarray) -> np.ndarray:
-    """Of cells around places; in the middle between them, on a logarithmic axis in its middle."""
+    """The edges of cells around places: the middles between them, as the axis is scaled."""
     if len(places) == 1:
         return places[0] + np.array([-0.5, 0.5]) * (abs(places[0]) or 1.0)
     p = np.log(places) if _is_geometric(places) else places

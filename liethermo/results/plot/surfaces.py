@@ -53,9 +53,9 @@ def momentum_sphere(
     solution : Solution
         Of a system with three components, such as one on so(3)*.
     system : System, optional
-        What was integrated. Without it, as for a solution read from a file, the energy surface is the quadric through
-        all states if there is exactly one, and the entropy surfaces are spheres if the algebra is so(3) or su(2),
-        where every Casimir is a function of ``|mu|``; what remains unknown is left out. The axes are labelled by the
+        What was integrated. It is not known for a solution read from a file. The energy surface is then the quadric
+        through all states, if there is exactly one. The entropy surfaces are spheres if the algebra is so(3) or su(2),
+        where every Casimir is a function of ``|mu|``. What remains unknown is left out. The axes are labelled by the
         names of its algebra's basis elements, if they have some.
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.

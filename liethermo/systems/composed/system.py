@@ -115,7 +115,7 @@ class ComposedSystem(System):
     def split(self, x) -> tuple[jax.Array, ...]:
         """The states of the subsystems, shapes (..., dim_a), in a state or a batch of states.
 
-        Of :class:`Copies` in one array, shape (..., count, dim_a).
+        Those of :class:`Copies` are in one array, shape (..., count, dim_a).
         """
         found = jnp.split(self.state(x, batch=True), self._starts[1:-1], axis=-1)
         return tuple(

@@ -1,0 +1,75 @@
+"""Pages, docstrings and messages follow the rules in ``docs/vale``, whether Vale is installed or not."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+yaml = pytest.importorskip("yaml")
+
+ROOT = Path(__file__).parents[1]
+RULES = {path.stem: yaml.safe_load(path.read_text()) for path in sorted((ROOT / "docs/vale/liethermo").glob("*.yml"))}
+PAGES = [*ROOT.glob("*.md"), *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts)]
+MODULES = [*ROOT.glob("liethermo/**/*.py"), *ROOT.glob("manifolds/**/*.py")]
+
+
+def paragraphs_of_page(text: str) -> Iterator[str]:
+    """Prose alone: no code, tables, formulas or directives."""
+    text = re.sub(r"```.*?```|:::.*?:::|\$\$.*?\$\$|<!--.*?-->", "\n\n", text, flags=re.DOTALL)
+    for block in re.split(r"\n\s*\n|\n(?=\s*[-*#|] )", text):
+        if not block.lstrip().startswith(("|", "#", ":", "(")):
+            yield block.lstrip("-* ")
+
+
+def paragraphs_of_module(text: str) -> Iterator[str]:
+    """Docstrings, those of attributes too, by paragraphs and entries of lists of parameters."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            blocks = re.split(r"\n\s*\n|\n\s*-{3,}\s*\n|\n(?=\s*\S+(?:, \S+)* : )", node.value.value)
+            yield from (block for block in blocks if "====" not in block)  # no tables
+
+
+def faults(paragraph: str) -> Iterator[str]:
+    plain = re.sub(r"\s+", " ", re.sub(r"``.*?``|`.*?`|\$.*?\$|\[[^\]]*\]", "x", paragraph, flags=re.DOTALL)).strip()
+    sentences = re.split(r"(?<=[.!?;:]) ", plain)
+    for name, rule in RULES.items():
+        if rule["extends"] == "substitution":
+            found = [word for word in rule["swap"] if re.search(rf"\b{word}\b", plain, re.IGNORECASE)]
+        elif rule["extends"] == "existence":
+            found = [match.group() for raw in rule["raw"] for match in re.finditer(raw, plain)]
+        else:
+            found = [s for s in sentences if len(re.findall(rule["token"], s)) > rule["max"]]
+        yield from (f"{name}: {fault!r} in {plain[:160]!r}" for fault in found)
+
+
+@pytest.mark.parametrize("kind", ["pages", "modules"])
+def test_prose_follows_the_rules(kind):
+    files, paragraphs = (PAGES, paragraphs_of_page) if kind == "pages" else (MODULES, paragraphs_of_module)
+    assert len(files) > 20
+    found = [
+        f"{path.relative_to(ROOT)}: {fault}"
+        for path in files
+        for paragraph in paragraphs(path.read_text())
+        for fault in faults(paragraph)
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "Keep every so-manieth state.",
+        "It starts from a step of nothing.",
+        "Laws hold. Of the same energy the schemes keep the rest.",
+        "One idea " + "and another " * 40 + "is too much.",
+    ],
+)
+def test_a_fault_is_found(sentence):
+    assert list(faults(sentence))
+
+
+def test_every_rule_is_understood():
+    assert {rule["extends"] for rule in RULES.values()} == {"substitution", "existence", "occurrence"}
+    assert "docs/vale" in (ROOT / ".vale.ini").read_text()
