@@ -46,7 +46,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "code_links",
     "executed",
-    "momentum_sphere",
+    "moving_pictures",
     "offline_mathjax",
 ]
 
@@ -92,7 +92,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"liethermo {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_js_files = ["momentum_sphere.js"]
+html_js_files = ["turning.js", "momentum_sphere.js", "sphere_field.js"]
 html_show_sourcelink = False
 html_theme_options = {
     "logo": {"text": "liethermo"},

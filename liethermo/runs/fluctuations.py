@@ -18,7 +18,7 @@ from ..integrators.fluctuating import with_noise
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import at_points
-from .threefry import normal
+from .threefry import folded, normal
 
 BOUND = 6.0
 """Standard deviations that no random number exceeds, so that the equation of a step keeps a solution: one in 5e8 would,
@@ -80,6 +80,10 @@ class Fluctuations:
     def seeds(self) -> list[int]:
         """One, or one for each trajectory."""
         return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
+
+    def at(self, places: Sequence[np.ndarray]) -> np.ndarray:
+        """A seed for each point of a grid with these places along its axes: see :class:`liethermo.Study`."""
+        return folded(self.seeds[0], places)
 
     def of(self, i: int) -> Fluctuations:
         """The noise of one trajectory of an ensemble."""

@@ -6,6 +6,8 @@ generator behind JAX's keys; here in NumPy, which needs no program for every sha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import ndtri
 
@@ -26,6 +28,15 @@ def threefry(key, counter) -> tuple[np.ndarray, np.ndarray]:
             y = (y << np.uint32(rotation) | y >> np.uint32(32 - rotation)) ^ x
         x, y = x + words[(group + 1) % 3], y + words[(group + 2) % 3] + np.uint32(group + 1)
     return x, y
+
+
+def folded(seed: int, places: Sequence[np.ndarray]) -> np.ndarray:
+    """A seed below 2^63 for each point of a grid, from one seed and its places along the axes, shape (points,) each."""
+    count = len(places[0]) if places else 1
+    key = np.full(count, seed >> 32, np.uint32), np.full(count, seed & 0xFFFFFFFF, np.uint32)
+    for axis, place in enumerate(places):
+        key = threefry(key, (np.asarray(place).astype(np.uint32), np.full(count, axis, np.uint32)))
+    return (key[0].astype(np.int64) & 0x7FFFFFFF) << 32 | key[1].astype(np.int64)
 
 
 def normal(seeds: np.ndarray, members: np.ndarray, first: int, steps: int, count: int) -> np.ndarray:

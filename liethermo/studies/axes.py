@@ -24,13 +24,18 @@ class Zipped:
         The parameters.
     states : ndarray, shape (m, n), or None
         Initial states along the axis.
+    count : int
+        Of an axis that has neither.
     """
 
     columns: Mapping[str, np.ndarray]
     states: np.ndarray | None = None
+    count: int = 0
 
     def __len__(self) -> int:
-        return len(self.states) if self.states is not None else len(next(iter(self.columns.values())))
+        if self.states is not None:
+            return len(self.states)
+        return len(next(iter(self.columns.values()))) if self.columns else self.count
 
 
 def zipped(**columns) -> Zipped:
@@ -57,18 +62,20 @@ def zipped(**columns) -> Zipped:
 
 
 def replicas(states) -> Zipped:
-    """An axis of initial states: ``axes={"replica": lt.replicas(states)}``.
+    """An axis of initial states, ``axes={"replica": lt.replicas(states)}``, or of runs that noise alone sets apart.
 
     Parameters
     ----------
-    states : array, shape (m, n)
-        The initial state of each replica.
+    states : array, shape (m, n), or int
+        The initial state of each replica; or, of a study with noise, how many there are, each with its own seed.
 
     Raises
     ------
     InputError
         If the states are not such an array of finite numbers.
     """
+    if np.ndim(states) == 0:
+        return Zipped({}, count=_count(states))
     array = np.asarray(states, dtype=np.float64)
     if array.ndim != 2 or not array.size:
         raise InputError(f"replicas have initial states of shape (replicas, n), not {array.shape}")
@@ -197,7 +204,7 @@ class Axis:
         """What tells the places along the axis apart; numbers that rounding alone tells apart are the same."""
         states = [] if self.states is None else [[tuple(map(_key, row)) for row in self.states.tolist()]]
         columns = [list(map(_key, column.tolist())) for column in self.columns.values()]
-        return list(zip(*columns, *states, strict=True))
+        return list(zip(*(columns + states or [self.labels.tolist()]), strict=True))
 
 
 def _key(value: Any) -> Any:

@@ -49,6 +49,7 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
         "step": _step(task.step),
         "method": repr(task.method),
         "until": _until(task.until),
+        "noise": None if task.noise is None else task.noise.listed(),
         "measures": {name: measure.told() for name, measure in task.measures.items()},
         "values": {name: _numbers(columns.measures[name][0]) for name in task.measures},
     }
@@ -56,7 +57,7 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
 
 def provenance(described: Mapping[str, Any], engine: str) -> dict[str, Any]:
     """Where the results come from, for people."""
-    told = {key: described[key] for key in ("system", "method", "step", "t_span", "until")}
+    told = {key: described[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
     return {**told, **{f"{name}_version": version for name, version in described["versions"].items()}, "engine": engine}
 
 
@@ -64,9 +65,9 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]
     """In what two studies differ, a line each; empty for the same study."""
     same_versions = mine["versions"] == theirs["versions"]
     found = [
-        f"{key} is {mine[key]!r:.120}, and {theirs[key]!r:.120} in the store"
-        for key in ("system", "t_span", "step", "method", "until", "measures")
-        if mine[key] != theirs[key]
+        f"{key} is {mine[key]!r:.120}, and {theirs.get(key)!r:.120} in the store"
+        for key in ("system", "t_span", "step", "method", "until", "noise", "measures")
+        if mine[key] != theirs.get(key)
     ]
     if found:
         return found

@@ -69,7 +69,10 @@ def done(solver: Solver, store: Store, works: Sequence[Work]) -> tuple[int, floa
     points = {name: np.concatenate([work.points[name] for work in works]) for name in names}
     states = None if works[0].states is None else np.concatenate([w.states for w in works if w.states is not None])
     sizes = [len(work) for work in works]
-    arrays = solver.columns(points, states, sum(sizes)).arrays()
+    noise, seeds = solver.task.noise, None
+    if noise is not None:
+        seeds = noise.at([np.concatenate(column) for column in zip(*(work.places for work in works), strict=True)])
+    arrays = solver.columns(points, states, sum(sizes), seeds).arrays()
     start = 0
     for work, size in zip(works, sizes, strict=True):
         own = {name: values[start : start + size] for name, values in arrays.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from ..results.evidence import laws_functions, sizes
 from ..results.many import laws_of_many
 from ..results.status import Laws
 from ..runs.ensemble import ensemble
+from ..runs.fluctuations import Fluctuations
 from ..systems import System
 from ..tracing.interpret import at_points
 from ..tracing.remembered import Latest
@@ -78,6 +79,7 @@ class Task:
     example: Mapping[str, Any]
     save_at: tuple[float, ...] | None
     saves: int
+    noise: Fluctuations | None = None
 
 
 @dataclass
@@ -115,6 +117,10 @@ class Summary:
             raise AttributeError(name) from None
 
 
+SPARE = 2**63 - 2**32
+"""Seeds from here on belong to no point."""
+
+
 class Solver:
     """A task with what has been found for it once: the family of its systems, and the engine that they run on."""
 
@@ -131,8 +137,9 @@ class Solver:
         self.laws: Laws | None = None
         self.engine: Any = task.engine
 
-    def columns(self, points: Points, states: np.ndarray | None, size: int) -> Columns:
-        """What is kept of some points, with their initial states where they bring some."""
+    def columns(self, points: Points, states: np.ndarray | None, size: int, seeds: np.ndarray | None = None) -> Columns:
+        """What is kept of some points, with their initial states where they bring some, and their seeds with noise."""
+        self._seeds = seeds
         reasons: dict[int, str] = {} if self.members.family is None else self.members.refused(points, size)
         x0s, attitudes = states, None
         if self._x0 is not None:
@@ -197,7 +204,12 @@ class Solver:
             rows = chosen[np.minimum(np.arange(number), len(chosen) - 1)]
             family = self.members.at(points, rows)
         attitude = None if attitudes is None else attitudes[rows]
-        options: dict[str, Any] = {"until": task.until, "save_at": task.save_at, "attitude": attitude}
+        noise = None
+        if task.noise is not None and self._seeds is not None:
+            filling = SPARE + np.arange(len(rows))  # seeds of those that only fill up, no two alike
+            filling[: len(chosen)] = self._seeds[chosen]
+            noise = replace(task.noise, seed=tuple(map(int, filling[: len(rows)])))
+        options: dict[str, Any] = {"until": task.until, "save_at": task.save_at, "attitude": attitude, "noise": noise}
         found = ensemble(
             family, x0s[rows], task.t_span, task.step, task.method, progress=False,
             outputs=self._outputs, engine=self.engine, **{k: v for k, v in options.items() if v is not None},

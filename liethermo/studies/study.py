@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
+from ..runs.fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from ..runs.preparation import check_choice
 from ..runs.timetable import Timetable
 from ..systems import System
@@ -80,6 +81,9 @@ class Study:
         Folder of the results. Without one they are kept until this object is gone.
     attitude : array, shape (m, m), or function from the dict of a point to one, optional
         As for :func:`integrate`.
+    noise : Fluctuations, optional
+        As for :func:`integrate`. Every point has a seed of its own, made from that of the noise and from its place on
+        the axes alone: chunks, workers and longer axes do not change it.
     chunk : int, optional
         Points of a chunk, about: what is in memory at once, and what is lost at most where a run is killed.
     units, names : dict from str to str, optional
@@ -107,6 +111,7 @@ class Study:
         until: Any = None,
         engine: Literal["auto", "array", "compiled"] = "auto",
         attitude: Any = None,
+        noise: Fluctuations | None = None,
         chunk: int | None = None,
         units: Mapping[str, str] | None = None,
         names: Mapping[str, str] | None = None,
@@ -117,7 +122,8 @@ class Study:
         taken = {*self._axes.names, *self._axes.parameters}
         if both := taken & {*self._measures}:
             raise InputError(f"{both.pop()!r} is a measure and an axis")
-        method = DEFAULT_METHOD if method is None else method
+        check_noise(noise)
+        method = (DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE) if method is None else method
         if not isinstance(method, OneStepMethod):
             raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
         check_choice("engine", engine, ("auto", "array", "compiled"))
@@ -161,7 +167,7 @@ class Study:
         parameters = self._axes.parameters
         self._task = Task(
             builder(build, parameters), parameters, x0, attitude, (table.start, table.end), step, method, until, engine,
-            self._measures, {}, save_at, saves,
+            self._measures, {}, save_at, saves, noise,
         )  # fmt: skip
         self._solved: tuple[Solver, Columns, np.ndarray] | None = None
         self._place: tuple[int, ...] = ()
@@ -325,7 +331,8 @@ class Study:
         axes, places = (self._axes, self._candidates()) if axes is None else (axes, [place])
         first, failed = "", 0
         for place in places:
-            why, built = self._tried(*_at(axes, place))
+            seeds = None if self._task.noise is None else self._task.noise.at([np.array([i]) for i in place])
+            why, built = self._tried(*_at(axes, place), seeds)
             if self._solved is not None and not why:
                 self._place = place
                 return self._solved
@@ -341,7 +348,7 @@ class Study:
         numbers = dict.fromkeys(int(size * _spread(k)) for k in range(TRIED))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
 
-    def _tried(self, point: dict[str, Any], states: np.ndarray | None) -> tuple[str, bool]:
+    def _tried(self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None) -> tuple[str, bool]:
         """Solve a point by itself; why it cannot be, or nothing, and whether its system was built."""
         self._solved = None
         self._check_axes(point)
@@ -349,7 +356,7 @@ class Study:
             solver = Solver(dataclasses.replace(self._task, example=point))
         except Exception as error:  # the builder may be anyone's, and may raise at some points
             return told(error), False
-        columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1)
+        columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1, seeds)
         if columns.status[0] in (Code.INADMISSIBLE, MEASURE_FAILED):
             return columns.message[0], True
         measures = {name: _shaped(measure, columns.measures[name][0]) for name, measure in self._measures.items()}

@@ -111,7 +111,7 @@ def test_longer_axes_run_the_new_points_alone(done, tmp_path):
 
     def watched(solver, store, axes, survey, bar):
         columns = solver.columns
-        solver.columns = lambda points, states, size: asked.append(size) or columns(points, states, size)
+        solver.columns = lambda points, states, size, seeds=None: asked.append(size) or columns(points, states, size, seeds)
         here(solver, store, axes, survey, bar)
         del solver.columns
 
@@ -455,3 +455,51 @@ def test_a_process_that_is_killed_loses_what_it_was_at(repetitions, done, tmp_pa
         assert study(store).run().complete
         assert content(store) == content(done[0])
     assert repetitions == 1 or partly > repetitions // 3, "kills fell too early or too late to mean much"
+
+
+def spin_in_a_bath(point):
+    field = jnp.array([0.0, 0.0, 1.0])
+    return lt.LiePoissonSystem(mf.so(3), lambda m: -m @ field, dissipation=lt.DoubleBracket(point["rate"]))
+
+
+def test_noise_of_a_point_is_its_own(tmp_path):
+    """Chunks, other points and longer axes do not change it; another seed, or another place, does."""
+
+    def study(rates, name, chunk, seed=3):
+        return lt.Study(
+            spin_in_a_bath, {"rate": rates, "copy": lt.replicas(4)}, x0=[0.6, 0.0, 0.8], t_span=(0.0, 1.0), step=0.1,
+            measure={"final": "final"}, noise=lt.Fluctuations(0.2, seed, temperature=1.0), chunk=chunk,
+            store=tmp_path / f"{name}.zarr",
+        )  # fmt: skip
+
+    rates = [0.5, 1.0]
+    whole, cut = study(rates, "whole", 64), study(rates, "cut", 3)
+    whole.run()
+    cut.run()
+    ends = whole.results["final"].values
+    assert np.array_equal(ends, cut.results["final"].values)
+    assert len(np.unique(ends[..., 0])) == 8, "every point has its own"
+    longer = study([*rates, 2.0], "whole", 64)
+    longer.run()
+    assert np.array_equal(longer.results["final"].values[:2], ends)
+    other = study(rates, "other", 64, seed=4)
+    other.run()
+    assert not np.array_equal(other.results["final"].values, ends)
+    with pytest.raises(lt.InputError, match="noise"):
+        study(rates, "whole", 64, seed=4).run()
+    assert np.abs(np.linalg.norm(ends, axis=-1) - 1.0).max() < 1e-14
+
+
+def test_noise_at_a_place_is_that_of_its_seed(tmp_path):
+    noise = lt.Fluctuations(0.2, 3, temperature=1.0)
+    study = lt.Study(
+        spin_in_a_bath, {"rate": [0.5, 1.0]}, x0=[0.6, 0.0, 0.8], t_span=(0.0, 1.0), step=0.1,
+        measure={"final": "final"}, noise=noise, store=tmp_path / "one.zarr",
+    )  # fmt: skip
+    study.run()
+    seed = int(noise.at([np.array([1])])[0])
+    alone = lt.integrate(
+        spin_in_a_bath({"rate": 1.0}), [0.6, 0.0, 0.8], (0.0, 1.0), 0.1,
+        noise=lt.Fluctuations(0.2, seed, temperature=1.0),
+    )  # fmt: skip
+    assert np.abs(study.results["final"].values[1] - alone.x[-1]).max() < 1e-14

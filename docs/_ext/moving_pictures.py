@@ -1,9 +1,14 @@
-"""A Sphinx extension: the directive ``momentum-sphere``, a moving picture of a relaxing body, computed by the build."""
+"""A Sphinx extension: moving pictures that a reader can turn, computed by the build.
+
+``momentum-sphere`` is a relaxing body on its energy surface, ``sphere-field`` a decaying flow on the sphere. The
+content of each directive says in words what it shows.
+"""
 
 from __future__ import annotations
 
 import html
 import json
+from collections.abc import Callable
 
 import numpy as np
 from docutils import nodes
@@ -25,7 +30,7 @@ def _motion(system, start, end: float, step: float, digits: int = 4) -> list[lis
     return np.round(solution.x, digits).tolist()
 
 
-def scene() -> dict:
+def relaxing_body() -> dict:
     """Free motions on the energy ellipsoid, and one that relaxes."""
     import liethermo as lt
 
@@ -45,21 +50,57 @@ def scene() -> dict:
     return {"axes": axes.tolist(), "orbits": orbits, "relaxing": relaxing}
 
 
-class MomentumSphere(Directive):
-    """The picture; the content of the directive says in words what it shows."""
+FLUID, GRID, FRAMES, END = 20, (32, 64), 25, 60.0
+"""The flow of the gallery's example: its N, the grid that is drawn, the number of pictures and when it ends."""
+
+
+def decaying_flow() -> dict:
+    """The vorticity of a flow on the sphere whose enstrophy falls, on a grid, at equal times."""
+    import liethermo as lt
+
+    sphere = lt.models.QuantisedSphere(FLUID)
+    flow = lt.models.zeitlin(FLUID, decay="enstrophy", rate=0.3)
+    start = sphere.random(seed=3, degrees=(2, 8), enstrophy=40.0)
+    every = round(END / 0.04 / (FRAMES - 1))
+    method = lt.MetriplecticRungeKutta(4)
+    solution = lt.integrate(flow, start, (0.0, END), 0.04, method, save_every=every, engine="array")
+    if not solution.audit().passed:
+        raise RuntimeError(f"the picture's own run breaks a law:\n{solution.audit()}")
+    frames = np.stack([sphere.on_grid(mu, GRID) for mu in solution.x])
+    return {
+        "rows": GRID[0],
+        "columns": GRID[1],
+        "largest": float(np.round(np.abs(frames[0]).max(), 2)),
+        "times": np.round(solution.t, 2).tolist(),
+        "frames": np.round(frames, 2).reshape(len(frames), -1).tolist(),
+    }
+
+
+class _Moving(Directive):
+    """A canvas, and the scene that its script draws."""
 
     has_content = True
+    scene: Callable[[], dict]
 
     def run(self) -> list[nodes.Node]:
         words = html.escape(" ".join(self.content), quote=True)
-        data = json.dumps(scene(), separators=(",", ":"))
+        data = json.dumps(type(self).scene(), separators=(",", ":"))
         markup = (
-            f'<canvas class="momentum-sphere" role="img" aria-label="{words}" tabindex="0"></canvas>'
-            f'<script type="application/json" class="momentum-sphere-data">{data}</script>'
+            f'<canvas class="{self.name}" role="img" aria-label="{words}" tabindex="0"></canvas>'
+            f'<script type="application/json" class="{self.name}-data">{data}</script>'
         )
         return [nodes.raw("", markup, format="html")]
 
 
+class MomentumSphere(_Moving):
+    scene = staticmethod(relaxing_body)
+
+
+class SphereField(_Moving):
+    scene = staticmethod(decaying_flow)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("momentum-sphere", MomentumSphere)
+    app.add_directive("sphere-field", SphereField)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
