@@ -111,7 +111,7 @@ def test_longer_axes_run_the_new_points_alone(done, tmp_path):
 
     def watched(solver, store, axes, survey, bar):
         columns = solver.columns
-        solver.columns = lambda points, states, size, seeds=None: asked.append(size) or columns(points, states, size, seeds)
+        solver.columns = lambda points, states, size, *rest: asked.append(size) or columns(points, states, size, *rest)
         here(solver, store, axes, survey, bar)
         del solver.columns
 
