@@ -118,8 +118,10 @@ def ensemble(
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
     states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
-    run = np.setdiff1d(np.arange(len(states)), list(reasons))
-    family, states = family.select(run), states[run]
+    run = np.arange(len(states))
+    if reasons:
+        run = np.setdiff1d(run, list(reasons))
+        family, states = family.select(run), states[run]
     told = member = family.representative
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
@@ -183,8 +185,9 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
     InputError
         If none can.
     """
-    good = np.setdiff1d(np.arange(family.size), list(family.refused))
-    member = family.member(int(good[0])) if family.example is None else family.example
+    member = family.example
+    if member is None:
+        member = family.member(next(i for i in range(family.size) if i not in family.refused))
     x0s, bad = _states(member, x0s)
     size = common_size(len(x0s), family.size, attitudes)
     states = np.broadcast_to(x0s, (size, x0s.shape[1]))

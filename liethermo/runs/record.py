@@ -166,10 +166,10 @@ class Alone:
     """Finds one trajectory of an ensemble as a run of its own would present it."""
 
     def __init__(self, record: Record, method: OneStepMethod, run: np.ndarray):
-        self.record, self.method, self.places = record, method, {int(i): j for j, i in enumerate(run)}
+        self.record, self.method, self.run = record, method, run
 
     def __call__(self, many: Ensemble, i: int) -> Solution:
-        record, j, plain = self.record, self.places[i], many.member(i)
+        record, j, plain = self.record, int(np.searchsorted(self.run, i)), many.member(i)
         system = record.family.member(j)
         if record.path is None:
             assert record.x is not None

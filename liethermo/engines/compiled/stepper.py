@@ -162,7 +162,8 @@ class Stepper:
         }
         self._pieces = {name: self._piece(*spec) for name, spec in self._programs(programs).items()}
         loop = self._pieces["iterate"]
-        changing = [i for i, name in enumerate(loop.arguments) if name in ITERATION]
+        still = ("p", "h") if method.explicit else [name for name in loop.arguments if name not in ITERATION]
+        changing = [i for i, name in enumerate(loop.arguments) if name not in still]
         self._pieces["iterate"] = loop._replace(program=loop.program.factored(changing))
         own_size = int(varies.sum())
         working = (*ITERATION, *after, "defined", "newtons", "noise")
@@ -228,13 +229,19 @@ class Stepper:
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields of :class:`.stepping.State`, trajectories first."""
-        number, rows = len(fields["x"]), self._layout.rows
-        whole = np.zeros((number, self._layout.height))
-        for name, values in fields.items():
-            whole[:, rows[name] : rows[name] + self._layout.sizes[name]] = np.reshape(values, (number, -1))
         if self._varies.any() and "p" not in fields:
-            whole[:, rows["p"] : rows["p"] + self._layout.sizes["p"]] = parameters[:, self._varies]
-        return self.of_rows(whole)
+            fields = fields | {"p": parameters[:, self._varies]}
+        number = len(fields["x"])
+        count = -(-number // self.lanes)
+        whole = np.zeros((count, self._layout.height, self.lanes))
+        for name, values in fields.items():
+            rows = np.reshape(values, (number, -1))
+            if number < count * self.lanes:  # some lanes stay empty
+                rows = np.concatenate([rows, np.repeat(rows[-1:], count * self.lanes - number, axis=0)])
+            first = self._layout.rows[name]
+            whole[:, first : first + self._layout.sizes[name]] = rows.reshape(count, self.lanes, -1).swapaxes(1, 2)
+        whole[-1, self._layout.rows["status"], self.lanes - (count * self.lanes - number) :] = EMPTY
+        return whole.reshape(count, -1)
 
     def block_of(self, state: State) -> np.ndarray:
         """The only block of a trajectory by itself."""
