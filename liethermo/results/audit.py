@@ -11,6 +11,7 @@ from manifolds._tables import Row, html_table, table
 
 from ..engines.codes import Code
 from ..errors import InputError
+from ..functions.gradients import EPS
 
 if TYPE_CHECKING:
     from .evidence import Evidence
@@ -34,9 +35,6 @@ class Record(Protocol):
     def laws(self) -> Laws: ...
     @property
     def evidence(self) -> Evidence: ...
-
-
-EPS = float(np.finfo(np.float64).eps)
 
 
 VALUE = 8 * EPS

@@ -204,7 +204,7 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
 def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
     """Initial states, shape (trajectories, n), and those among them that are none, and why."""
     try:
-        return np.atleast_2d(member.numbers(x0s, batch=True)), {}
+        return np.atleast_2d(np.asarray(member.numbers(x0s, batch=True))), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiub" or not len(rows):
@@ -226,4 +226,4 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
         raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")
     filled = rows.copy()
     filled[list(bad)] = rows[good[0]]
-    return member.numbers(filled, batch=True), bad
+    return np.asarray(member.numbers(filled, batch=True)), bad

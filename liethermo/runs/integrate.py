@@ -6,6 +6,9 @@ import os
 from collections.abc import Callable
 from typing import Literal
 
+import jax
+import numpy as np
+
 from ..engines.codes import Code
 from ..errors import ConvergenceError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
@@ -122,6 +125,7 @@ def integrate(
             "are for runs without"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
+    x: jax.Array | np.ndarray
     if isinstance(system, AttitudeSystem):
         x = system.begin(x0, attitude)
     elif isinstance(system, DrivenSystem):

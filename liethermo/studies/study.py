@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from manifolds.errors import warn
 
@@ -19,13 +21,14 @@ from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
+from ..runs.events import Relaxed
 from ..runs.fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from ..runs.preparation import check_choice
 from ..runs.timetable import Timetable
 from ..systems import System
 from . import files, identity
-from .axes import Axes
-from .measures import AtTimes, Measure, OfSolution, measures_of
+from .axes import Axes, Zipped
+from .measures import At, AtTimes, Measure, OfSolution, measures_of
 from .members import ASKED, Watched, builder, plain
 from .progress import Bar, StudyStatus
 from .running import here, spread
@@ -100,22 +103,22 @@ class Study:
     def __init__(
         self,
         build: System | Callable[[dict], System],
-        axes: Mapping[str, Any],
+        axes: Mapping[str, Sequence | np.ndarray | Zipped],
         *,
-        x0: Any = None,
+        x0: npt.ArrayLike | Callable[[dict], npt.ArrayLike] | None = None,
         t_span: tuple[float, float],
         step: float | Adaptive,
         method: OneStepMethod | None = None,
-        measure: Mapping[str, Any],
-        store: Any = None,
-        until: Any = None,
+        measure: Mapping[str, str | Relaxed | At | Callable],
+        store: str | os.PathLike | None = None,
+        until: Relaxed | Callable | None = None,
         engine: Literal["auto", "array", "compiled"] = "auto",
-        attitude: Any = None,
+        attitude: npt.ArrayLike | Callable[[dict], npt.ArrayLike] | None = None,
         noise: Fluctuations | None = None,
         chunk: int | None = None,
         units: Mapping[str, str] | None = None,
         names: Mapping[str, str] | None = None,
-        spec: Mapping[str, Any] | None = None,
+        spec: Mapping[str, object] | None = None,
     ):
         self._axes = Axes.of(axes)
         self._measures, until = measures_of(measure, until)
@@ -174,7 +177,7 @@ class Study:
 
     # -- running --------------------------------------------------------------------------------------------------
 
-    def run(self, client: Any = None, *, progress: bool | None = None) -> StudyStatus:
+    def run(self, client: object = None, *, progress: bool | None = None) -> StudyStatus:
         """Do what is not done, and keep it: nothing is done twice.
 
         Parameters

@@ -242,7 +242,7 @@ class System(Kind):
         numbers = self.numbers(x, batch)
         return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)
 
-    def numbers(self, x, batch: bool = False) -> Any:
+    def numbers(self, x, batch: bool = False) -> np.ndarray | jax.Array:
         """What :meth:`state` makes of x, as an array of NumPy where its values are known."""
         if not isinstance(x, jax.Array):
             try:

@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..audit import EPS, LAW_FAILS, Audit
+from ...functions.gradients import EPS
+from ..audit import LAW_FAILS, Audit
 from ..solution import Solution
 from .figures import BLUE, DPI, GREEN, GREY, RED, finished, writable
 
