@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, TypeVar
 
 import jax
-import scipy.sparse
+import scipy
 
 from manifolds._module import Module
 

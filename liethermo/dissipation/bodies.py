@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from manifolds.structures.contact import Places

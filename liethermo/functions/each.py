@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from manifolds._arrays import is_traced, real_array
 from manifolds.structures.spins import cross

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import scipy.sparse
+import scipy
 
 from .energy import Energy
 from .indices import as_pattern

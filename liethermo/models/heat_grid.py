@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from manifolds._arrays import is_traced
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = np.uint32(0x1BD11BDA)
@@ -61,5 +61,5 @@ def normal(seeds: np.ndarray, members: np.ndarray, first: int, steps: int, count
             numbers = np.arange(first + start, first + min(start + portion, steps), dtype=np.uint32)[:, None]
             high, low = threefry(own, (numbers, places))
             bits = high.astype(np.uint64) << np.uint64(32) | low
-            found[i, start : start + portion] = ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+            found[i, start : start + portion] = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
     return found

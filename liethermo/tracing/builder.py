@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 Scalar = str | float | int | bool
 
@@ -37,8 +37,8 @@ ELEMENTARY: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
     **{name: getattr(np, name) for name in "sinh cosh tanh floor ceil".split()},
     **{f"a{name}": getattr(np, f"arc{name}") for name in "sin cos tan tan2 sinh cosh tanh".split()},
-    "erf": scipy.special.erf,
-    "erfc": scipy.special.erfc,
+    "erf": lambda x: scipy.special.erf(x),
+    "erfc": lambda x: scipy.special.erfc(x),
     "is_finite": np.isfinite,
     **{name: getattr(operator, name) for name in "eq ne lt le gt ge xor".split()},
     "and": operator.and_,

@@ -8,7 +8,7 @@ from fractions import Fraction
 from numbers import Rational
 
 import numpy as np
-import scipy.sparse as sp
+import scipy
 
 LARGEST_DENOMINATOR = 1000
 
@@ -62,20 +62,27 @@ def _fraction(value) -> Fraction | None:
     return fraction if float(fraction) == number else None
 
 
-def jacobi_sums(constants: np.ndarray) -> sp.coo_array:
-    """``[[a,b],c] + [[b,c],a] + [[c,a],b]`` for all triples, as a sparse (dim^3, dim) array; exact for integers."""
+DENSE = 12
+"""Dimension up to which all triples of elements are looked at in one array."""
+
+
+def jacobi_sums(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The components of ``[[a,b],c] + [[b,c],a] + [[c,a],b]`` that are not zero, and the numbers of their triples.
+
+    They are exact for integers.
+    """
     dim = constants.shape[0]
-    if constants.dtype == object:
+    if constants.dtype == object or dim <= DENSE:
         nested = np.tensordot(constants, constants, axes=(2, 0))
-        total = nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)
-        at = np.nonzero(total.reshape(dim**3, dim))
-        return sp.coo_array((total.reshape(dim**3, dim)[at].astype(float), at), shape=(dim**3, dim))
-    rows = sp.csr_array(constants.reshape(dim * dim, dim))
-    columns = sp.csr_array(constants.reshape(dim, dim * dim))
+        total = (nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)).reshape(dim**3, dim)
+        triples, components = np.nonzero(total)
+        return total[triples, components].astype(float), triples
+    rows = scipy.sparse.csr_array(constants.reshape(dim * dim, dim))
+    columns = scipy.sparse.csr_array(constants.reshape(dim, dim * dim))
     nested = (rows @ columns).tocoo()  # entry ((a, b), (c, f)) is the component f of [[e_a, e_b], e_c]
     ab, cf = nested.coords
     (a, b), (c, f) = divmod(ab, dim), divmod(cf, dim)
     triples = np.concatenate([(a * dim + b) * dim + c, (c * dim + a) * dim + b, (b * dim + c) * dim + a])
-    sums = sp.coo_array((np.tile(nested.data, 3), (triples, np.tile(f, 3))), shape=(dim**3, dim))
+    sums = scipy.sparse.coo_array((np.tile(nested.data, 3), (triples, np.tile(f, 3))), shape=(dim**3, dim))
     sums.sum_duplicates()
-    return sums
+    return sums.data, sums.coords[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 
 from ..errors import (
     AntisymmetryError,
@@ -54,7 +53,7 @@ def constants_of_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
         raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
     matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
     columns = real_columns(matrices)
-    singular = scipy.linalg.svdvals(columns)
+    singular = np.linalg.svd(columns, compute_uv=False)
     if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
         raise ClosureError(
             f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
@@ -65,7 +64,7 @@ def constants_of_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     products = np.einsum("aij,bjk->abik", matrices, matrices)
     commutators = real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
     commutators[:, np.linalg.norm(commutators, axis=0) <= AXIOM_TOLERANCE] = 0.0
-    coordinates, *_ = scipy.linalg.lstsq(columns, commutators)
+    coordinates, *_ = np.linalg.lstsq(columns, commutators, rcond=None)
     residuals = np.abs(columns @ coordinates - commutators).max(axis=0)
     tolerance = 1e-10
     if residuals.max() > tolerance:
@@ -99,12 +98,12 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
             tolerance=tolerance,
             indices=(a, b),
         )
-    sums = jacobi_sums(constants)
+    sums, triples = jacobi_sums(constants)
     tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
-    worst = int(np.abs(sums.data).argmax()) if sums.nnz else -1
-    if worst >= 0 and abs(sums.data[worst]) > tolerance:
-        residual = abs(float(sums.data[worst])) * unit**2
-        a, b, c = sorted(int(i) for i in np.unravel_index(sums.coords[0][worst], constants.shape))
+    worst = int(np.abs(sums).argmax()) if sums.size else -1
+    if worst >= 0 and abs(sums[worst]) > tolerance:
+        residual = abs(float(sums[worst])) * unit**2
+        a, b, c = sorted(int(i) for i in np.unravel_index(triples[worst], constants.shape))
         raise JacobiError(
             f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
             f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "

@@ -13,7 +13,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from .._arrays import as_numeric, real_components
 from .._sizes import check_memory, checked_size

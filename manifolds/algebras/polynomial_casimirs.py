@@ -9,8 +9,7 @@ from functools import lru_cache
 from itertools import combinations_with_replacement
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ..errors import JacobiError, LieAlgebraError
 from ._null_space import numerical_null_space, numerical_rank, prime, rational_null_space, reduced, row_echelon
@@ -119,7 +118,7 @@ class TooLargeError(LieAlgebraError):
     """More monomials than the linear algebra is asked to take."""
 
 
-def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, sp.csc_array]:
+def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """The maps ``F -> sum_{a,c} C[a, b, c] mu_c dF/dmu_a`` on polynomials of one degree, one below the other.
 
     Returns the monomials as their sorted factors, shape (n, degree), in lexicographic order, and a sparse
@@ -143,15 +142,15 @@ def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, sp.csc_
         values.append(constants[a, b, c][entry])
     coordinates = np.concatenate(rows), np.concatenate(columns)
     shape = (maps * len(factors), len(factors))
-    conditions = sp.csc_array(sp.coo_array((np.concatenate(values), coordinates), shape=shape))
+    conditions = scipy.sparse.csc_array(scipy.sparse.coo_array((np.concatenate(values), coordinates), shape=shape))
     conditions.eliminate_zeros()
     return factors, conditions
 
 
-def _blocks(conditions: sp.csc_array) -> list[np.ndarray]:
+def _blocks(conditions: scipy.sparse.csc_array) -> list[np.ndarray]:
     """The columns in groups that no condition couples to one another: weight spaces, parities and the like."""
     pattern = conditions.astype(bool).astype(np.int64)
-    _, block_of = connected_components(pattern.T @ pattern, directed=False)
+    _, block_of = scipy.sparse.csgraph.connected_components(pattern.T @ pattern, directed=False)
     return np.split(np.argsort(block_of, kind="stable"), np.cumsum(np.bincount(block_of))[:-1])
 
 

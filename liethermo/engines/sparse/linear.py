@@ -6,9 +6,7 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.sparse.linalg
+import scipy
 
 WIDEST = 1_000
 """Widest level of a breadth-first search up to which a matrix is factorised.

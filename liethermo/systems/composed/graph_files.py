@@ -10,7 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from ...errors import FileError, InputError
 from ...functions.edges import edges
