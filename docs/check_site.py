@@ -48,6 +48,7 @@ SHOWN = (
     "howto/index",
     "explanation/index",
     "explanation/accuracy",
+    "explanation/large_systems",
     "reference/api",
     "reference/benchmarks",
     "reference/generated/manifolds.LieAlgebra",
