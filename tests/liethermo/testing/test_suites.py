@@ -45,7 +45,7 @@ def test_a_dissipation_that_loses_energy():
     system = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lt.Quadratic(np.ones(3)), Leaking(rate=0.2), validate=False
     )
-    with pytest.raises(testing.PropertyError, match=r"any vector in the place of grad H is in the kernel .*FAILS"):
+    with pytest.raises(testing.PropertyError, match=r"any vector instead of grad H is in the kernel .*FAILS"):
         testing.check_dissipation(system)
 
 
