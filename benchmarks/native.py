@@ -97,7 +97,7 @@ class Body:
         self._library, self._parameters = program(source, *options), np.array(parameters, dtype=float)
 
     def integrate(self, x0, step: float, steps: int, every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """``steps`` steps from x0; every so-manieth state, by default the last, and a record of :func:`run_type`."""
+        """``steps`` steps from x0; every n-th state, by default the last, and a record of :func:`run_type`."""
         every = steps if every is None else every
         x0 = np.ascontiguousarray(x0, dtype=float)
         saves, run = steps // every, np.zeros(1, run_type(len(x0)))

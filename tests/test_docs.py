@@ -149,28 +149,3 @@ def test_a_name_that_does_not_exist_is_found(code_links):
 def code_links(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
     return importlib.import_module("code_links")
-
-
-FOREIGN = {
-    r"so-manieth|manieth": "every n-th",
-    r"step of nothing": "a step of zero",
-    r"^Of (the|a|every) [^.;]*\bthe (schemes|method|library|system)s? ": "subject, verb, object",
-    r"\b(thereof|therein|hereby|whereby|heretofore)\b": "name the thing",
-    r"\b(utilize|leverage|in order to|a number of)\b": "use, use, to, how many",
-    r"\bcolour-?bar\b": "color bar",
-}
-"""Turns of phrase that the pages do not use, and what to write."""
-
-
-@pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_the_prose_of_a_page(page):
-    found = [
-        f"{match.group(0)!r}: {better}"
-        for pattern, better in FOREIGN.items()
-        for match in re.finditer(pattern, _words(page), re.MULTILINE | re.IGNORECASE)
-    ]
-    assert found == []
-
-
-def test_the_prose_test_finds_what_it_is_for():
-    assert re.search(next(iter(FOREIGN)), "Keep every so-manieth state")
