@@ -124,6 +124,6 @@ class KillingDissipation(OfBracket):
 
 
 def _factor(system, dH, form) -> Factor | None:
-    """The factor;  ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes: C is skew in a, b, H_ab not."""
+    """The factor of ``ad*_dH 𝒦 ad_dH``. As C is skew in a, b, ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes."""
     root, g = root_of(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

@@ -19,6 +19,7 @@ from .pacing import (
     ARRIVED,
     FINISHED,
     LOOKING,
+    TOLD,
     Pace,
     Pacing,
     begin,
@@ -31,7 +32,7 @@ from .pacing import (
     reach,
 )
 from .rules import RULES
-from .stepping import TELLING, State, take_step
+from .stepping import State, take_step
 
 
 class Paces(Protocol):
@@ -68,8 +69,7 @@ class OnePace(Paces, Protocol):
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         """Make so many attempts, or fewer.
 
-        Returns, attempts first, the number of the step after each, the time "t" and the size "taken"; after those that
-        others follow all of :data:`.stepping.TELLING` too.
+        Returns, attempts first, what :data:`.pacing.TOLD` names of each.
         """
         ...
 
@@ -131,7 +131,7 @@ class SinglePaces(_ArrayPaces):
             self.pace = follow(self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES)
         else:
             self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
-        return {name: self.read(name) for name in (*TELLING, "t", "taken")}
+        return {name: self.read(name) for name in TOLD}
 
 
 class VmapPaces(_ArrayPaces):

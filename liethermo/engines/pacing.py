@@ -62,6 +62,10 @@ ARRIVED, LOOKING, CAUGHT, FINISHED = 20, 21, 22, 23
 is to be looked at; an event happens in the step that was tried; it is at its end."""
 
 
+TOLD = ("x", "energy", "entropy", "step", "t", "taken")
+"""What is told of each attempt of a trajectory that is looked at: fields of its state, its time and its step."""
+
+
 class Pacing(Module):
     """How steps are chosen and what is watched: parameters of a program, as those of a system are.
 

@@ -16,7 +16,7 @@ import numpy as np
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.paced import Guide
-from ..engines.pacing import CAUGHT
+from ..engines.pacing import CAUGHT, TOLD
 from ..engines.stepping import State
 from ..errors import InputError
 from .adaptive import UNDERFLOW, Adaptive, pacing_of
@@ -25,9 +25,6 @@ from .timetable import Timetable
 
 TOGETHER = 64
 """Attempts between looks at an adaptive run."""
-
-TOLD = ("x", "energy", "entropy", "step", "t", "taken")
-"""What is read of each attempt."""
 
 MOST_KEPT = 2**28
 """Numbers that an adaptive run keeps at most (2 GiB)."""

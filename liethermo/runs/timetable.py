@@ -54,7 +54,7 @@ class Timetable:
 
     def time(self, step: int) -> float:
         """The time after so many steps."""
-        return self.end if step >= self.steps else self.start + step * self.h
+        return float(self.reached(np.asarray(step)))
 
     def reached(self, steps: np.ndarray) -> np.ndarray:
         """The times after so many steps."""

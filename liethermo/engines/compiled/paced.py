@@ -7,9 +7,9 @@ import numpy as np
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.scalarize import UnsupportedPrimitive
-from ..pacing import Pace, Pacing, begun, fitted, judged, shape_seen
+from ..pacing import TOLD, Pace, Pacing, begun, fitted, judged, shape_seen
 from ..rules import RULES, Rules
-from ..stepping import TELLING, State
+from ..stepping import State
 from .form import Form, numbers_of
 from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper, stepper_for
 
@@ -32,7 +32,7 @@ class PacedStepper(Stepper):
     """
 
     names, passed = NAMES, ("reached", "length")
-    kept = (*TELLING, "t", "taken")
+    kept = TOLD
 
     def __init__(self, form: Form, own: Form, way: Form, parameters, method, seen: tuple, lanes, varies, rules):
         self._way, self._seen, self._skip = way, seen, form.size + own.size

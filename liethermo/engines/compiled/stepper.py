@@ -232,16 +232,11 @@ class Stepper:
         if self._varies.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._varies]}
         number = len(fields["x"])
-        count = -(-number // self.lanes)
-        whole = np.zeros((count, self._layout.height, self.lanes))
+        whole = np.zeros((-(-number // self.lanes), self._layout.height, self.lanes))
         for name, values in fields.items():
-            rows = np.reshape(values, (number, -1))
-            if number < count * self.lanes:  # some lanes stay empty
-                rows = np.concatenate([rows, np.repeat(rows[-1:], count * self.lanes - number, axis=0)])
             first = self._layout.rows[name]
-            whole[:, first : first + self._layout.sizes[name]] = rows.reshape(count, self.lanes, -1).swapaxes(1, 2)
-        whole[-1, self._layout.rows["status"], self.lanes - (count * self.lanes - number) :] = EMPTY
-        return whole.reshape(count, -1)
+            whole[:, first : first + self._layout.sizes[name]] = self._in_lanes(np.reshape(values, (number, -1)))
+        return self._marked(whole, number)
 
     def block_of(self, state: State) -> np.ndarray:
         """The only block of a trajectory by itself."""
@@ -261,12 +256,20 @@ class Stepper:
 
     def of_rows(self, whole: np.ndarray) -> np.ndarray:
         """Blocks of trajectories from all their rows, shape (trajectories, rows)."""
-        number, lanes = len(whole), self.lanes
-        count = -(-number // lanes)
-        if number < count * lanes:  # some lanes stay empty
-            whole = np.concatenate([whole, np.repeat(whole[-1:], count * lanes - number, axis=0)])
-            whole[number:, self._layout.rows["status"]] = EMPTY
-        return np.ascontiguousarray(whole.reshape(count, lanes, -1).swapaxes(1, 2)).reshape(count, -1)
+        return self._marked(np.ascontiguousarray(self._in_lanes(whole)), len(whole))
+
+    def _in_lanes(self, rows: np.ndarray) -> np.ndarray:
+        """Rows of trajectories, shape (trajectories, m), as (blocks, m, lanes); the last one fills empty lanes."""
+        count = -(-len(rows) // self.lanes)
+        if empty := count * self.lanes - len(rows):
+            rows = np.concatenate([rows, np.repeat(rows[-1:], empty, axis=0)])
+        return rows.reshape(count, self.lanes, -1).swapaxes(1, 2)
+
+    def _marked(self, whole: np.ndarray, number: int) -> np.ndarray:
+        """Blocks, shape (blocks, rows, lanes), of so many trajectories, their empty lanes marked; each in one row."""
+        used = number - (len(whole) - 1) * self.lanes
+        whole[-1, self._layout.rows["status"], used:] = EMPTY
+        return whole.reshape(len(whole), -1)
 
     def fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Fields of trajectories, trajectories first, those of empty lanes among them."""
