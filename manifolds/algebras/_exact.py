@@ -66,23 +66,27 @@ DENSE = 12
 """Dimension up to which all triples of elements are looked at in one array."""
 
 
-def jacobi_sums(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The components of ``[[a,b],c] + [[b,c],a] + [[c,a],b]`` that are not zero, and the numbers of their triples.
+def worst_jacobi(constants: np.ndarray) -> tuple[float, tuple[int, int, int]]:
+    """The largest component of ``[[a,b],c] + [[b,c],a] + [[c,a],b]`` and its triple; exact for integers.
 
-    They are exact for integers.
+    The constants are antisymmetric. In dimensions above DENSE one a is looked at after another, in memory for one.
     """
     dim = constants.shape[0]
     if constants.dtype == object or dim <= DENSE:
         nested = np.tensordot(constants, constants, axes=(2, 0))
-        total = (nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)).reshape(dim**3, dim)
-        triples, components = np.nonzero(total)
-        return total[triples, components].astype(float), triples
+        total = np.abs(nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)).max(axis=3)
+        a, b, c = (int(i) for i in np.unravel_index(total.argmax(), total.shape))
+        return float(total[a, b, c]), (a, b, c)
+    worst, triple = 0.0, (0, 0, 0)
     rows = scipy.sparse.csr_array(constants.reshape(dim * dim, dim))
     columns = scipy.sparse.csr_array(constants.reshape(dim, dim * dim))
-    nested = (rows @ columns).tocoo()  # entry ((a, b), (c, f)) is the component f of [[e_a, e_b], e_c]
-    ab, cf = nested.coords
-    (a, b), (c, f) = divmod(ab, dim), divmod(cf, dim)
-    triples = np.concatenate([(a * dim + b) * dim + c, (c * dim + a) * dim + b, (b * dim + c) * dim + a])
-    sums = scipy.sparse.coo_array((np.tile(nested.data, 3), (triples, np.tile(f, 3))), shape=(dim**3, dim))
-    sums.sum_duplicates()
-    return sums.data, sums.coords[0]
+    for i in range(dim):
+        nested = (scipy.sparse.csr_array(constants[i]) @ columns).tocoo()  # [[e_i, e_b], e_c] in row b, columns (c, f)
+        b, (c, f) = nested.coords[0], divmod(nested.coords[1], dim)
+        turned = scipy.sparse.coo_array((nested.data, (c, b * dim + f)), shape=nested.shape)
+        third = (rows @ scipy.sparse.csr_array(constants[:, i])).reshape(nested.shape)  # [[e_b, e_c], e_i]
+        sums = (nested.tocsr() - turned.tocsr() + third.tocsr()).tocoo()
+        if sums.nnz and np.abs(sums.data).max() > worst:
+            at = int(np.abs(sums.data).argmax())
+            worst, triple = abs(float(sums.data[at])), (i, int(sums.coords[0][at]), int(sums.coords[1][at]) // dim)
+    return worst, triple

@@ -11,7 +11,7 @@ from ..errors import (
     JacobiError,
     ShapeError,
 )
-from ._exact import RationalArray, jacobi_sums
+from ._exact import RationalArray, worst_jacobi
 
 AXIOM_TOLERANCE = 1e-12
 """Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
@@ -98,12 +98,11 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
             tolerance=tolerance,
             indices=(a, b),
         )
-    sums, triples = jacobi_sums(constants)
+    worst, triple = worst_jacobi(constants)
     tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
-    worst = int(np.abs(sums).argmax()) if sums.size else -1
-    if worst >= 0 and abs(sums[worst]) > tolerance:
-        residual = abs(float(sums[worst])) * unit**2
-        a, b, c = sorted(int(i) for i in np.unravel_index(triples[worst], constants.shape))
+    if worst > tolerance:
+        residual = worst * unit**2
+        a, b, c = sorted(triple)
         raise JacobiError(
             f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
             f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
@@ -121,10 +120,13 @@ def without_rounding(
 
     The constants are those of matrices of norm 1, the ``columns``.
     """
+
+    def defect(constants):
+        return np.abs(columns @ constants.reshape(len(constants) ** 2, -1).T - commutators).max()
+
     scaled = constants * scales
     snapped = _nearest_fractions(scaled, 1e-12 * np.maximum(scales, np.abs(scaled)))
-    defect = np.abs(columns @ (snapped / scales).reshape(len(constants) ** 2, -1).T - commutators).max()
-    return snapped if defect <= 4 * np.finfo(float).eps else scaled
+    return snapped if defect(snapped / scales) <= max(4 * np.finfo(float).eps, defect(constants)) else scaled
 
 
 def _nearest_fractions(values: np.ndarray, within: np.ndarray) -> np.ndarray:
