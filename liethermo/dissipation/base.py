@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, TypeVar
 
 import jax
+import jax.numpy as jnp
 import scipy
 
 from manifolds._module import Module
@@ -108,6 +109,23 @@ class Dissipation(Module):
         """
         del system, x, dH, dL
         return None
+
+    def divergence(self, system: Geometry, x) -> jax.Array:
+        """The divergence of every column of the factor at the gradients of the functions, shape (columns,).
+
+        By differentiation, except where the construction makes it vanish.
+        """
+        B = self.factor_at(system, x)
+        assert B is not None
+        return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.changes(system, x), axis=0)
+
+    def changes(self, system: Geometry, x) -> jax.Array:
+        """What the divergence of each column is the sum of, shape (n, columns)."""
+        return system.changes(x, lambda y, alpha: self.factor_at(system, y).transposed(alpha))  # type: ignore[union-attr]
+
+    def factor_at(self, system: Geometry, x) -> Factor | None:
+        """The factor at the gradients of the functions."""
+        return self.factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
     def momentum(self, dH, turned) -> jax.Array | None:
         """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].

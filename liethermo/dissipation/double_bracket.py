@@ -63,7 +63,9 @@ class DoubleBracket(Dissipation):
         return self.rate * system.poisson.sharp(x, lowered)
 
     def factor(self, system, x, dH, dL):
-        if self.metric is None and system.space is not None:
-            return None
         root = None if self.metric is None else root_of(self.metric)
-        return Factor(system.dim, lambda w: system.poisson.sharp(x, w if root is None else root @ w)).scaled(self.rate)
+
+        def times(w):
+            return system.poisson.sharp(x, system.lowered(x, system.isotropic(x, w)) if root is None else root @ w)
+
+        return Factor(system.isotropic_size if root is None else system.dim, times).scaled(self.rate)

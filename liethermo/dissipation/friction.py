@@ -17,22 +17,24 @@ from .factor import Factor
 class Friction(Dissipation):
     """``x' = Pi dH - rate * D(x) dH``: the energy falls, ``H' = -rate dH . D dH <= 0``, and is gone.
 
-    With D = diag(0, gamma) on (q, p) it is the drag ``p' = -gamma v``; on the dual of an algebra it is that of a body
-    in a fluid. The heat is not followed, so no entropy is needed and its law is not claimed. In a bath of a temperature
-    (:class:`liethermo.Fluctuations`) it is Langevin's equation, and the heat is recorded.
+    Without a D it is the gradient flow of the metric. With D = diag(0, gamma) on (q, p) it is the drag
+    ``p' = -gamma v``; on the dual of an algebra it is that of a body in a fluid. The heat is not followed, so no
+    entropy is needed and its law is not claimed. In a bath of a temperature (:class:`liethermo.Fluctuations`) it is
+    Langevin's equation, and the heat is recorded.
 
     Parameters
     ----------
-    D : array, shape (n, n), or (n,) for a diagonal matrix, or function from x, shape (n,), to a matrix (n, n)
-        Positive semidefinite. A function is taken to have the same rank everywhere.
+    D : array, shape (n, n), or (n,) for a diagonal matrix, or function from x, shape (n,), to a matrix (n, n); optional
+        Positive semidefinite. A function is taken to have the same rank everywhere. By default the identity, or on a
+        manifold the inverse of the metric of the space.
     rate : float, >= 0
     """
 
-    D: Callable | jax.Array
+    D: Callable | jax.Array | None
     rate: jax.Array
 
-    def __init__(self, D, rate=1.0):
-        if not callable(D):
+    def __init__(self, D=None, rate=1.0):
+        if D is not None and not callable(D):
             D = semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D
         self.rate = checked_rate(rate)
@@ -50,12 +52,20 @@ class Friction(Dissipation):
         return False
 
     def prepared(self, system):
-        check_matrix(self.D, system.dim, "the friction D")
+        if self.D is not None:
+            check_matrix(self.D, system.dim, "the friction D")
         return self
 
     def force(self, system, x, dH, dS, dL):
-        return -self.rate * (form_at(self.D, x) @ dH)
+        if self.D is None:
+            return -self.rate * system.raised(x, dH)
+        return -self.rate * system.tangent(x, form_at(self.D, x) @ dH)
 
     def factor(self, system, x, dH, dL):
+        if self.D is None:
+            return Factor(system.isotropic_size, lambda w: system.isotropic(x, w), system.space is None).scaled(
+                self.rate
+            )
         root = semidefinite_root(self.D(x)) if callable(self.D) else semidefinite_factor(self.D)
-        return Factor(system.dim, lambda w: root @ w, not callable(self.D)).scaled(self.rate)
+        constant = system.space is None and not callable(self.D)
+        return Factor(system.dim, lambda w: system.tangent(x, root @ w), constant).scaled(self.rate)

@@ -54,3 +54,14 @@ class Geometry(Protocol):
     def tangent(self, x, w) -> jax.Array:
         """The tangent vector nearest to an array, shape (n,)."""
         ...
+
+    @property
+    def isotropic_size(self) -> int: ...
+
+    def isotropic(self, x, w) -> jax.Array:
+        """``R w`` with ``R R^T`` the inverse of the metric, shape (n,)."""
+        ...
+
+    def changes(self, x, rows) -> jax.Array:
+        """What the divergence of fields is the sum of, where a covector alpha at y makes ``rows(y, alpha)`` of them."""
+        ...

@@ -39,16 +39,8 @@ def factors(dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence) -> 
 
 
 def divergence(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
-    """The divergence of every column of the factors, at the gradients of the functions, shape (columns,).
-
-    By differentiation, except where the construction makes it vanish.
-    """
-    parts = factors_at(dissipation, system, x)
-    found = [
-        jnp.zeros(B.size) if B.solenoidal else jnp.sum(_changes(dissipation, system, x, i), axis=0)
-        for i, (_, B) in enumerate(parts)
-    ]
-    return jnp.concatenate([jnp.zeros(0), *found])
+    """The divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
+    return jnp.concatenate([jnp.zeros(0), *(part.divergence(system, x) for part in dissipation.terms)])
 
 
 def factors_at(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
@@ -57,23 +49,13 @@ def factors_at(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Diss
     return factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
-def _changes(dissipation: Dissipation, system: Geometry, x, i: int) -> jax.Array:
-    """``dB_ja / dx_j`` of the factor of summand i, shape (n, columns)."""
-
-    def change(axis):
-        row = lambda y: factors_at(dissipation, system, y)[i][1].transposed(axis)  # noqa: E731
-        return jax.jvp(row, (x,), (axis,))[1]
-
-    return jax.vmap(change)(jnp.eye(x.shape[0]))
-
-
 def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
     """What the factors miss of what they are to be, at a state and relative to what cancels: the largest of each."""
     dH = system.energy.gradient(x)
     away = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape[0]))
     found: dict[str, list[jax.Array]] = {SQUARE: [], KERNEL: [], DIVERGENCE: []}
     parts = factors_at(dissipation, system, x)
-    for i, ((part, B), (_, own)) in enumerate(zip(parts, portions(dissipation, dissipation.preserve), strict=True)):
+    for (part, B), (_, own) in zip(parts, portions(dissipation, dissipation.preserve), strict=True):
         dL, keeps = tuple(L.gradient(x) for L in own), part.energy_law == "conserved"
         force = part.force(system, x, dH, away, dL)
         square = B.times(B.transposed(away)) if keeps else -B.times(B.transposed(dH))
@@ -82,7 +64,7 @@ def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Ar
         kernel = [_relative(B.transposed(v), size * jnp.linalg.norm(v)) for v in ((dH, *dL) if keeps else dL)]
         found[KERNEL] += kernel
         if B.solenoidal:
-            changes = _changes(dissipation, system, x, i)
+            changes = part.changes(system, x)
             varies = jnp.max(jnp.abs(changes)) + size / (1.0 + jnp.linalg.norm(x))  # the former may be rounding alone
             found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), varies))
     return {name: jnp.max(jnp.stack(values)) for name, values in found.items() if values}

@@ -89,9 +89,11 @@ class ProjectedMetric(Dissipation):
 
         Their divergence is zero where G is constant.
         """
-        if system.space is not None:
-            return None
         G, n = form_at(self.cometric, x), system.dim
+        if system.space is not None:
+            if G is not None:
+                return None
+            return self._projected(system, x, dH, dL, system.isotropic_size, lambda w: system.isotropic(x, w))
         root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
         if not dL and not self.normalized:
             above = np.triu_indices(n, 1)
@@ -101,8 +103,11 @@ class ProjectedMetric(Dissipation):
                 return root @ ((W - W.T) @ (dH @ root))
 
             return Factor(len(above[0]), turned, solenoidal=not callable(self.cometric)).scaled(self.rate)
+        return self._projected(system, x, dH, dL, n, lambda w: root @ w)
+
+    def _projected(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
         frame = _Orthonormal.of(self._raised(system, x), (dH, *dL))
-        return Factor(n, lambda w: frame.off_images(root @ w)).scaled(
+        return Factor(size, lambda w: frame.off_images(root(w))).scaled(
             self.rate if self.normalized else self.rate * frame.gram
         )
 

@@ -114,6 +114,11 @@ class OneStepMethod(Module):
         """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
         raise InputError(f"{self} has no error estimate: {self.fixed}")
 
+    @property
+    def has_estimate(self) -> bool:
+        """Whether it gives :meth:`error`."""
+        return type(self).error is not OneStepMethod.error
+
     def judged(self, system: System, x) -> tuple[System, jax.Array]:
         """The part of the system, and of the state, that the estimate of the error is about."""
         return system, x

@@ -103,6 +103,10 @@ class InCharts(OneStepMethod):
     def check(self, system: System) -> None:
         self.method.check(system)
 
+    @property
+    def has_estimate(self) -> bool:
+        return self.method.has_estimate
+
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return self.method.error(system, x, low, h, k) if self.explicit else collocation_error(system, x, low, h, k)
 
@@ -153,7 +157,16 @@ class InCharts(OneStepMethod):
         begin = -0.5 * self.method.increment(h, own)
         return _Step(local, self.method.pulled(local), begin, there(low), own, jax.vmap(back_there))
 
+    @property
+    def increments(self) -> int:
+        return self.method.increments
+
+    def driven_by(self, dW) -> OneStepMethod:
+        return InCharts(self.method.driven_by(dW), self.retraction)
+
     def predict(self, k, before) -> jax.Array:
+        if self.increments:
+            return self.method.predict(k, before)
         return k if self.explicit else 2.0 * k - before  # whatever the method's own: the chart has changed
 
     def __str__(self) -> str:

@@ -14,6 +14,7 @@ from ..functions.energy import Energy
 from ..systems import System
 from ..tracing.interpret import at_points
 from .base import OneStepMethod
+from .charts import in_charts
 from .midpoint import MetriplecticMidpoint
 
 MISFIT = 1e-10
@@ -68,6 +69,13 @@ class Fluctuating(OneStepMethod):
     @property
     def increments(self) -> int:
         return self.dW.shape[0]
+
+    def on(self, system: System) -> OneStepMethod:
+        return in_charts(self, system, self.method.retraction, "midpoint")
+
+    def pulled(self, local) -> OneStepMethod:
+        density = None if self.density is None else local.pulled(self.density)
+        return Fluctuating(self.method, self.boltzmann, self.temperature, density, self.dW)
 
     def driven_by(self, dW) -> OneStepMethod:
         return Fluctuating(self.method, self.boltzmann, self.temperature, self.density, dW)
@@ -127,10 +135,6 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
     """
     if not isinstance(method, MetriplecticMidpoint):
         raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
-    if system.space is not None:
-        raise InputError(
-            f"noise is for states in R^n, and this system is on {system.space.name}: a spin is a state of so(3)* too"
-        )
     if system.dissipation is None:
         raise InputError("noise belongs to a dissipation, and this system has none")
     lowers = [part for part in system.dissipation.terms if part.energy_law != "conserved"]
@@ -141,7 +145,7 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
         )
     if temperature is not None and not lowers:
         raise InputError("the dissipation keeps the energy, so there is no bath that could have a temperature")
-    size = sum(B.size for _, B in factors_at(system.dissipation, system, jnp.zeros(system.dim)))
+    size = sum(B.size for _, B in factors_at(system.dissipation, system, jnp.asarray(system.samples(1)[0])))
     T = 1.0 if temperature is None else temperature
     return Fluctuating(method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(size))
 

@@ -137,6 +137,10 @@ class WithAttitude(OneStepMethod):
     def predict(self, k, before) -> jax.Array:
         return self.method.predict(k, before)
 
+    @property
+    def has_estimate(self) -> bool:
+        return self.method.has_estimate
+
     def error(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
         (mu, _), (mu_low, _), (rates, _) = map(system.split, (x, low, k))
         return self.method.error(system.body, mu, mu_low, h, rates)

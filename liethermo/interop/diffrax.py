@@ -87,8 +87,8 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         y1, *state = one_step(system, method, (y0, low, k, before), h)
         solved = jnp.isfinite(jnp.sum(y1))
         slopes = state[1]
-        error = jax.lax.stop_gradient(method.error(system, y0, low, h, slopes)) if _has_error(method) else jnp.zeros(())
-        estimate = jnp.full_like(y0, jnp.where(solved, error, jnp.inf))
+        error = method.error(system, y0, low, h, slopes) if method.has_estimate else jnp.zeros(())
+        estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(solved, error, jnp.inf)))
         field = system.vector_field
         dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}
         result = diffrax.RESULTS.where(solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
@@ -105,7 +105,3 @@ class Solver(diffrax.AbstractAdaptiveSolver):
                 "an energy that depends on time needs a clock and a ledger in the state: use lt.integrate or lt.flow"
             )
         return system, traced_energies(self.method.pulled(system).on(system), system.dim)
-
-
-def _has_error(method: OneStepMethod) -> bool:
-    return type(method).error is not OneStepMethod.error

@@ -119,3 +119,12 @@ class _Force(Carried):
         place = _Place(self.system, self.coordinates, self.place, x)
         dL = tuple(map(place.lift, dL))
         return place.lower(self.part.force(self.system, place.state, place.lift(dH), place.lift(dS), dL))
+
+    def factor(self, system, x, dH, dL):
+        place = _Place(self.system, self.coordinates, self.place, x)
+        B = self.part.factor(self.system, place.state, place.lift(dH), tuple(map(place.lift, dL)))
+        return None if B is None else B._replace(times=lambda w: place.lower(B.times(w)), solenoidal=False)
+
+    def divergence(self, system, x):
+        """That with the volume of the manifold."""
+        return self.part.divergence(self.system, _Place(self.system, self.coordinates, self.place, x).state)

@@ -152,6 +152,26 @@ class Kind(Module):
             return w
         return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
 
+    @property
+    def isotropic_size(self) -> int:
+        """How many numbers :meth:`isotropic` takes."""
+        return self.dim if self.space is None else self.space.isotropic_size
+
+    def isotropic(self, x, w) -> jax.Array:
+        """``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
+        return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
+
+    def changes(self, x, rows) -> jax.Array:
+        """What the divergence of vector fields is the sum of, over the first axis.
+
+        ``rows(y, alpha)`` is what a covector alpha at y makes of the field, or of each of several; vectors of shape
+        (n,).
+        """
+        if self.space is None:
+            return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
+        vector = self.space.to_vector
+        return self.space._changes(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
+
     # -- for the engines ----------------------------------------------------------------------------------------------
 
     @property

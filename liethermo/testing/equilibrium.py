@@ -110,7 +110,9 @@ def check_equilibrium(
         own = float(np.sqrt(weights**2 @ (value - mean) ** 2))
         error = float(np.hypot(own, found.std(ddof=1) / np.sqrt(paths)))
         away = abs(float(found.mean()) - mean)
-        missed = away / error if error > 0.0 else (0.0 if away <= 1e-12 * max(1.0, abs(mean)) else np.inf)
+        if away <= 1e-12 * max(1.0, abs(mean)):  # what is constant has errors of rounding alone
+            away = 0.0
+        missed = away / error if error > 0.0 else np.inf if away else 0.0
         note = f"{found.mean():.5g}, exactly {mean:.5g} +- {own:.1g}"
         suite.rows.append(Row(f"<{name}> in standard errors", float(missed), errors, bool(missed <= errors), note))
     return suite.report()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def polar(a) -> jax.Array:
@@ -120,6 +121,12 @@ def determinant(a) -> jax.Array:
     det = _eliminate(a, a[..., :0])[1]
     # a matrix of numbers leads to NaN only by way of a pivot of zero
     return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
+
+
+def skew(w, n: int) -> jax.Array:
+    """The skew matrices with the entries w above the diagonal, row by row, shape (..., n, n)."""
+    upper = jnp.zeros((*w.shape[:-1], n, n)).at[..., *np.triu_indices(n, 1)].add(w)
+    return upper - upper.swapaxes(-1, -2)
 
 
 def largest(matrix) -> jax.Array:

@@ -188,6 +188,37 @@ class Space(Maps):
         """
         return self._compiled("_sharp", self._checked_point(x, "x"), self._array(alpha, "alpha"))
 
+    def isotropic(self, x, w) -> jax.Array:
+        """``R w``, a tangent vector, with ``R R^T`` the inverse of the metric: of normal numbers, isotropic noise.
+
+        Parameters
+        ----------
+        x : array, shape ``(..., *shape)``
+        w : array, shape (..., isotropic_size)
+        """
+        w = jnp.asarray(as_numeric(w, "w"))
+        if w.shape[-1:] != (self.isotropic_size,):
+            size = self.isotropic_size
+            raise ShapeError(f"w must have last axis {size} for {self.name}, but its shape is {w.shape}")
+        return self._compiled("_isotropic", self._checked_point(x, "x"), w.astype(jnp.float64))
+
+    def divergence(self, field, x) -> jax.Array:
+        """The divergence of a vector field at one point, shape (): how fast its flow expands Riemannian volume.
+
+        Parameters
+        ----------
+        field : function
+            From a point to a tangent vector there, arrays of the shape of a point.
+        x : array, shape ``shape``
+
+        Raises
+        ------
+        SpaceError
+            On a space without geodesics whose metric is not that of the arrays around.
+        """
+        x = self._checked_point(x, "x")
+        return self._changes(x, lambda y, alpha: self._pair(alpha, field(y))).sum()
+
     # -- geodesics ------------------------------------------------------------------------------------------------
 
     def exp(self, x, v) -> jax.Array:

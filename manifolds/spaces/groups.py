@@ -186,6 +186,22 @@ class GroupSpace(Space):
     def _inner(self, x, u, v):
         return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
 
+    @cached_property
+    def _traces(self) -> np.ndarray:
+        """``tr ad`` of the orthonormal basis, shape (dim,): zero on a unimodular group."""
+        with jax.ensure_compile_time_eval():
+            axes = np.eye(self.dim)
+            brackets = np.asarray(self.group.algebra.bracket(axes[:, None], axes[None]))
+        return np.linalg.solve(self._root, np.einsum("kaa->k", brackets))
+
+    def _changes(self, x, rows):
+        """Those along left translations, and the divergences ``-tr ad_E`` of the left-invariant fields themselves."""
+        along = super()._changes(x, rows)
+        if self.group.algebra.is_unimodular():
+            return along
+        own = rows(x, self._flat(x, self._from_coordinates(x, -self._traces)))
+        return jnp.concatenate([along, own[None]])
+
     def _exp(self, x, v):
         return self._group_exp(x, v)
 

@@ -131,6 +131,42 @@ class Maps(ABC):
     def _sharp(self, x, alpha):
         return self._from_coordinates(x, self._pair(self._frame(x), self._over_frame(alpha)))
 
+    @property
+    def isotropic_size(self) -> int:
+        """How many numbers :meth:`isotropic` takes."""
+        return self.size if self._induced else self.dim
+
+    def _isotropic(self, x, w):
+        """``R w`` with ``R R^T`` the inverse of the metric, and R differentiable in x.
+
+        A smooth frame is such an R; so are the fields of a group of isometries, and the projection of arrays.
+        """
+        return self._project_tangent(x, self.from_vector(w)) if self._induced else self._from_coordinates(x, w)
+
+    @property
+    def _induced(self) -> bool:
+        """Whether the metric is known to be that of the arrays around."""
+        return type(self)._inner is Maps._inner
+
+    def _changes(self, x, rows):
+        """``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
+
+        ``rows(y, alpha)`` is what a covector alpha at y makes of the field X, or of each of several.
+        """
+
+        def geodesic(t, e):
+            y = self._exp(x, t * e)
+            return rows(y, self._flat(y, self._transport(x, t * e, e)))
+
+        def straight(t, e):  # the metric being that of the arrays around
+            return rows(self._project(x + t * e), e.conj())
+
+        if not (self.geodesics or self._induced):
+            raise SpaceError(f"divergences on {self.name} are found along geodesics: give _exp, _log and _transport")
+        along = geodesic if self.geodesics else straight
+        frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
+        return jax.vmap(lambda e: jax.jvp(lambda t: along(t, e), (0.0,), (1.0,))[1])(frame)
+
     def _norm(self, x, v):
         return safe_sqrt(self._inner(x, v, v))
 

@@ -118,6 +118,15 @@ class Product(Space):
         triples = zip(self.factors, self.split(x), jnp.split(c, ends, axis=-1), strict=True)
         return self.join(*(factor._from_coordinates(part, components) for factor, part, components in triples))
 
+    @property
+    def isotropic_size(self):
+        return sum(factor.isotropic_size for factor in self.factors)
+
+    def _isotropic(self, x, w):
+        ends = np.cumsum([factor.isotropic_size for factor in self.factors])[:-1]
+        triples = zip(self.factors, self.split(x), jnp.split(w, ends, axis=-1), strict=True)
+        return self.join(*(factor._isotropic(part, own) for factor, part, own in triples))
+
     def _inner(self, x, u, v):
         return sum(self._each("_inner", x, u, v))
 
@@ -251,6 +260,13 @@ class Power(Space):
 
     def _from_coordinates(self, x, c):
         return self.base._from_coordinates(x, c.reshape(*c.shape[:-1], self.count, self.base.dim))
+
+    @property
+    def isotropic_size(self):
+        return self.count * self.base.isotropic_size
+
+    def _isotropic(self, x, w):
+        return self.base._isotropic(x, w.reshape(*w.shape[:-1], self.count, self.base.isotropic_size))
 
     def _inner(self, x, u, v):
         return self.base._inner(x, u, v).sum(axis=-1)

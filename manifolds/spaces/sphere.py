@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from .._sizes import checked_size
-from ..matrices.linear import complement
+from ..matrices.linear import complement, skew
 from ..matrices.stumpff import arc, stumpff
 from .base import CUT_MARGIN, Space, register
 from .maps import safe_sqrt
@@ -60,6 +60,14 @@ class Sphere(Space):
 
     def _frame(self, x):
         return complement(x[..., None]).swapaxes(-1, -2)
+
+    @property
+    def isotropic_size(self):
+        return math.comb(self.n + 1, 2)
+
+    def _isotropic(self, x, w):
+        """By the rotations of every plane."""
+        return (skew(w, self.n + 1) @ x[..., None])[..., 0]
 
     def _inner(self, x, u, v):
         return (u * v).sum(axis=-1)

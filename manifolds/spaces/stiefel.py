@@ -12,7 +12,7 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
-from ..matrices.linear import complement, largest, orthonormalized, polar, solve
+from ..matrices.linear import complement, largest, orthonormalized, polar, skew, solve
 from ..matrices.symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
 
@@ -82,6 +82,14 @@ class Stiefel(Space):
         within = x[..., None, :, :] @ np.array(skew).reshape(-1, self.p, self.p)
         outwards = jnp.einsum("...ni,jp->...ijnp", complement(x), units)
         return jnp.concatenate([within, outwards.reshape(*x.shape[:-2], -1, *self.shape)], axis=-3)
+
+    @property
+    def isotropic_size(self):
+        return math.comb(self.n, 2)
+
+    def _isotropic(self, x, w):
+        """By the rotations of every plane."""
+        return skew(w, self.n) @ x
 
     def _inner(self, x, u, v):
         return self._pair(self._flat(x, u), v)

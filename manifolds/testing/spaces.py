@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from ..retractions.charts import ProjectionRetraction
+from ..retractions.coordinates import coordinates_around
 from ..spaces.base import Space
 from .report import Report, Suite
 
 BATCH = 4
+
+DIFFERENCES = 1e-8
+"""What a divergence by differences may miss."""
 
 
 def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1e-12) -> Report:
@@ -51,6 +60,19 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
     paired = np.sum(np.asarray(M.flat(x, u)) * v, axis=axes).real
     suite.small("flat(u) v = <u, v>", paired - np.asarray(M.inner(x, u, v)), size, allowed)
     suite.small("sharp inverts flat", np.asarray(M.sharp(x, M.flat(x, u))) - u, size, allowed)
+    R = np.asarray(M.isotropic(x[:, None], np.broadcast_to(np.eye(M.isotropic_size), (BATCH, *[M.isotropic_size] * 2))))
+    parts = [np.asarray(M.inner(np.broadcast_to(x[:, None], R.shape), R, w[:, None])) for w in (u, v)]
+    suite.small(
+        "isotropic: R R^T inverts the metric", (parts[0] * parts[1]).sum(1) - (c * d).sum(1), size, 10 * allowed
+    )
+    if M.geodesics or M._induced:
+        turn = jnp.asarray(random.standard_normal((M.size, M.size))) / M.size
+
+        def field(y):
+            return M._project_tangent(y, M.from_vector(turn @ jnp.tanh(M.to_vector(y))))
+
+        missed = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
+        suite.small("divergences are those of the volume", missed, size, DIFFERENCES)
     if not M.geodesics:
         suite.without("geodesics", "the space has none of its own: its charts project")
         return suite.report()
@@ -77,3 +99,21 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
     half = np.asarray(M.exp(x, 0.5 * across))
     suite.small("midpoints", np.asarray(M.midpoint(x, y)) - half, size, 10 * allowed)
     return suite.report()
+
+
+def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
+    """``d(sqrt(g) X^i)/dc_i / sqrt(g)`` in coordinates around a point, by differences of order four."""
+    around = coordinates_around(ProjectionRetraction(M), x)
+
+    @jax.jit
+    def flux(c):
+        place = around.at(c)
+        frame = M._frame(place.point)
+        volume = 1.0 / jnp.abs(jnp.linalg.det(jax.vmap(place.lower)(frame)))
+        return volume, volume * place.lower(field(place.point))
+
+    total, axes = 0.0, step * np.eye(M.dim)
+    for i, e in enumerate(axes):
+        near, far = (flux(k * e)[1][i] - flux(-k * e)[1][i] for k in (1, 2))
+        total += float((8.0 * near - far) / (12.0 * step))
+    return total / float(flux(np.zeros(M.dim))[0])

@@ -10,6 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.choice import Chosen
+from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
@@ -199,13 +200,6 @@ def test_what_has_no_noise(change, words):
         lt.integrate(system, START, (0.0, 1.0), **arguments)
 
 
-def test_no_noise_on_manifolds():
-    space = mf.Sphere(2)
-    system = lt.MetriplecticSystem(None, lambda x: x[2], lambda x: x[0], lt.ProjectedMetric(), space=space)
-    with pytest.raises(lt.InputError, match=r"R\^n"):
-        lt.integrate(system, [0.0, 0.6, 0.8], (0.0, 1.0), 0.1, noise=NOISE)
-
-
 def test_noise_is_named_in_the_provenance():
     solution = run(BODY, NOISE, "compiled")
     assert solution.provenance["noise"]["seed"] == 3
@@ -261,6 +255,53 @@ def test_a_spin_with_a_bath_of_its_own():
     late = many.x[:, many.t >= 6.0, 2].mean(axis=1)
     z = 2.0 / 0.8
     assert abs(late.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late.std() / np.sqrt(2000) + 0.005
+
+
+def _of(g, energy, entropy, rate):
+    return lt.LiePoissonSystem(g, lt.Quadratic(energy), lt.Quadratic(entropy), lt.KillingDissipation(rate))
+
+
+def _curved_form(n):
+    A = np.random.default_rng(0).standard_normal((n, n))
+    return A @ A.T / n + np.eye(n)
+
+
+LONG = {  # k, the step, and a body of each kind
+    "so(3)": (1.0, 0.02, BODY, START),
+    "se(3)": (
+        0.05,
+        0.02,
+        _of(mf.se(3), [1.0, 0.5, 0.4, 0.8, 0.7, 0.9], [0.0, 0.0, 0.0, -1.0, -1.0, -1.0], 0.3),
+        [0.6, -0.3, 0.5, 0.4, 0.7, -0.2],
+    ),
+    "su(3)": (0.02, 0.02, _of(mf.su(3), _curved_form(8), -np.ones(8), 0.02), 0.2 * np.arange(-3.0, 5.0)),
+    "spin with a bath": (
+        1.0,
+        0.02,
+        lt.models.single_spin(field=2.0, rate=0.5, baths=lt.HeatBaths(capacity=200.0, temperature=0.8)),
+        [0.6, 0.0, 0.8, 0.0],
+    ),
+    "gases": (
+        1e-3,
+        2e-3,
+        lt.models.gas_piston(moles=(1.0, 2.0), conductance=(100.0, 100.0)),
+        gas_piston_state(0.4, (300.0, 310.0, 300.0), moles=(1.0, 2.0)),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LONG)
+def test_a_thousand_paths_of_ten_thousand_steps_keep_their_energy(name):
+    k, h, system, x0 = LONG[name]
+    times = (0.0, 10_000 * h)
+    x0 = np.tile(np.asarray(x0, dtype=float), (1000, 1))
+    many = lt.ensemble(system, x0, times, h, noise=lt.Fluctuations(k, seed=1), outputs="trajectory", save_every=2500)
+    assert many.ok.all()
+    assert many.energy_drift.max() < 1e-13
+    assert np.ptp(many.x[:, -1], axis=0).max() > 0.0
+    if name == "spin with a bath":
+        assert np.abs(np.linalg.norm(many.x[..., :3], axis=-1) - 1.0).max() < 1e-13
 
 
 @pytest.mark.slow
