@@ -14,4 +14,5 @@ NAMES = (
     "lattice",
     "first_run",
     "memory",
+    "studies",
 )

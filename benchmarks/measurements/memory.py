@@ -44,18 +44,18 @@ def run(quick: bool) -> Report:
 def child(bodies: str) -> dict:
     """The part that runs in a process of its own."""
     work = by_library(body(RATE), random_states(int(bodies)), T_END, STEPS, "compiled", outputs="summary")
-    before, result = _resident(), work()
+    before, result = resident(), work()
     kept = ensemble_laws(result)
     assert np.all(np.isfinite(result.energy))
     return {
         "before": before,
-        "peak": _resident(),
+        "peak": resident(),
         "seconds": result.wall_time,
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }
 
 
-def _resident() -> float:
+def resident() -> float:
     """Largest resident size of this program so far, in bytes.
 
     Not ``getrusage``: a process inherits its figure from the one that started it, which may have been larger.
