@@ -202,28 +202,38 @@ class ExplicitMethod(OneStepMethod):
 
     def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
         """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
-        change = Gonzalez()
-
-        def misses(d) -> jax.Array:
-            return changes - jnp.stack([jnp.dot(change(law.function, x, d, low), d) for law in laws])
-
-        spheres = system.spheres
-
-        def directions(d):
-            end = x + (low + d)
-            found = [system.raised(end, law.function.gradient(end)) for law in laws]
-            return found if spheres is None else [spheres.along(end, v) for v in found]
+        change, spheres = Gonzalez(), system.spheres
+        functions = [law.function for law in laws]
+        before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
 
         def landed(d):
             return d if spheres is None else spheres.reached(x, low, d)
 
+        def gradients(d) -> list:
+            return [f.gradient(x + (low + d)) for f in functions]
+
+        def misses(d, ends) -> jax.Array:
+            """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
+            along = [
+                change(f, x, d, low) if first is None else 0.5 * (first + last)
+                for f, first, last in zip(functions, before, ends, strict=True)
+            ]
+            return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
+
+        def directions(d, ends) -> list:
+            end = x + (low + d)
+            found = [system.raised(end, gradient) for gradient in ends]
+            return found if spheres is None else [spheres.along(end, v) for v in found]
+
         d = landed(d)
-        found = directions(d)
+        ends = gradients(d)
+        found = directions(d, ends)
         for i in range(self.corrections):
-            found = directions(d) if 0 < i < 3 else found  # the last time they are as good as they get
-            d = landed(d + towards(found, misses(d)))
+            found = directions(d, ends) if 0 < i < 3 else found  # the last time they are as good as they get
+            d = landed(d + towards(found, misses(d, ends)))
+            ends = gradients(d)
         squares = jnp.stack([jnp.dot(v, v) for v in found])
-        left = misses(d) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
+        left = misses(d, ends) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
         return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
 
     def _laws(self, system: System) -> list[Law]:

@@ -73,15 +73,37 @@ class QuantisedSphere:
 
     def _on_diagonals(self, mu, function) -> jax.Array:
         """A map of the diagonals above and with the main one, shape (N, 2, N): entry i of the m-th at [i, :, m]."""
+        reads, values, places, weights = self._entries
+        tables = self.algebra.tables
+        diagonal = tables.diagonal
+        assert diagonal is not None
+        mu = jnp.asarray(mu)
+        main = (mu[..., diagonal.components] / tables.squares[diagonal.components]) @ diagonal.table.T
+        read = jnp.concatenate([mu, jnp.zeros((*mu.shape[:-1], 1)), main], axis=-1)
+        rows = function(read[..., reads] * values)
+        read = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.table]
+        return jnp.concatenate(read, axis=-1)[..., places] * weights
+
+    @cached_property
+    def _entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The component in each entry [i, :, m], and its factor; the entry of each component, and the factor back.
+
+        The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
+        the same products with the basis. What stands on the main diagonal follows the components, or the entries.
+        """
         tables, N = self.algebra.tables, self.N
-        parts = jnp.stack(tables.matrix(tables.raised(mu)), axis=-3)
-        rows = jnp.pad(parts.reshape(*parts.shape[:-2], N * N), [(0, 0)] * (parts.ndim - 2) + [(0, N)])
-        rows = rows.reshape(*parts.shape[:-2], N, N + 1)[..., :N] * self._inside  # row i begins at its diagonal
-        rows = jnp.swapaxes(function(jnp.swapaxes(rows, -3, -2)), -3, -2)
-        flat = jnp.pad(rows * self._inside, [(0, 0)] * (rows.ndim - 1) + [(0, 1)])
-        upper = flat.reshape(*parts.shape[:-2], N * (N + 1))[..., : N * N].reshape(parts.shape)
-        lower = jnp.swapaxes(jnp.triu(upper, 1), -1, -2)
-        return tables.products((upper[..., 0, :, :] - lower[..., 0, :, :], upper[..., 1, :, :] + lower[..., 1, :, :]))
+        i, part, m = np.indices((N, 2, N))
+        above = (m > 0) & (i + m < N)
+        place = i * N + np.minimum(i + m, N - 1)
+        reads = np.where(above, tables.reads[part, place], tables.dim).astype(np.int32)
+        values = np.where(above, tables.values[part, place], 0.0)
+        places, weights = np.zeros(tables.dim, dtype=np.int32), np.ones(tables.dim)
+        places[reads[above]], weights[reads[above]] = np.flatnonzero(above), 2.0 * values[above]
+        values /= np.append(tables.squares, 1.0)[reads]
+        assert tables.diagonal is not None
+        places[tables.diagonal.components] = above.size + np.arange(len(tables.diagonal.components))
+        reads[:, tables.diagonal.part, 0], values[:, tables.diagonal.part, 0] = tables.dim + 1 + np.arange(N), 1.0
+        return reads, values, places, weights
 
     def _applied(self, rows) -> jax.Array:
         main, beside = self._tridiagonal

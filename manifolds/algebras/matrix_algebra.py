@@ -60,7 +60,7 @@ class MatrixAlgebra(OnDemand):
 
     ``[x, y]`` and ``ad*_x mu`` are found from the matrices of x, y and mu: mu is the matrix M of the algebra with
     ``<mu, y> = Re tr(M^H y)``, so that ``ad*_x mu`` is that of ``[x^H, M]``. Products of complex matrices are three of
-    real ones, and of anti-Hermitian matrices a commutator is one product, less its adjoint.
+    real ones, and of anti-Hermitian matrices a commutator takes one product.
 
     Attributes
     ----------
@@ -92,15 +92,18 @@ class MatrixAlgebra(OnDemand):
         return MatrixAction(self, self.tables.matrix(self._element(x, "x")))
 
     def _bracket(self, X: Parts, Y: Parts) -> jax.Array:
-        return self._components(self._commutator(X, Y))
+        return self.tables.raised(self._commutator(X, Y))
 
     def _ad_star(self, X: Parts, mu) -> jax.Array:
-        return self.tables.products(self._commutator(_adjoint(X), self.tables.matrix(self.tables.raised(mu))))
+        return self._commutator(_adjoint(X), self.tables.matrix(self.tables.raised(mu)))
 
-    def _commutator(self, X: Parts, Y: Parts) -> Parts:
-        product = _product(X, Y)
-        other = _adjoint(product) if self.known.compact else _product(Y, X)
-        return tuple(a - b for a, b in zip(product, other, strict=True))
+    def _commutator(self, X: Parts, Y: Parts) -> jax.Array:
+        """``<[X, Y], e_a>`` for each a, shape (..., dim).
+
+        Of anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have the same products with each e_a.
+        """
+        products = self.tables.products(_product(X, Y))
+        return 2.0 * products if self.known.compact else products - self.tables.products(_product(Y, X))
 
     def _components(self, X: Parts) -> jax.Array:
         return self.tables.raised(self.tables.products(X))
@@ -252,7 +255,7 @@ class TraceForm:
     def __matmul__(self, x) -> jax.Array:
         g = self.algebra
         if g.is_semisimple():
-            return g.known.killing[0] * g.tables.products(g.tables.matrix(x))
+            return g.known.killing[0] * g.tables.lowered(x)
         return -g._killing(x)
 
 

@@ -62,6 +62,11 @@ class MatrixBasis:
     entries : Entries
         Each entry of the matrix at most once.
     diagonal : Diagonal, optional
+
+    Attributes
+    ----------
+    reads, values : array, shape (parts, N * N)
+        The component that stands in each entry of a matrix, ``dim`` where none does, and the number that it has there.
     """
 
     def __init__(self, size: int, entries: Entries, diagonal: Diagonal | None = None):
@@ -70,9 +75,9 @@ class MatrixBasis:
         used = [entries.part] if diagonal is None else [entries.part, np.array([diagonal.part])]
         self.parts = 2 if np.concatenate(used).any() else 1
         place = entries.row * size + entries.column
-        self._reads = np.full((self.parts, size * size), self.dim, dtype=np.int32)  # dim: a component that is zero
-        self._times = np.zeros((self.parts, size * size))
-        self._reads[entries.part, place], self._times[entries.part, place] = entries.component, entries.value
+        self.reads = np.full((self.parts, size * size), self.dim, dtype=np.int32)  # dim: a component that is zero
+        self.values = np.zeros((self.parts, size * size))
+        self.reads[entries.part, place], self.values[entries.part, place] = entries.component, entries.value
         order = np.argsort(entries.component, kind="stable")
         component, place = entries.component[order], (entries.part * size * size + place)[order]
         rank = np.arange(len(order)) - np.searchsorted(component, component)
@@ -85,7 +90,7 @@ class MatrixBasis:
         padded = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], 1))], axis=-1)
         parts = []
         for part in range(self.parts):
-            found = padded[..., self._reads[part]] * self._times[part]
+            found = padded[..., self.reads[part]] * self.values[part]
             found = found.reshape(*x.shape[:-1], self.size, self.size)
             if self.diagonal is not None and self.diagonal.part == part:
                 diagonal = x[..., self.diagonal.components] @ self.diagonal.table.T
@@ -105,12 +110,15 @@ class MatrixBasis:
 
     def raised(self, mu) -> jax.Array:
         """The components of the matrix M of the span with ``<M, e_a> = mu_a`` for each a, shape (..., dim)."""
-        mu = jnp.asarray(mu)
-        found = mu / self.squares
-        if self.diagonal is None:
+        found = jnp.asarray(mu) / self.squares
+        if self.diagonal is None or self.orthogonal:
             return found
-        own = mu[..., self.diagonal.components] @ self._inverse_gram
+        own = jnp.asarray(mu)[..., self.diagonal.components] @ self._inverse_gram
         return found.at[..., self.diagonal.components].set(own)
+
+    def lowered(self, x) -> jax.Array:
+        """``<M, e_a>`` for each a, of the matrix M with the components x: the inverse of :meth:`raised`."""
+        return jnp.asarray(x) * self.squares if self.orthogonal else self.products(self.matrix(x))
 
     @cached_property
     def squares(self) -> np.ndarray:
@@ -132,13 +140,13 @@ class MatrixBasis:
     def _inverse_gram(self) -> np.ndarray:
         assert self.diagonal is not None
         gram = self.diagonal.table.T @ self.diagonal.table
-        return np.diag(1.0 / np.diag(gram)) if self.orthogonal else np.linalg.inv(gram)
+        return np.linalg.inv(gram)
 
     def matrices(self) -> np.ndarray:
         """The e_a, shape (dim, N, N)."""
         flat = np.zeros((self.parts, self.dim + 1, self.size * self.size))
         for part in range(self.parts):
-            flat[part, self._reads[part], np.arange(self.size * self.size)] = self._times[part]
+            flat[part, self.reads[part], np.arange(self.size * self.size)] = self.values[part]
         found = flat[:, :-1].reshape(self.parts, self.dim, self.size, self.size)
         if self.diagonal is not None:
             on = np.arange(self.size)
