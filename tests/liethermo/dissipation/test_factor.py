@@ -60,6 +60,7 @@ def test_factors(g, case):
         assert np.abs(missed).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_factors_between_bodies():
     """Heat that flows and friction that heats: each flow by itself, at any gradient with positive temperatures."""
     system = lt.models.gas_piston()

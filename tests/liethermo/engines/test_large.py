@@ -53,6 +53,7 @@ def disorder(count, seed=0):
     return np.append((s / np.linalg.norm(s, axis=1)[:, None]).ravel(), 0.0)
 
 
+@pytest.mark.slow
 def test_many_damped_spins_take_long_steps():
     """One spin of so many always has an update that shrinks late; steps of 1.0 need Newton's method."""
     system, x = ring(COUNT), disorder(COUNT)

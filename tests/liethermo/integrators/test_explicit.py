@@ -197,6 +197,7 @@ def test_engines_take_the_same_steps(method):
     assert np.abs(many - alone).max() <= 1e-15 * np.abs(many).max()
 
 
+@pytest.mark.slow
 @pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @each_method
 def test_derivatives(method):

@@ -158,6 +158,7 @@ def test_attempts_together_are_attempts_one_by_one():
     assert replace(together.stats, wall_time=0.0) == replace(single.stats, wall_time=0.0)
 
 
+@pytest.mark.slow
 def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
     """Where Newton's method is first needed and cannot be compiled: no step before that is lost."""
 
@@ -456,6 +457,7 @@ def test_bad_tolerances(options, message):
 # -- the method -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "explicit"), [(1.0, True), pytest.param(300.0, False, marks=pytest.mark.slow)])
 def test_a_method_is_suggested_by_what_it_costs(rate, explicit):
     system, x0 = lt.models.rigid_body(rate=rate), np.array([0.1, 1.0, 0.1])

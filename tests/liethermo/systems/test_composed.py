@@ -130,6 +130,7 @@ def test_the_equations_of_friction():
     assert np.allclose(field(a="contact"), [v_a, -p_a * T_a, p_a * v_a, v_b, 0.0, 0.0], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_one_body_with_contact_friction_is_an_evolution_system():
     energy = lt.Kinetic([0.5]) + lt.Potential(lambda q, S: 0.5 * q @ q + jnp.exp(S))
     composed, evolution = lt.ComposedSystem([lt.Subsystem(energy, 3, "contact")]), lt.EvolutionSystem(energy, 3)
@@ -296,6 +297,7 @@ def test_unusable_subsystems(make, words):
         make()
 
 
+@pytest.mark.slow
 def test_graphs_in_every_form():
     """Matrix, sparse matrix and edges say the same; parts may be meant."""
     k = np.array([[0.0, 1.0, 0.5], [1.0, 0.0, 0.0], [0.5, 0.0, 0.0]])

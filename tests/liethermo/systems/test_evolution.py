@@ -257,6 +257,7 @@ def test_the_contact_field_keeps_its_law_exactly():
     assert [row.note for row in audit.rows if row.law == "energy drift"] == ["no law promised"]
 
 
+@pytest.mark.slow
 def test_a_contact_field_at_constant_temperature_loses_its_energy_exponentially():
     """H_S = 1: ``H(t) = H(0) exp(-t)``, to second order."""
     errors = []

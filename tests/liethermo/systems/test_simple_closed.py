@@ -108,6 +108,7 @@ def _rate(system, x):
     return system.vector_field(x)
 
 
+@pytest.mark.slow
 def test_the_same_lagrangian_in_its_different_forms():
     """Three arguments, one array, and a sum of energies; a coefficient of friction and the force that it means."""
     R = np.array([[0.5, 0.1], [0.1, 0.3]])
@@ -130,6 +131,7 @@ def test_the_same_lagrangian_in_its_different_forms():
 # -- bad input --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_friction_that_injects_energy():
     def pushing(q, v, S):
         return jnp.array([0.1 * v[0], -v[1]])

@@ -77,6 +77,7 @@ def test_a_form_of_one_site_acts_at_each(form):
         np.testing.assert_allclose(one, all_, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_local_projected_metric_is_the_projected_metric_of_each_site():
     rates = np.arange(6.0).reshape(SITES)
     made = system(lt.LocalProjectedMetric(rates))

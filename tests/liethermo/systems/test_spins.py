@@ -93,6 +93,7 @@ ENERGIES = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ENERGIES)
 def test_energies_are_the_sums_over_their_edges(name):
     energy, written = ENERGIES[name]
@@ -192,7 +193,7 @@ def reference(t=1.0):
     ("method", "order", "steps"),
     [
         (lt.MetriplecticRungeKutta(4), 4, (10, 20, 40)),
-        (lt.MetriplecticGauss(2), 4, (5, 10, 20)),
+        pytest.param(lt.MetriplecticGauss(2), 4, (5, 10, 20), marks=pytest.mark.slow),
         pytest.param(lt.MetriplecticMidpoint(), 2, (20, 40, 80), marks=pytest.mark.slow),
         pytest.param(lt.MetriplecticGauss(1), 2, (20, 40, 80), marks=pytest.mark.slow),
         pytest.param(lt.MetriplecticRungeKutta(8), 8, (17, 22, 28), marks=pytest.mark.slow),
@@ -245,6 +246,7 @@ def test_the_closed_form_solves_the_equations():
     assert s[2] == pytest.approx(np.tanh(0.4 * 1.3 * t + np.arctanh(-0.8)), abs=1e-15)
 
 
+@pytest.mark.slow
 def test_a_small_wave_on_a_ring_has_the_frequency_of_its_length():
     n, J, K, amplitude = 24, 0.9, 0.2, 1e-5
     system = lt.models.spin_lattice(n, J, K, rate=0.0, baths=False)

@@ -50,6 +50,7 @@ def _quartic_system():
     return lt.EulerPoincareSystem(mf.so(3), quartic, entropy=SPHERE, dissipation=lt.KillingDissipation(0.5))
 
 
+@pytest.mark.slow
 def test_quadratic_lagrangians_are_transformed_in_closed_form():
     A = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.0], [0.0, 0.0, 0.5]])
     b = np.array([0.1, -0.2, 0.3])

@@ -74,6 +74,7 @@ def looped(passes: int, what: str) -> tuple[float, ...]:
     return tuple(map(float, done.stdout.split()))
 
 
+@pytest.mark.slow
 def test_a_loop_compiles_once_and_keeps_nothing():
     """It was some 400 memory maps a pass, of the 65,530 that a process can have, and five seconds."""
     maps, megabytes, each = looped(60, "some")

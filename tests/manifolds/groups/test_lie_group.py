@@ -51,7 +51,7 @@ def duals(group, seed):
     return np.random.default_rng(10_000 + seed).standard_normal((BATCH, group.dim))
 
 
-OTHERS = ("SO(2)", "SE(2)", "SL(3)", "GL(2)", "Heisenberg(2)")
+OTHERS = ("SO(2)", "SO(4)", "SE(2)", "SL(3)", "GL(2)", "Heisenberg(2)")
 """Groups of the slow tier: of each family one or two are in the default one."""
 
 

@@ -356,6 +356,7 @@ def test_false_claims_are_seen_to_be_false(M):
     assert_visible(false_claims(M, *data(M, 7)[:2]))
 
 
+@pytest.mark.slow
 @each_split
 def test_the_cosymplectic_part_alone_is_another_dynamics(M):
     """Lambda_0 conserves f too, but its field leaves the kernel of eta and produces no S."""

@@ -19,7 +19,7 @@ def functions(n, seed):
     return (lambda x: jnp.sin(a @ x)), (lambda x: (b @ x) ** 2), (lambda x: jnp.exp(c @ x / 2))
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(4)
 @each_structure
 @given(seed=seeds)
 def test_axioms(P, seed):
