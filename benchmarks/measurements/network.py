@@ -14,7 +14,7 @@ from liethermo.models.heat_grid import grid_graph
 from .. import child as process
 from .. import laws
 from ..report import Report, Table, Target, ratio
-from .memory import STATUS, _resident
+from .memory import STATUS, resident
 
 SIZES = (1_000, 10_000, 100_000)
 MILD, STIFF = 0.02, 100.0
@@ -82,7 +82,7 @@ def child(graph: str, nodes: str, h: str) -> dict:
         "first": times[1] - times[0],
         "step": (times[3] - times[2]) / STEPS,
         "iterations": solution.stats.iterations_per_step,
-        "peak": _resident() if STATUS.is_file() else None,
+        "peak": resident() if STATUS.is_file() else None,
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }
 

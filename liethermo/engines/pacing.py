@@ -206,6 +206,10 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     if not pacing.falling:
         crosses = crosses | ((pace.value < 0.0) & (value >= 0.0))
     caught = good & crosses & (pacing.watched is not None)
+    if pacing.adaptive and pacing.watched is not None and not pacing.falling:
+        share = first_change(system, method, pacing, pace.value, old.x, h * new.k)
+        cut = good & ~crosses & (share < 1.0)  # there and back within the step: a shorter one ends there
+        good, wish = good & ~cut, jnp.where(cut, share * h, wish)
     code = jnp.where(caught, CAUGHT, jnp.where(good & (reached >= pace.stop), ARRIVED, code))
 
     def kept(after, before):
@@ -237,6 +241,15 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     spent = (tried >= pacing.most) & (after.state.status == Code.COMPLETED)
     status = jnp.where(spent, Code.STEP_LIMIT, after.state.status).astype(old.status.dtype)
     return after._replace(state=after.state._replace(status=status))
+
+
+def first_change(system: System, method: OneStepMethod, pacing: Pacing, before, x, d) -> jax.Array:
+    """The first share of a step from x, among the method's looks, after which what is watched has another sign."""
+    share = jnp.ones(())
+    for theta in method.looks[::-1]:
+        value = pacing.watch(system, method.along(system, x, jnp.asarray(method.weights(theta)) @ d))
+        share = jnp.where((before * value < 0.0) & jnp.isfinite(value), theta, share)
+    return share
 
 
 # -- the size of the next step ----------------------------------------------------------------------------------------

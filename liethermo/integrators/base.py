@@ -102,6 +102,12 @@ class OneStepMethod(Module):
         """Those w for which ``h sum_i w_i k_i`` displaces the state by a share theta of a step, shape (..., stages)."""
         return integrated(self.stages, theta)
 
+    @property
+    def looks(self) -> np.ndarray:
+        """Shares of an adaptive step at which the sign of an event is looked at, on its way: the more, the longer."""
+        count = self.order // 2
+        return np.arange(1, count) / max(count, 1)
+
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""
         return jnp.tile(system.vector_field(x), (self.stages, 1))

@@ -56,7 +56,7 @@ def power(g: LieAlgebra, sites) -> DirectSum:
         raise ParameterError(f"copies are of a LieAlgebra, not of {type(g).__name__}")
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
     if not shape:
-        raise ParameterError("copies of an algebra need a number of sites")
+        raise ParameterError("copies of an algebra need the number of sites")
     shape = tuple(checked_size(n, 1, "power(g, sites)", "each number of sites") for n in shape)
     if isinstance(g, DirectSum) and g.sites is not None:
         shape = (*shape, *g.sites)

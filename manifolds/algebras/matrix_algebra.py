@@ -100,7 +100,7 @@ class MatrixAlgebra(OnDemand):
     def _commutator(self, X: Parts, Y: Parts) -> jax.Array:
         """``<[X, Y], e_a>`` for each a, shape (..., dim).
 
-        Of anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have the same products with each e_a.
+        For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have the same products with each e_a.
         """
         products = self.tables.products(_product(X, Y))
         return 2.0 * products if self.known.compact else products - self.tables.products(_product(Y, X))

@@ -45,7 +45,7 @@ class Spins(PoissonStructure):
     def __init__(self, sites, others: int = 0, ratio=1.0):
         shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
         if not shape:
-            raise ParameterError("spins need a number of sites")
+            raise ParameterError("spins need the number of sites")
         self.sites = tuple(checked_size(n, 1, "Spins", "each number of sites") for n in shape)
         self.others = checked_size(others, 0, "Spins", "the number of other components")
         self.ratio = real_array(ratio)
