@@ -15,7 +15,7 @@ from ..contest import of_one_scheme
 from ..native import Ring
 from ..report import Report, Table, Target, ratio, take_part
 from ..timing import race
-from .memory import STATUS, _resident
+from .memory import STATUS, resident
 
 EXCHANGE, AXIS, RATE, STEP = 1.0, 0.1, 0.1, 0.02
 COUNT, FEW, STEPS = 100_000, 2, 12
@@ -104,7 +104,7 @@ def child(method: str, count: str) -> dict:
         "first": first,
         "step": (many - few) / (STEPS - FEW),
         "iterations": solution.stats.iterations_per_step,
-        "peak": _resident() if STATUS.is_file() else None,
+        "peak": resident() if STATUS.is_file() else None,
         "lengths": float(np.abs(lengths - 1.0).max()),
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }

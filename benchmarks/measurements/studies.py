@@ -125,7 +125,7 @@ def _on_workers(count: int, workers: int) -> float:
     from distributed import Client, LocalCluster
 
     cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
-    with cluster, Client(cluster) as client:
-        with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as folder:
-            _timed(_study(64 * workers, first, chunk=8), client)
-            return _timed(_study(count, folder, chunk=4096), client)
+    folders = tempfile.TemporaryDirectory(), tempfile.TemporaryDirectory()
+    with cluster, Client(cluster) as client, folders[0] as first, folders[1] as folder:
+        _timed(_study(64 * workers, first, chunk=8), client)
+        return _timed(_study(count, folder, chunk=4096), client)
