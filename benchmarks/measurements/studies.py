@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def _rates(count: int) -> np.ndarray:
 
 
 def _study(count: int, folder: str, **changes) -> lt.Study:
-    arguments = {"t_span": (0.0, END), "step": STEP, "measure": {"time": lt.Relaxed(TOL)}} | changes
+    arguments: dict[str, Any] = {"t_span": (0.0, END), "step": STEP, "measure": {"time": lt.Relaxed(TOL)}} | changes
     return lt.Study(_body, {"rate": _rates(count)}, x0=X0, method=METHOD, store=Path(folder) / "s.zarr", **arguments)
 
 

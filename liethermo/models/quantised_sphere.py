@@ -81,8 +81,8 @@ class QuantisedSphere:
         main = (mu[..., diagonal.components] / tables.squares[diagonal.components]) @ diagonal.table.T
         read = jnp.concatenate([mu, jnp.zeros((*mu.shape[:-1], 1)), main], axis=-1)
         rows = function(read[..., reads] * values)
-        read = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.table]
-        return jnp.concatenate(read, axis=-1)[..., places] * weights
+        found = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.table]
+        return jnp.concatenate(found, axis=-1)[..., places] * weights
 
     @cached_property
     def _entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
