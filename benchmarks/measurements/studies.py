@@ -14,6 +14,7 @@ import liethermo as lt
 from .. import child as process
 from ..machine import cores
 from ..report import Report, Table, Target
+from .memory import resident
 
 X0, STEP, END, TOL = (1.0, 0.2, 0.3), 0.1, 40.0, 1e-8
 METHOD = lt.MetriplecticRungeKutta(4)
@@ -60,8 +61,6 @@ def run(quick: bool) -> Report:
 
 def child(what: str, number: str, workers: str = "1") -> dict:
     """The part that runs in a process of its own."""
-    from .memory import resident
-
     count = int(number)
     works = {"bare": _bare, "kept": _kept, "chunks": _chunks, "workers": lambda n: _on_workers(n, int(workers))}
     seconds = works[what](count)
@@ -109,17 +108,14 @@ def _timed(study: lt.Study, client=None) -> float:
     return time.perf_counter() - start
 
 
-def _kept(count: int) -> float:
+def _kept(count: int, **changes) -> float:
     with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as folder:
-        _timed(_study(100, first))
-        return _timed(_study(count, folder))
+        _timed(_study(100, first, **changes))
+        return _timed(_study(count, folder, **changes))
 
 
 def _chunks(count: int) -> float:
-    short = {"t_span": (0.0, STEP), "measure": {"final": "final"}, "chunk": 1}
-    with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as folder:
-        _timed(_study(100, first, **short))
-        return _timed(_study(count, folder, **short))
+    return _kept(count, t_span=(0.0, STEP), measure={"final": "final"}, chunk=1)
 
 
 def _on_workers(count: int, workers: int) -> float:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds.matrices.linear import skew
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import IndefiniteError, InputError
@@ -76,8 +77,7 @@ class FourBracket(Dissipation):
         root = semidefinite_root(form) if callable(self.tensor) else semidefinite_factor(form)
 
         def times(w):
-            A = jnp.zeros((system.dim, system.dim)).at[i, j].add(root @ w)
-            return (A - A.T) @ dH
+            return skew(root @ w, system.dim) @ dH
 
         return Factor(len(i), times, solenoidal=not callable(self.tensor))
 

@@ -6,8 +6,8 @@ import math
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from manifolds.matrices.linear import skew
 from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..errors import InputError
@@ -60,14 +60,12 @@ class LocalProjectedMetric(Dissipation):
         """At each site all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, of the columns l of a root of G."""
         d, count = system.shape[-1], math.prod(system.sites)
         root = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
-        above = np.triu_indices(d, 1)
         rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)
         scale = jnp.where(rates > 0.0, jnp.sqrt(jnp.where(rates > 0.0, rates, 1.0)), 0.0)
         gradients = dH.reshape(count, d) @ root
 
         def turned(w):
-            W = jnp.zeros((count, d, d)).at[:, *above].add(w.reshape(count, -1))
-            skew = W - jnp.swapaxes(W, -1, -2)
-            return (scale * (jnp.einsum("nij,nj->ni", skew, gradients) @ root.T)).ravel()
+            turns = skew(w.reshape(count, -1), d)
+            return (scale * (jnp.einsum("nij,nj->ni", turns, gradients) @ root.T)).ravel()
 
-        return Factor(count * len(above[0]), turned, solenoidal=True)
+        return Factor(count * math.comb(d, 2), turned, solenoidal=True)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from manifolds.errors import warn
+from manifolds.matrices.linear import skew
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.checks import recognised
@@ -96,13 +96,11 @@ class ProjectedMetric(Dissipation):
             return self._projected(system, x, dH, dL, system.isotropic_size, lambda w: system.isotropic(x, w))
         root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
         if not dL and not self.normalized:
-            above = np.triu_indices(n, 1)
 
             def turned(w):
-                W = jnp.zeros((n, n)).at[above].add(w)
-                return root @ ((W - W.T) @ (dH @ root))
+                return root @ (skew(w, n) @ (dH @ root))
 
-            return Factor(len(above[0]), turned, solenoidal=not callable(self.cometric)).scaled(self.rate)
+            return Factor(math.comb(n, 2), turned, solenoidal=not callable(self.cometric)).scaled(self.rate)
         return self._projected(system, x, dH, dL, n, lambda w: root @ w)
 
     def _projected(self, system, x, dH, dL, size: int, root: Callable) -> Factor:

@@ -198,7 +198,6 @@ def test_engines_take_the_same_steps(method):
 
 
 @pytest.mark.slow
-@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @each_method
 def test_derivatives(method):
     """Against differences of fourth order, by the state and by a parameter."""

@@ -483,7 +483,7 @@ def test_an_event_that_comes_and_goes_within_a_step_is_seen(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate", "explicit"), [(1.0, True), pytest.param(300.0, False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("rate", "explicit"), [(1.0, True), (300.0, False)])
 def test_a_method_is_suggested_by_what_it_costs(rate, explicit):
     system, x0 = lt.models.rigid_body(rate=rate), np.array([0.1, 1.0, 0.1])
     found = lt.suggest_method(system, x0, 1e-6)
