@@ -22,7 +22,7 @@ class State(NamedTuple):
     x: jax.Array
     low: jax.Array  # what rounding has kept from x so far (compensated summation)
     k: jax.Array
-    before: jax.Array  # the slopes of the step before the last
+    before: jax.Array  # the slopes of the step before the last; none of an explicit method, which guesses nothing
     energy: jax.Array
     entropy: jax.Array
     status: jax.Array
@@ -59,7 +59,7 @@ def first_state(system: System, method: OneStepMethod, x) -> State:
         x=x,
         low=jnp.zeros_like(x),
         k=k,
-        before=k,
+        before=_of_guesses(method, k),
         energy=energy,
         entropy=entropy,
         status=count,
@@ -79,6 +79,10 @@ def first_state(system: System, method: OneStepMethod, x) -> State:
         energy_sensitivity=sizes[0],
         entropy_sensitivity=sizes[1],
     )
+
+
+def _of_guesses(method: OneStepMethod, k) -> jax.Array:
+    return k[:0] if method.explicit else k
 
 
 begin = program(first_state)
@@ -131,7 +135,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         x=new,
         low=new_low,
         k=solved.k,
-        before=state.k,
+        before=_of_guesses(method, state.k),
         energy=energy,
         entropy=entropy,
         status=state.status,

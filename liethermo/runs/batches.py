@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 import math
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +30,8 @@ from .timetable import CHUNK_STEPS, Course
 LANES = 8
 """Trajectories in a block of the compiled engine: one AVX-512 vector or two of AVX2."""
 
-BATCH = 4096
-"""Trajectories that a thread of the compiled engine takes at once: enough to hide the cost of Python."""
+BATCH = 8192
+"""Trajectories that a thread of the compiled engine takes at once, at most: enough to hide the cost of Python."""
 
 ARRAY_BATCH = 65_536
 """Trajectories that the array engine takes at once: bounded memory."""
@@ -68,18 +69,24 @@ def by_threads(work: Callable[[slice, threading.Event], None], size: int, steps:
         with contextlib.suppress(KeyboardInterrupt):
             work(slice(0, size), stop)
         return
-    portion = min(BATCH, LANES * math.ceil(size / (LANES * 2 * cores)))
-    with ThreadPoolExecutor(cores) as pool:
-        starts = range(0, size, portion)
-        tasks = [pool.submit(work, slice(first, min(first + portion, size)), stop) for first in starts]
-        try:
-            for task in tasks:
-                task.result()
-        except KeyboardInterrupt:
-            stop.set()
-        except BaseException:
-            stop.set()
-            raise
+    portion = LANES * math.ceil(size / (LANES * cores * math.ceil(size / (BATCH * cores))))
+    pool, starts = _threads(cores, os.getpid()), range(0, size, portion)
+    tasks = [pool.submit(work, slice(first, min(first + portion, size)), stop) for first in starts]
+    try:
+        for task in tasks:
+            task.result()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        stop.set()  # those that have not begun have nothing to do
+        wait(tasks)
+
+
+@functools.cache
+def _threads(number: int, process: int) -> ThreadPoolExecutor:
+    """Threads that stay, since starting them takes as long as many an ensemble; a forked process has none of them."""
+    del process
+    return ThreadPoolExecutor(number)
 
 
 THREADS: contextvars.ContextVar[int | None] = contextvars.ContextVar("THREADS", default=None)
@@ -119,7 +126,7 @@ def run_compiled(
             return
         number = chosen.stop - chosen.start
         blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
-        before = {name: value[:number].copy() for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
+        before = {name: value[:number].copy("K") for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
         record.begin(chosen, before["x"], before["energy"], before["entropy"])
         taken = 0
         for h, saves, every, place in calls(course, CHUNK_STEPS * 16 // max(number, LANES)):

@@ -60,7 +60,7 @@ class Family:
         if isinstance(system, Family):
             return system
         if isinstance(system, System):
-            return cls._of_named(system, {} if parameters is None else parameters)
+            return cls._of_named(system, parameters)
         if not callable(system):
             raise InputError(f"the first argument is a system, or a function that builds one, not {system!r}")
         if parameters is None:
@@ -72,6 +72,9 @@ class Family:
 
     @classmethod
     def _of_named(cls, system: System, parameters) -> Family:
+        if parameters is None:
+            leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
+            return cls(Form.of(system), [np.asarray(leaf)[None] for leaf in leaves], system)
         if not isinstance(parameters, Mapping):
             raise InputError(
                 "parameters of a system are a dict from names to arrays; "

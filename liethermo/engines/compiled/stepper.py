@@ -150,7 +150,8 @@ class Stepper:
         self._both, self._driven, self._explicit, self._increments = both, driven, method.explicit, method.increments
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
         self._shapes["dW"] = (method.increments,)
-        self._shapes |= dict.fromkeys(("k", "before", "guess", "old", "new", "direction", "changes"), (stages, n))
+        self._shapes |= dict.fromkeys(("k", "guess", "old", "new", "direction", "changes"), (stages, n))
+        self._shapes["before"] = (0 if method.explicit else stages, n)
 
         after = ("converged", "going")
         solved = "h guess update converged defined made newtons noise"
@@ -273,10 +274,10 @@ class Stepper:
 
     def fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Fields of trajectories, trajectories first, those of empty lanes among them."""
-        found = {}
+        found, number = {}, len(blocks) * self.lanes
         for name in self.names if names is None else names:
-            values = self.part(blocks, name).swapaxes(1, 2)
-            found[name] = values.reshape(len(blocks) * self.lanes, *self._shapes.get(name, ()))
+            values = self.part(blocks, name).swapaxes(0, 1)
+            found[name] = values.reshape(-1, number).T.reshape(number, *self.shape(name))
         return found
 
     def run(
