@@ -55,11 +55,13 @@ def normal(seeds: np.ndarray, members: np.ndarray, first: int, steps: int, count
     found = np.empty((len(members), steps, count))
     places = np.arange(count, dtype=np.uint32)
     portion = max(1, BLOCK // max(count, 1))
-    for i, key in enumerate(zip(*keys, strict=True)):
-        own = np.full(1, key[0]), np.full(1, key[1])
+    together = max(1, portion // max(steps, 1))
+    for i in range(0, len(members), together):
+        own = keys[0][i : i + together, None, None], keys[1][i : i + together, None, None]
         for start in range(0, steps, portion):
             numbers = np.arange(first + start, first + min(start + portion, steps), dtype=np.uint32)[:, None]
             high, low = threefry(own, (numbers, places))
             bits = high.astype(np.uint64) << np.uint64(32) | low
-            found[i, start : start + portion] = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+            values = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+            found[i : i + together, start : start + portion] = values
     return found
