@@ -134,7 +134,7 @@ class Many:
         form, h = self.family.form, paces.read("taken", caught)
         own = self.family.flat(places[caught], caught.size)
         function, p = self.event.function, own.shape[1]
-        whole = paces.stepped(caught, h)
+        whole = paces.stepped(caught, h, ("x", "k"))
         x = paces.read("x", caught)
 
         def watched(x: np.ndarray, some: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ class Many:
             return np.asarray(at_points(_watched, (form, function, p), at[rows]))[: len(at)]
 
         def value(shares: np.ndarray, some: np.ndarray) -> np.ndarray:
-            end = paces.stepped(caught[some], shares * h[some])
+            end = paces.stepped(caught[some], shares * h[some], ("x", "status"))
             found = watched(end["x"], some)
             failed = np.flatnonzero((end["status"] != Code.COMPLETED) | ~np.isfinite(found))
             for j in failed:  # a part of the step that fails is replaced by the polynomial of the whole
@@ -156,9 +156,7 @@ class Many:
 
         everyone = np.arange(caught.size)
         shares = located(value, watched(x, everyone), watched(whole["x"], everyone))
-        end = paces.stepped(caught, shares * h)
-        fields = {name: end[name] for name in TELLING}
-        return fields, paces.read("t", caught) + shares * h
+        return paces.stepped(caught, shares * h, TELLING), paces.read("t", caught) + shares * h
 
 
 def _watched(model: tuple[Form, Callable, int], at):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ...integrators import OneStepMethod
@@ -144,19 +146,25 @@ class LanePaces:
         block, lane = np.divmod(chosen, self.stepper.lanes)
         self.stepper.part(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
 
-    def stepped(self, chosen: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
-        """The fields of the states after steps of these sizes from those that some have."""
-        fields = {name: self.read(name, chosen) for name in FIELDS} | {"status": np.zeros(len(chosen))}
-        blocks = self.plain.blocks(fields | {"p": self.read("p", chosen)})
-        sizes = np.resize(h, len(blocks) * self.plain.lanes)
-        self.plain.run(self.first, blocks, sizes, 1, 1)
-        return {name: values[: len(chosen)] for name, values in self.plain.fields(blocks).items()}
+    def stepped(self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = FIELDS) -> dict[str, np.ndarray]:
+        """Fields of the states after steps of these sizes from those that some have."""
+        own, plain = self._rows(chosen), self.plain
+        rows = np.zeros((len(chosen), plain.height))
+        of_state = slice(plain.rows(FIELDS[-1]).stop)  # the first rows of both
+        rows[:, of_state], rows[:, plain.rows("p")] = own[:, of_state], own[:, self.stepper.rows("p")]
+        rows[:, plain.rows("status")] = 0.0
+        blocks = plain.of_rows(rows)
+        plain.run(self.first, blocks, np.resize(h, len(blocks) * plain.lanes), 1, 1)
+        return {name: values[: len(chosen)] for name, values in plain.fields(blocks, names).items()}
+
+    def _rows(self, chosen: np.ndarray) -> np.ndarray:
+        """All that is known of some of them, shape (trajectories, rows)."""
+        block, lane = np.divmod(chosen, self.stepper.lanes)
+        return self.stepper.part(self.blocks)[block, :, lane]
 
     def only(self, chosen: np.ndarray) -> None:
         """Go on with some of them."""
-        block, lane = np.divmod(chosen, self.stepper.lanes)
-        rows = self.stepper.part(self.blocks)[block, :, lane]
-        self.blocks, self.number = self.stepper.of_rows(rows), len(chosen)
+        self.blocks, self.number = self.stepper.of_rows(self._rows(chosen)), len(chosen)
 
 
 def lane_pace(

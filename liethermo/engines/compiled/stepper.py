@@ -218,11 +218,18 @@ class Stepper:
 
     def part(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
         """A field of blocks, or all rows of them, shape (blocks, entries, lanes)."""
-        whole = blocks.reshape(len(blocks), self._layout.height, self.lanes)
-        if name is None:
-            return whole
+        whole = blocks.reshape(len(blocks), self.height, self.lanes)
+        return whole if name is None else whole[:, self.rows(name)]
+
+    @property
+    def height(self) -> int:
+        """How many rows a trajectory has."""
+        return self._layout.height
+
+    def rows(self, name: str) -> slice:
+        """Those of a field."""
         first = self._layout.rows[name]
-        return whole[:, first : first + self._layout.sizes[name]]
+        return slice(first, first + self._layout.sizes[name])
 
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of a field of one trajectory."""
@@ -233,15 +240,14 @@ class Stepper:
         if self._varies.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._varies]}
         number = len(fields["x"])
-        whole = np.zeros((-(-number // self.lanes), self._layout.height, self.lanes))
+        whole = np.zeros((-(-number // self.lanes), self.height, self.lanes))
         for name, values in fields.items():
-            first = self._layout.rows[name]
-            whole[:, first : first + self._layout.sizes[name]] = self._in_lanes(np.reshape(values, (number, -1)))
+            whole[:, self.rows(name)] = self._in_lanes(np.reshape(values, (number, -1)))
         return self._marked(whole, number)
 
     def block_of(self, state: State) -> np.ndarray:
         """The only block of a trajectory by itself."""
-        whole = np.zeros((1, self._layout.height))
+        whole = np.zeros((1, self.height))
         row = whole[0]
         for (first, end, shape), value in zip(self._places, state, strict=True):
             if shape:
