@@ -147,9 +147,7 @@ class VmapPaces(_ArrayPaces):
         given = self.form, self.parameters, self.axes, self.method, self.pacing
         self.pace = _follow_all(*given, self.pace, jnp.asarray(most))
 
-    def stepped(
-        self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = State._fields
-    ) -> dict[str, np.ndarray]:
+    def stepped(self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = State._fields) -> dict[str, np.ndarray]:
         sizes = np.ones(self.number)
         sizes[chosen] = h
         state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))

@@ -61,38 +61,41 @@ class Iteration(NamedTuple):
             mean = jnp.sqrt(update) * jnp.sqrt(self.previous)
             previous = jnp.where(self.made > 1, mean, previous)
         stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
-        return Iteration(k, update, jnp.fmin(update, self.best), stalled, previous, self.made + 1)
+        best = jnp.where(update < self.best, update, self.best)
+        return Iteration(k, update, best, stalled, previous, self.made + 1)
 
     def slower(self, rate: float) -> jax.Array:
         """Whether updates shrink by less than a rate of contraction."""
         return self.update > rate * self.previous
 
-    def settled(self, scale, rules: Rules, misfit=jnp.inf, noise=0.0) -> jax.Array:
+    def settled(self, scale, rules: Rules, misfit=None, noise=None) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
 
         Small beside the scale of the slopes and the state; or the misfit is, beside the ``noise`` that slopes have.
         """
-        small = (self.update <= rules.plateau * scale) | (misfit <= rules.plateau * noise)
+        small = self.update <= rules.plateau * scale
+        if noise is not None:
+            small |= misfit <= rules.plateau * noise
         return (self.update <= rules.floor * scale) | ((self.stalled >= 2) & small)
 
-    def stands(self, scale, rules: Rules, noise=0.0) -> tuple[jax.Array, jax.Array]:
-        """How a fixed-point iteration stands: whether it has converged, and whether to go on."""
-        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * jnp.maximum(scale, noise))
+    def stands(self, scale, rules: Rules, noise=None) -> tuple[jax.Array, jax.Array]:
+        """How a fixed-point iteration that has begun stands: whether it has converged, and whether to go on."""
+        least = scale if noise is None else jnp.maximum(scale, noise)
+        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * least)
         finite = jnp.isfinite(self.update)
-        hopeless = slow | ((self.made > 0) & ~finite)
         settled = self.settled(scale, rules, self.update, noise)
-        return settled & finite, ~settled & ~hopeless & (self.made < rules.fixed_point)
+        return settled & finite, ~settled & ~slow & finite & (self.made < rules.fixed_point)
 
 
-def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=0.0, rules: Rules = RULES) -> Solved:
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=None, rules: Rules = RULES) -> Solved:
     """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
 
     def goes_on(s: Iteration):
-        return s.stands(scale(s.k), rules, noise)[1]
+        return (s.made == 0) | s.stands(scale(s.k), rules, noise)[1]
 
     s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k), rules), Iteration.begin(guess))
     converged = s.stands(scale(s.k), rules, noise)[0]
-    noise = jnp.zeros(()) + noise
+    noise = jnp.zeros(()) + (0.0 if noise is None else noise)
     return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), noise)
 
 

@@ -99,12 +99,14 @@ class _Steps(Writer):
         own = np.cumsum(varies) - 1
         self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
         slots = [name for name in layout.sizes if name != "p"]
-        self.slots = {
-            name: [self.builder.alloca(self.number, name=f"{name}_{i}") for i in range(layout.sizes[name])]
-            for name in slots
-        }
+        self.slots = {name: self._slots(name) for name in slots}
+        needed = {*pieces["conclude"].arguments, *SOLVED} if lanes > 1 and not explicit else ()
+        self.outcome = {name: self._slots(name) for name in pieces["iterate"].results if name in needed}
         self.truth = {name: self.builder.alloca(self.test, name=name) for name in ("running", "active")}
         self.block = self.builder.alloca(NUMBERS)
+
+    def _slots(self, name: str) -> list[ir.Value]:
+        return [self.builder.alloca(self.number, name=f"{name}_{i}") for i in range(self.layout.sizes[name])]
 
     # -- the loops ----------------------------------------------------------------------------------------------------
 
@@ -156,12 +158,17 @@ class _Steps(Writer):
         self.run("prepare")
         build.store(build.load(truth["running"]), truth["active"])
 
-        with self.repeated(lambda: self.any(build.load(truth["active"]))):
-            active = build.load(truth["active"])
-            self.run("iterate", active if self.lanes > 1 else None)
-            going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
-            build.store(build.and_(active, going), truth["active"])
-        if not self.explicit:
+        if self.explicit:
+            self.run("iterate")
+        else:
+            with self.repeated(lambda: self.any(build.load(truth["active"]))):
+                active = build.load(truth["active"])
+                self.run("iterate", *((active, self.outcome) if self.lanes > 1 else ()))
+                going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
+                build.store(build.and_(active, going), truth["active"])
+            for name, ends in self.outcome.items():
+                for slot, end in zip(self.slots[name], ends, strict=True):
+                    build.store(build.load(end), slot)
             solved = build.fcmp_ordered("==", self.value("converged"), self.constant(1.0))
             hard = build.and_(build.load(truth["running"]), build.not_(solved))
             with build.if_then(self.any(hard), likely=False):
@@ -194,8 +201,12 @@ class _Steps(Writer):
 
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
-    def run(self, name: str, where: ir.Value | None = None) -> None:
-        """Run a piece; its results take the place of what there was, in the lanes where a test holds."""
+    def run(self, name: str, where: ir.Value | None = None, apart: Mapping[str, list] | None = None) -> None:
+        """Run a piece; its results take the place of what there was, in the lanes where a test holds.
+
+        Or they do in all lanes, and those of some names are kept ``apart`` where the test holds: so no iteration has to
+        wait until it is known which lanes the one before has left.
+        """
         piece, build = self.pieces[name], self.builder
 
         def read(i: int, j: int) -> ir.Value:
@@ -203,8 +214,12 @@ class _Steps(Writer):
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
         for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
-            for slot, value in zip(self.slots[array], values, strict=True):
+            kept = self.slots[array] if apart is None else apart.get(array, [])
+            for slot, value in zip(kept, values, strict=bool(kept)):
                 build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
+            if apart is not None:
+                for slot, value in zip(self.slots[array], values, strict=True):
+                    build.store(value, slot)
 
     def parameter(self, i: int) -> ir.Value:
         own, build = self.own[i], self.builder

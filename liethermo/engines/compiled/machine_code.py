@@ -9,6 +9,7 @@ import hashlib
 import os
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -36,7 +37,8 @@ LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
 class Writer:
     """Writes programs where a builder stands, on numbers, or on vectors with a number for each lane.
 
-    Truth values are bits, integers have 64. Nothing is reordered or fused, so results are those of NumPy.
+    Truth values are bits, integers have 64. Nothing is reordered. A product that is only added to something is fused
+    with the sum, and rounded once, on processors that can; which ones are does not depend on the lanes.
     """
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
@@ -54,7 +56,11 @@ class Writer:
             Asked for what the program uses.
         """
         places = {name: (i, j) for i, names in enumerate(program.inputs) for j, name in enumerate(names)}
+        uses = Counter(a for _, _, args in program.instructions for a in args)
+        uses.update(a for entries in program.outputs for a in entries)
         values: dict[Scalar, ir.Value] = {}
+        products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
+        sizes: set[Scalar] = set()  # numbers without a sign
 
         def value(a: Scalar) -> ir.Value:
             if not isinstance(a, str):
@@ -64,7 +70,18 @@ class Writer:
             return values[a]
 
         for target, op, args in program.instructions:
-            values[target] = self.operation(op, self._alike(op, [value(a) for a in args], args))
+            given = self._alike(op, [value(a) for a in args], args)
+            fused = [i for i, a in enumerate(args) if a in products] if op in ("add", "sub") else []
+            if fused:
+                values[target] = self._fused(op, fused[-1], products[args[fused[-1]]], given)
+            elif op == "max" and sizes.issuperset(args):
+                values[target] = self._larger(*given)
+            else:
+                values[target] = self.operation(op, given)
+            if op == "mul" and uses[target] == 1 and values[target].type == self.number:
+                products[target] = given
+            if op == "abs" or (op == "max" and sizes.issuperset(args)):
+                sizes.add(target)
         return [[self._as_number(value(a)) for a in entries] for entries in program.outputs]
 
     def constant(self, number: bool | int | float) -> ir.Value:
@@ -109,6 +126,24 @@ class Writer:
             signed = self._intrinsic("llvm.copysign", [self.constant(1.0), x], self.number)
             return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed, x)
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
+
+    def _fused(self, op: str, place: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]) -> ir.Value:
+        """A sum or difference whose term at a place is a product."""
+        (x, y), other = factors, terms[1 - place]
+        if op == "sub":
+            x, other = (x, self.builder.fneg(other)) if place == 0 else (self.builder.fneg(x), other)
+        return self._intrinsic("llvm.fmuladd", (x, y, other), self.number)
+
+    def _larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """The larger of two numbers without a sign, NaN if either is: their bits are in the order of the numbers."""
+        build, count = self.builder, max(self.lanes, 2)
+        number, whole = ir.VectorType(NUMBER, count), ir.VectorType(WHOLE, count)
+        first = ir.Constant(ir.IntType(32), 0)
+        if self.lanes == 1:
+            x, y = (build.insert_element(ir.Constant(number, ir.Undefined), v, first) for v in (x, y))
+        bits = [build.bitcast(v, whole) for v in (x, y)]
+        found = build.bitcast(build.call(self._declared(f"llvm.smax.v{count}i64", whole, bits), bits), number)
+        return build.extract_element(found, first) if self.lanes == 1 else found
 
     def any(self, tests: ir.Value) -> ir.Value:
         """Whether a truth value holds in any lane, as one bit."""

@@ -3,6 +3,7 @@
 import gc
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -46,6 +47,37 @@ def test_every_operation_at_every_kind_of_number(op, lanes):
         numbers = ~np.isnan(np.ravel(right).astype(float))
         if right.dtype.kind == "f" and op not in ("max", "min", "sign"):  # whose zeros may have either sign
             assert np.array_equal(np.signbit(np.ravel(found))[numbers], np.signbit(np.ravel(right))[numbers])
+
+
+def test_products_in_sums_are_the_same_in_every_lane():
+    """Rounded once where the processor can, and alike alone and in lanes: no trajectory knows its neighbours."""
+
+    def run(a):
+        x, y, z = a
+        return x * y + z, z - x * y, x * y - z, x * y - z * x, -(x * y) + z, (x * y - z) + x * y
+
+    program, lanes = program_of(run, np.ones(3)), 4
+    alone, together = compiled(program), compiled(program, lanes)
+    given = np.random.default_rng(0).uniform(-1.0, 1.0, (100, lanes, 3))
+    for a in given:
+        rows = [np.concatenate([np.ravel(v) for v in alone(own)]) for own in a]
+        found = np.stack([np.ravel(v) for v in together(a)], axis=1)
+        assert np.array_equal(found, rows)
+        expected = np.stack([np.ravel(v) for v in program.evaluate(a, batch=True)], axis=1)
+        assert np.abs(found - expected).max() <= 4e-16
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_the_largest_component(lanes):
+    """Sizes are compared by their bits; one that is NaN shows."""
+    program = program_of(lambda a: jnp.max(jnp.abs(a)), np.ones(3))
+    triples = np.array(list(itertools.product(SPECIAL, repeat=3))).reshape(-1, lanes, 3)
+    function = compiled(program, lanes)
+    for a in triples:
+        (found,) = function(a)
+        expected = np.maximum(np.maximum(abs(a[:, 0]), abs(a[:, 1])), abs(a[:, 2]))
+        np.testing.assert_array_equal(np.ravel(found), expected)
+        assert not np.signbit(np.ravel(found)[~np.isnan(expected)]).any()
 
 
 def test_arithmetic_of_integers_and_constants():
