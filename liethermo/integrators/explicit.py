@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Self
@@ -30,6 +31,10 @@ for the states between. Error and what is missed are over h."""
 NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
 """What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
 back, and the most that one takes back: far below what its rounding is."""
+
+
+FEW = 64
+"""Components of a state from which on a correction takes longer than finding out whether there is need of it."""
 
 
 class Law(NamedTuple):
@@ -92,7 +97,7 @@ class ExplicitMethod(OneStepMethod):
     """
 
     corrections: ClassVar[int] = 4
-    """Newton corrections of a step: a relative error of a twentieth is one of rounding after them."""
+    """Newton corrections of a step at most: a relative error of a twentieth is one of rounding after them."""
 
     number: int | None = eqx.field(static=True)
     functions: tuple[Energy, ...]
@@ -225,16 +230,30 @@ class ExplicitMethod(OneStepMethod):
             found = [system.raised(end, gradient) for gradient in ends]
             return found if spheres is None else [spheres.along(end, v) for v in found]
 
-        d = landed(d)
-        ends = gradients(d)
-        found = directions(d, ends)
-        for i in range(self.corrections):
+        def left(d, ends, found) -> jax.Array:
+            squares = jnp.stack([jnp.dot(v, v) for v in found])
+            missed = misses(d, ends) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
+            return jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, missed)))
+
+        def corrected(i: int, d, ends, found, missed) -> tuple:
+            del missed
             found = directions(d, ends) if 0 < i < 3 else found  # the last time they are as good as they get
             d = landed(d + towards(found, misses(d, ends)))
             ends = gradients(d)
-        squares = jnp.stack([jnp.dot(v, v) for v in found])
-        left = misses(d, ends) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
-        return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, left)))
+            return d, ends, found, left(d, ends, found)
+
+        d = landed(d)
+        ends = gradients(d)
+        found = directions(d, ends)
+        state = d, ends, found, left(d, ends, found)
+        for i in range(self.corrections):
+            correct = functools.partial(corrected, i)
+            if i and x.shape[0] > FEW:  # of a short step one is enough
+                done = state[-1] <= EPS * jnp.linalg.norm(state[0])
+                state = jax.lax.cond(done, lambda *same: same, correct, *state)
+            else:
+                state = correct(*state)
+        return state[0], state[-1]
 
     def _laws(self, system: System) -> list[Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
