@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.groups.maps import central, from_adjoint_cayley
+from manifolds.groups.maps import central, from_adjoint_cayley, inverse_dexp
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
 from ..functions.gradients import compensated
-from ..systems import AttitudeSystem
+from ..systems import AttitudeSystem, TurningSystem
 from .base import OneStepMethod
 from .tableaus import gauss
 
@@ -38,6 +36,8 @@ class WithAttitude(OneStepMethod):
     ``"exp"`` is collocation in the algebra, ``g' = g exp(h sum b_i k_i)`` with ``k_i = dexp^-1(h sum_j A_ij k_j) xi_i``
     [Munthe-Kaas 1999]: with one stage ``g' = g exp(h xi)``. It stays in every group; spatial momenta are kept to the
     order of the method.
+
+    Explicit methods turn by ``"exp"``, whatever is asked for: their step is that of (mu, theta), ``g' = g exp(theta)``.
 
     Momenta are those that the method gives without attitudes; the order is the same for all three.
 
@@ -76,12 +76,18 @@ class WithAttitude(OneStepMethod):
     def keeps(self, system, name: str) -> bool:
         return self.method.keeps(system.body, name)
 
+    @property
+    def explicit(self) -> bool:
+        return self.method.explicit
+
     def check(self, system) -> None:
-        if self.method.explicit:
-            raise InputError(f"{self.method} does not reconstruct attitudes: take lt.MetriplecticGauss")
         self.method.check(system.body)
 
     def slopes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
+        if self.explicit:
+            local = TurningSystem(system, self.order)
+            start, rest, own = local.around(x), local.around(low), local.lowered_rates(k)
+            return local.raised_rates(self.method.pulled(local).slopes(local, start, rest, h, own))
         (mu, g), (mu_low, g_low), (rates, g_rates) = map(system.split, (x, low, k))
         algebra, A = system.group.algebra, gauss(self.stages).A
         momenta = self.method.slopes(system.body, mu, mu_low, h, rates)
@@ -91,7 +97,7 @@ class WithAttitude(OneStepMethod):
         moved = h * jnp.einsum("ij,j...->i...", A, g_rates)
         if self.kind == "cayley":
             return system.join(momenta, (g + (g_low + moved)) @ algebra.hat(xi))
-        return system.join(momenta, algebra.hat(_inverse_dexp(algebra, algebra.vee(moved), xi, self.order)))
+        return system.join(momenta, algebra.hat(inverse_dexp(algebra, algebra.vee(moved), xi, self.order)))
 
     def increment(self, h, k) -> jax.Array:
         """The increment of the momentum and, unless by ``"cayley"``, of the attitude in the algebra."""
@@ -128,11 +134,21 @@ class WithAttitude(OneStepMethod):
         return system.group.restore_map(g @ system.group.exp_map(algebra, algebra.vee(omega)))
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
+        if self.explicit:
+            local = TurningSystem(system, self.order)
+            return local.raised_rates(self.method.start(local, local.around(x)))
         (mu, g), algebra = system.split(x), system.group.algebra
         rates = self.method.start(system.body, mu)
         turn = algebra.hat(system.body.energy.gradient(mu))
         turn = g @ turn if self.kind == "cayley" else turn
         return system.join(rates, jnp.broadcast_to(turn, (self.stages, *turn.shape)))
+
+    def missed(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
+        (mu, _), (mu_low, _), (rates, _) = map(system.split, (x, low, k))
+        return self.method.missed(system.body, mu, mu_low, h, rates)
+
+    def weights(self, theta):
+        return self.method.weights(theta)
 
     def predict(self, k, before) -> jax.Array:
         return self.method.predict(k, before)
@@ -165,23 +181,3 @@ def _collocated(algebra, xi) -> jax.Array:
     Q = solve_near_identity(jnp.eye(stages * dim) - implicit, start).reshape(stages, dim, dim)
     R = jnp.eye(dim) + jnp.einsum("j,jab,jbc->ca", tableau.b, turned, Q)
     return from_adjoint_cayley(algebra, R) + central(algebra, tableau.b @ xi)
-
-
-def _inverse_dexp(algebra, omega, xi, order: int) -> jax.Array:
-    """``sum_j (-1)^j B_j / j! ad_omega^j xi``, j <= order: the omega' that turns ``exp(omega)`` with velocity xi."""
-    term, total = xi, xi
-    for j in range(1, order + 1):
-        term = -algebra.bracket(omega, term) / j
-        if _BERNOULLI[j]:
-            total = total + _BERNOULLI[j] * term
-    return total
-
-
-def _bernoulli(count: int) -> list[float]:
-    numbers: list[float] = []
-    for m in range(count):
-        numbers.append(1.0 if m == 0 else -sum(math.comb(m + 1, j) * b for j, b in enumerate(numbers)) / (m + 1))
-    return [b if m == 1 or m % 2 == 0 else 0.0 for m, b in enumerate(numbers)]
-
-
-_BERNOULLI = _bernoulli(17)

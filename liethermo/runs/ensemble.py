@@ -127,7 +127,8 @@ def ensemble(
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
     if isinstance(member, AttitudeSystem):
         attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
-        family, states = family.through(AttitudeSystem), np.asarray(member.begin(states, attitude, batch=True))
+        family = family.through(AttitudeSystem, member.reconstruction)
+        states = np.asarray(member.begin(states, attitude, batch=True))
     elif attitude is not None:
         raise InputError(NO_GROUP)
     if isinstance(member, DrivenSystem):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -73,8 +73,8 @@ class Family:
     @classmethod
     def _of_named(cls, system: System, parameters) -> Family:
         if parameters is None:
-            leaves = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
-            return cls(Form.of(system), [np.asarray(leaf)[None] for leaf in leaves], system)
+            own = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
+            return cls(Form.of(system), [np.asarray(leaf)[None] for leaf in own], system)
         if not isinstance(parameters, Mapping):
             raise InputError(
                 "parameters of a system are a dict from names to arrays; "
@@ -145,10 +145,11 @@ class Family:
         """The family of the same form whose members are built from other values."""
         return replace(self, values=[*given, *self.values[self.given :]])
 
-    def through(self, change: Callable[..., System]) -> Family:
-        """The family of what a function, one that has an identity, makes of the members."""
+    def through(self, change: Callable[..., System], *fixed: Hashable) -> Family:
+        """The family of what a function, one that has an identity, makes of the members, with these arguments."""
         form = self.form
-        return Family(Form((form.key, change), form.shapes, lambda arrays: change(form.rebuild(arrays))), self.values)
+        key = form.key, change, fixed
+        return Family(Form(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *fixed)), self.values)
 
     # -- members --------------------------------------------------------------------------------------------------
 

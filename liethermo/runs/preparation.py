@@ -38,7 +38,8 @@ def as_run(
     method = method if noise is None else noise.on(system, method)
     method = traced_energies(method.suited(tolerance).pulled(system).on(system), system.dim)
     if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
-        return AttitudeSystem(system), WithAttitude(method, system.reconstruction)
+        kind = "exp" if method.explicit else system.reconstruction
+        return AttitudeSystem(system, kind), WithAttitude(method, kind)
     return system, method
 
 

@@ -1,6 +1,6 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
-from .attitude import AttitudeSystem
+from .attitude import AttitudeSystem, TurningSystem
 from .base import System
 from .chart import ChartSystem
 from .composed.bodies import Copies, Subsystem
@@ -35,5 +35,6 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
+    "TurningSystem",
     "driven",
 ]

@@ -12,6 +12,7 @@ import numpy as np
 import manifolds as mf
 from manifolds.groups import maps
 
+from ..dissipation.base import Carried, Several
 from ..errors import InputError
 from ..functions.energy import Energy, Sum
 from ..tracing.interpret import at_points
@@ -49,15 +50,18 @@ class AttitudeSystem(System):
     Attributes
     ----------
     body : LiePoissonSystem
+    reconstruction : {"coadjoint", "cayley", "exp"}
+        How the attitude is found: see :class:`liethermo.WithAttitude`.
     group : manifolds.MatrixGroup
     """
 
     body: LiePoissonSystem
+    reconstruction: str = eqx.field(static=True)
     group: mf.MatrixGroup = eqx.field(static=True)
 
-    def __init__(self, body: LiePoissonSystem):
+    def __init__(self, body: LiePoissonSystem, reconstruction: str):
         assert body.group is not None
-        self.body, self.group, self.space = body, body.group, None
+        self.body, self.reconstruction, self.group, self.space = body, reconstruction, body.group, None
         self.dim = body.dim + self._parts * self.group.matrix_size**2
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self._of_momentum(body.energy)
@@ -67,7 +71,7 @@ class AttitudeSystem(System):
     def unrollable(self) -> bool:
         general = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
         own = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
-        kind = self.body.reconstruction or ""
+        kind = self.reconstruction
         unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again
         return self.body.unrollable and self._parts == 1 and unrolls
 
@@ -144,3 +148,69 @@ class AttitudeSystem(System):
 
 def _distance(system: AttitudeSystem, x) -> jax.Array:
     return system.group.defect(system.split(x)[1])
+
+
+class TurningSystem(System):
+    """A body in coordinates (mu, theta) around an attitude g, which it turns to ``g exp(hat(theta))``.
+
+    ``theta' = dexp(theta)^-1 grad H(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method that
+    needs no more. The laws are those of mu.
+
+    Attributes
+    ----------
+    whole : AttitudeSystem
+    order : int
+        The power of theta to which its velocity is computed.
+    """
+
+    whole: AttitudeSystem
+    order: int = eqx.field(static=True)
+
+    def __init__(self, whole: AttitudeSystem, order: int):
+        body = whole.body
+        self.whole, self.order, self.dim, self.space = whole, order, 2 * body.dim, None
+        self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
+        self.energy, self.entropy = whole.energy, whole.entropy
+        self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
+        self.dissipation = None
+        if body.dissipation is not None:
+            parts = tuple(_OnMomentum(part, tuple(map(self.pulled, part.preserve))) for part in body.dissipation.terms)
+            self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+
+    def pulled(self, energy: Energy) -> Energy:
+        return self.whole._of_momentum(energy)
+
+    def casimirs(self):
+        return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
+
+    def field(self, x, dH, dS, dL=()):
+        body, n = self.whole.body, self.whole.body.dim
+        motion = body.field(x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL))
+        return jnp.concatenate([motion, maps.inverse_dexp(body.algebra, x[n:], dH[:n], self.order)])
+
+    # -- coordinates --------------------------------------------------------------------------------------------------
+
+    def around(self, x) -> jax.Array:
+        """The coordinates of a state around its own attitude."""
+        mu = self.whole.split(x)[0]
+        return jnp.concatenate([mu, jnp.zeros_like(mu)])
+
+    def lowered_rates(self, k) -> jax.Array:
+        """In coordinates what :meth:`raised_rates` makes of them."""
+        rates, turns = self.whole.split(k)
+        return jnp.concatenate([rates, self.whole.body.algebra.vee(turns)], axis=-1)
+
+    def raised_rates(self, k) -> jax.Array:
+        """Vectors of coordinates, shape (stages, dim), with matrices of the algebra in place of theta."""
+        n = self.whole.body.dim
+        return self.whole.join(k[..., :n], self.whole.body.algebra.hat(k[..., n:]))
+
+
+class _OnMomentum(Carried):
+    """A dissipation of the momentum."""
+
+    def force(self, system, x, dH, dS, dL):
+        body = system.whole.body
+        n = body.dim
+        dS, dL = None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+        return jnp.pad(self.part.force(body, x[:n], dH[:n], dS, dL), (0, n))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from functools import cache
+from math import comb
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,30 @@ def dexp(algebra: LieAlgebra, x) -> jax.Array:
     ad, one = algebra.ad(x), jnp.broadcast_to(jnp.eye(algebra.dim), (*x.shape, algebra.dim))
     top = jnp.concatenate([-ad, one], axis=-1)
     return expm(jnp.concatenate([top, jnp.zeros_like(top)], axis=-2))[..., : algebra.dim, algebra.dim :]
+
+
+def inverse_dexp(algebra: LieAlgebra, x, v, order: int) -> jax.Array:
+    """``dexp(x)^-1 v`` to a power of x: ``sum_j (-1)^j B_j / j! ad_x^j v``, j <= order, B_j Bernoulli's numbers.
+
+    The x' with which ``exp(x)`` turns at the velocity v, ``d exp(x) / dt = exp(x) hat(v)``.
+    """
+    term, total = v, v
+    for j in range(1, order + 1):
+        term = -algebra.bracket(x, term) / j
+        if _BERNOULLI[j]:
+            total = total + _BERNOULLI[j] * term
+    return total
+
+
+def _bernoulli(count: int) -> list[float]:
+    numbers = [Fraction(1)]
+    for m in range(1, count):
+        known = sum((comb(m + 1, j) * b for j, b in enumerate(numbers)), Fraction(0))
+        numbers.append(-known / (m + 1))
+    return list(map(float, numbers))
+
+
+_BERNOULLI = _bernoulli(26)
 
 
 def cayley(algebra: LieAlgebra, x) -> jax.Array:

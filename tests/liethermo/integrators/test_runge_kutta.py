@@ -162,6 +162,3 @@ def test_bad_input():
         lt.integrate(BODY, X0, (0.0, 1.0), lt.Adaptive(1e-20), RK(4))
     with pytest.raises(lt.errors.InputError, match="sparse engine"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, RK(4), engine="sparse")
-    attitudes = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.ones(3)), group=mf.SO(3))
-    with pytest.raises(lt.errors.InputError, match="attitudes"):
-        lt.integrate(attitudes, X0, (0.0, 1.0), 0.1, RK(4), attitude=np.eye(3))
