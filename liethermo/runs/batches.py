@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..engines import array
+from ..engines.choice import COMPILED_DIM
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
 from ..engines.paced import step_all
@@ -169,13 +170,23 @@ def calls(course: Course, limit: int):
 # -- the array engine -------------------------------------------------------------------------------------------------
 
 
+def in_whole_vectors(first: int, last: int, dim: int) -> np.ndarray:
+    """Places of trajectories, the last one repeated until they fill vectors: what is left over is rounded otherwise.
+
+    So the numbers of a trajectory do not depend on how many there are. Large states, shape (dim,), fill vectors alone.
+    """
+    filled = LANES * math.ceil((last - first) / LANES) if dim <= COMPILED_DIM else last - first
+    return np.minimum(np.arange(first, first + filled), last - 1)
+
+
 def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tally, noise: Paths | None = None) -> None:
     """All trajectories of a batch in one program, by ``vmap``."""
     size, course, interrupted = len(record.x0), record.course, False
     portion = min(ARRAY_BATCH, size)
     limit = CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // portion)  # bounded memory for the increments
     for start in range(0, size, portion):
-        chosen = slice(start, min(start + portion, size))
+        number = min(portion, size - start)
+        chosen = in_whole_vectors(start, start + number, record.x0.shape[1])
         parameters, axes = family.batched(chosen)
         state = before = begin_all(family.form, parameters, axes, method, jnp.asarray(record.x0[chosen]))
         first = {name: np.asarray(value) for name, value in before._asdict().items()}
@@ -190,7 +201,7 @@ def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tall
                 if place is not None:
                     columns = [kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])]
                     record.keep(chosen, place, np.concatenate(columns, axis=-1))
-                tally.add((chosen.stop - chosen.start) * saves * every / course.steps)
+                tally.add(number * saves * every / course.steps)
         except KeyboardInterrupt:
             interrupted = True
         record.put(chosen, first, {name: np.asarray(value) for name, value in state._asdict().items()})

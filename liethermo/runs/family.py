@@ -242,7 +242,7 @@ class Family:
         columns = [np.broadcast_to(row.reshape(len(row), -1), (number, row[0].size)) for row in rows]
         return np.concatenate([np.zeros((number, 0)), *columns], axis=1)
 
-    def batched(self, chosen: slice) -> tuple[list[jax.Array], list[Any]]:
+    def batched(self, chosen: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
         """The parameters of some members, in front where they differ, and the axes for ``vmap``."""
         differ = [len(value) > 1 for value in self.values]
         arrays = [jnp.asarray(value[chosen] if d else value[0]) for value, d in zip(self.values, differ, strict=True)]

@@ -168,7 +168,7 @@ class Paths:
     increments: int
     numbers: np.ndarray
 
-    def rows(self, chosen: slice, first: int, steps: int, h) -> np.ndarray:
+    def rows(self, chosen: slice | np.ndarray, first: int, steps: int, h) -> np.ndarray:
         return self.noise.rows(self.increments, self.numbers[chosen], first, steps, float(h))
 
 

@@ -15,7 +15,7 @@ from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
 from ..tracing.interpret import at_points
-from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads
+from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads, in_whole_vectors
 from .events import Event, located
 from .family import Family
 from .record import Record
@@ -74,11 +74,11 @@ class Many:
         """All of a batch in one program."""
         size = len(self.record.x0)
         for start in range(0, size, ARRAY_BATCH):
-            chosen = slice(start, min(start + ARRAY_BATCH, size))
-            parameters, axes = self.family.batched(chosen)
+            places = in_whole_vectors(start, min(start + ARRAY_BATCH, size), self.record.x0.shape[1])
+            parameters, axes = self.family.batched(places)
             given = self.family.form, parameters, axes, self.method, self.pacing
-            paces = VmapPaces(*given, self.record.x0[chosen], *self._times)
-            self._follow(paces, np.arange(chosen.start, chosen.stop), None, lambda: self.interrupted)
+            paces = VmapPaces(*given, self.record.x0[places], *self._times)
+            self._follow(paces, places, None, lambda: self.interrupted)
 
     def _follow(self, paces: ManyPaces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
         """Trajectories with these places, to the ends of all."""
@@ -116,7 +116,7 @@ class Many:
                     codes = np.where(status[ended] == FINISHED, Code.COMPLETED, status[ended])
                     finish(ended, codes, fields_of(ended), paces.read("t", ended))
                 followed[ended] = followed[caught] = False
-                self.tally.add(ended.size + caught.size)
+                self.tally.add(np.unique(places[np.append(ended, caught)]).size)
                 if only is not None and 2 * followed.sum() <= len(places) and followed.any():
                     left = np.flatnonzero(followed)
                     only(left)
