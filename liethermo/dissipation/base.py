@@ -9,7 +9,7 @@ Remark 4.7 ask for, once for every class.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, TypeVar
 
 import jax
@@ -215,6 +215,14 @@ class Carried(Dissipation):
 
     part: Dissipation
     functions: tuple[Energy, ...]
+
+    @classmethod
+    def of(cls, dissipation: Dissipation | None, pulled: Callable[[Energy], Energy], *more) -> Dissipation | None:
+        """That of each summand, what it preserves pulled back; ``more`` is what a subclass has besides."""
+        if dissipation is None:
+            return None
+        parts = tuple(cls(part, tuple(map(pulled, part.preserve)), *more) for part in dissipation.terms)
+        return parts[0] if len(parts) == 1 else Several(parts)
 
     @property
     def energy_law(self):

@@ -78,25 +78,23 @@ class Iteration(NamedTuple):
             small |= misfit <= rules.plateau * noise
         return (self.update <= rules.floor * scale) | ((self.stalled >= 2) & small)
 
-    def stands(self, scale, rules: Rules, noise=None) -> tuple[jax.Array, jax.Array]:
+    def stands(self, scale, rules: Rules) -> tuple[jax.Array, jax.Array]:
         """How a fixed-point iteration that has begun stands: whether it has converged, and whether to go on."""
-        least = scale if noise is None else jnp.maximum(scale, noise)
-        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * least)
+        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * scale)
         finite = jnp.isfinite(self.update)
-        settled = self.settled(scale, rules, self.update, noise)
+        settled = self.settled(scale, rules)
         return settled & finite, ~settled & ~slow & finite & (self.made < rules.fixed_point)
 
 
-def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, noise=None, rules: Rules = RULES) -> Solved:
+def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, rules: Rules = RULES) -> Solved:
     """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
 
     def goes_on(s: Iteration):
-        return (s.made == 0) | s.stands(scale(s.k), rules, noise)[1]
+        return (s.made == 0) | s.stands(scale(s.k), rules)[1]
 
     s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k), rules), Iteration.begin(guess))
-    converged = s.stands(scale(s.k), rules, noise)[0]
-    noise = jnp.zeros(()) + (0.0 if noise is None else noise)
-    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), noise)
+    converged = s.stands(scale(s.k), rules)[0]
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), jnp.zeros(()))
 
 
 def noise_of(system: System, x, rules: Rules = RULES) -> jax.Array:
@@ -119,7 +117,7 @@ def solve_stages(
     fixed-point iteration fails.
     """
     measure = rules.size(guess.shape[-1])
-    first = fixed_point(slopes, guess, scale, rules=rules)
+    first = fixed_point(slopes, guess, scale, rules)
     done = first.converged
     size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
 

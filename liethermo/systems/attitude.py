@@ -12,7 +12,7 @@ import numpy as np
 import manifolds as mf
 from manifolds.groups import maps
 
-from ..dissipation.base import Carried, Several
+from ..dissipation.base import Carried
 from ..errors import InputError
 from ..functions.energy import Energy, Sum
 from ..tracing.interpret import at_points
@@ -172,10 +172,7 @@ class TurningSystem(System):
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = None
-        if body.dissipation is not None:
-            parts = tuple(_OnMomentum(part, tuple(map(self.pulled, part.preserve))) for part in body.dissipation.terms)
-            self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+        self.dissipation = _OnMomentum.of(body.dissipation, self.pulled)
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation.base import Carried, Several
+from ..dissipation.base import Carried
 from ..functions.energy import Energy, Sum
 from .base import System
 
@@ -45,14 +45,7 @@ class ChartSystem(System):
         trivial = isinstance(system.poisson, mf.NoPoisson)
         self.poisson = mf.NoPoisson(self.dim) if trivial else _Poisson(system, coordinates, place)
         self.momentum_maps = {name: self.pulled(J) for name, J in system.momentum_maps.items()}
-        if system.dissipation is None:
-            self.dissipation = None
-            return
-        parts = tuple(
-            _Force(part, tuple(map(self.pulled, part.preserve)), system, coordinates, place)
-            for part in system.dissipation.terms
-        )
-        self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+        self.dissipation = _Force.of(system.dissipation, self.pulled, system, coordinates, place)
 
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""

@@ -12,7 +12,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._module import Module
 
-from ..dissipation.base import Carried, Several
+from ..dissipation.base import Carried
 from ..errors import InputError
 from ..functions.checks import recognised
 from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime
@@ -59,10 +59,7 @@ class DrivenSystem(System):
         self.energy = energy if self.space is not None else recognised(energy, self.dim)
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = None
-        if body.dissipation is not None:
-            parts = tuple(_OnBody(part, tuple(map(self._of_body, part.preserve))) for part in body.dissipation.terms)
-            self.dissipation = parts[0] if len(parts) == 1 else Several(parts)
+        self.dissipation = _OnBody.of(body.dissipation, self._of_body)
 
     @property
     def kind(self) -> str:

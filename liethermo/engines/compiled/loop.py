@@ -214,9 +214,10 @@ class _Steps(Writer):
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
         for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
-            kept = self.slots[array] if apart is None else apart.get(array, [])
-            for slot, value in zip(kept, values, strict=bool(kept)):
-                build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
+            masked = self.slots if apart is None else apart
+            if array in masked:
+                for slot, value in zip(masked[array], values, strict=True):
+                    build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
             if apart is not None:
                 for slot, value in zip(self.slots[array], values, strict=True):
                     build.store(value, slot)

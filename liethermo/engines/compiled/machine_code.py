@@ -71,16 +71,17 @@ class Writer:
 
         for target, op, args in program.instructions:
             given = self._alike(op, [value(a) for a in args], args)
+            unsigned = op == "max" and sizes.issuperset(args)
             fused = [i for i, a in enumerate(args) if a in products] if op in ("add", "sub") else []
             if fused:
                 values[target] = self._fused(op, fused[-1], products[args[fused[-1]]], given)
-            elif op == "max" and sizes.issuperset(args):
+            elif unsigned:
                 values[target] = self._larger(*given)
             else:
                 values[target] = self.operation(op, given)
             if op == "mul" and uses[target] == 1 and values[target].type == self.number:
                 products[target] = given
-            if op == "abs" or (op == "max" and sizes.issuperset(args)):
+            if op == "abs" or unsigned:
                 sizes.add(target)
         return [[self._as_number(value(a)) for a in entries] for entries in program.outputs]
 

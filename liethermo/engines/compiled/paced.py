@@ -138,8 +138,7 @@ class LanePaces:
     def read(self, name: str, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
         if isinstance(chosen, slice):
             return self.stepper.fields(self.blocks, (name,))[name][: self.number][chosen].copy()
-        block, lane = np.divmod(chosen, self.stepper.lanes)
-        values = self.stepper.part(self.blocks, name)[block, :, lane]
+        values = self._rows(chosen, name)
         return values if name == "p" else values.reshape(len(chosen), *self.stepper.shape(name))
 
     def write(self, name: str, chosen: np.ndarray, values) -> None:
@@ -157,10 +156,10 @@ class LanePaces:
         plain.run(self.first, blocks, np.resize(h, len(blocks) * plain.lanes), 1, 1)
         return {name: values[: len(chosen)] for name, values in plain.fields(blocks, names).items()}
 
-    def _rows(self, chosen: np.ndarray) -> np.ndarray:
-        """All that is known of some of them, shape (trajectories, rows)."""
+    def _rows(self, chosen: np.ndarray, name: str | None = None) -> np.ndarray:
+        """A field of some of them, or all that is known of them, shape (trajectories, rows)."""
         block, lane = np.divmod(chosen, self.stepper.lanes)
-        return self.stepper.part(self.blocks)[block, :, lane]
+        return self.stepper.part(self.blocks, name)[block, :, lane]
 
     def only(self, chosen: np.ndarray) -> None:
         """Go on with some of them."""
