@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import real_array
-from manifolds.structures.spins import Planes, Spins, cross_planes, planes
+from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled
 
 from ..errors import InputError
 from ..functions.indices import Indices
@@ -105,7 +105,7 @@ class LandauLifshitz(Dissipation):
         if not self.baths:
             return system.poisson.joined(*self.parts(system, x, dH, None, None))
         spins = system.poisson
-        return spins.joined(*self.parts(system, x, dH, spins.spins(dS), dS[3 * spins.count :]))
+        return spins.joined(*self.parts(system, x, dH, spins.covectors(dS), dS[3 * spins.count :]))
 
     def parts(self, system, x, dH, dS: Planes | None, e) -> tuple[Planes, jax.Array]:
         """The components of the force on the spins, and the force on the baths, shape (m,).
@@ -115,29 +115,29 @@ class LandauLifshitz(Dissipation):
         """
         spins = system.poisson
         s, rate = spins.spins(x), self.rate.reshape(-1)
-        torque = cross_planes(s, spins.spins(dH))
+        torque = cross_planes(s, spins.covectors(dH))
         if not self.baths:
-            return _scaled(rate, cross_planes(s, torque)), jnp.zeros(0)
+            return scaled(rate, cross_planes(s, torque)), jnp.zeros(0)
         T = dH[3 * spins.count :]
         share, size = self._of_sites(e / T), rate * self._of_sites(jnp.abs(T))
         if dS is None:
-            pull = _scaled(-size * share, torque)
-        else:
-            a, b, c = cross_planes(s, dS)
-            pull = _scaled(size, (a - share * torque[0], b - share * torque[1], c - share * torque[2]))
-        return cross_planes(pull, s), self._warmed(torque, pull) / T
+            strength = size * share
+            return scaled(strength, cross_planes(s, torque)), self._heat(strength, torque, torque) / T
+        a, b, c = cross_planes(s, dS)
+        pull = a - share * torque[0], b - share * torque[1], c - share * torque[2]
+        return scaled(size, cross_planes(pull, s)), -self._heat(size, torque, pull) / T
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
         s, rate, T = spins.spins(x), self.rate.reshape(-1), dH[3 * spins.count :]
-        torque = cross_planes(s, spins.spins(dH))
+        torque = cross_planes(s, spins.covectors(dH))
         size = rate * self._of_sites(jnp.abs(T)) if self.baths else rate
         root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
 
         def times(w):
-            pull = _scaled(root, planes(w.reshape(spins.count, 3)))
-            warmed = self._warmed(torque, pull) / T if self.baths else jnp.zeros(0)
-            return spins.joined(cross_planes(pull, s), warmed)
+            pull = planes(w.reshape(spins.count, 3))
+            warmed = -self._heat(root, torque, pull) / T if self.baths else jnp.zeros(0)
+            return spins.joined(scaled(root, cross_planes(pull, s)), warmed)
 
         return Factor(3 * spins.count, times)
 
@@ -145,14 +145,12 @@ class LandauLifshitz(Dissipation):
         """Values of baths, shape (m,), at the sites that heat them, shape (count,) or (1,)."""
         return values[:1] if self.bath is None else values[np.asarray(self.bath).ravel()]
 
-    def _warmed(self, torque: Planes, pull: Planes) -> jax.Array:
-        """``-sum t . pull`` over the sites of each bath, shape (m,)."""
-        if self.bath is None:
+    def _heat(self, size, torque: Planes, pull: Planes) -> jax.Array:
+        """``sum size t . pull`` over the sites of each bath, shape (m,)."""
+        if self.bath is None and size.size == 1:
             heat = sum(jnp.dot(t, p) for t, p in zip(torque, pull, strict=True))
-            return jnp.zeros(self.baths).at[0].set(-heat)
-        heat = -(torque[0] * pull[0] + torque[1] * pull[1] + torque[2] * pull[2])
-        return jax.ops.segment_sum(heat, np.asarray(self.bath).ravel(), self.baths)
-
-
-def _scaled(factor, vectors: Planes) -> Planes:
-    return factor * vectors[0], factor * vectors[1], factor * vectors[2]
+            return jnp.zeros(self.baths).at[0].set(size.reshape(()) * heat)
+        each = size * dotted(torque, pull)
+        if self.bath is None:
+            return jnp.zeros(self.baths).at[0].set(jnp.sum(each))
+        return jax.ops.segment_sum(each, np.asarray(self.bath).ravel(), self.baths)

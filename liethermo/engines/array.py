@@ -11,7 +11,7 @@ from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
 from .rules import RULES, Rules
-from .stepping import State, begin, take_step
+from .stepping import State, begin, in_order, take_step
 
 
 def advance(
@@ -37,6 +37,7 @@ def advance(
 @program
 def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules, noise):
     first = state.step
+    system, method, state, back = in_order(system, method, state, rules)
 
     def step(s: State) -> State:
         own = method if noise is None else method.driven_by(noise[s.step - first])
@@ -50,12 +51,13 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
             return (s.status == Code.COMPLETED) & (s.step < target)
 
         state = jax.lax.while_loop(goes_on, step, state)
-        saved = state.x, state.energy, state.entropy, state.status == Code.COMPLETED
+        saved = back(state).x, state.energy, state.entropy, state.status == Code.COMPLETED
         return state, jax.tree_util.tree_map(lambda all_of, one: all_of.at[index].set(one), kept, saved)
 
     one = state.x, state.energy, state.entropy, jnp.zeros((), bool)
     kept = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in one)
-    return jax.lax.fori_loop(0, saves, one_save, (state, kept))  # as many passes as saves, whatever the capacity
+    state, kept = jax.lax.fori_loop(0, saves, one_save, (state, kept))  # as many passes as saves, not as the capacity
+    return back(state), kept
 
 
 KEPT_STATES, KEPT_NUMBERS = 1024, 2**16

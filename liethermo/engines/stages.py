@@ -116,10 +116,16 @@ def solve_stages(
     what Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where
     fixed-point iteration fails.
     """
-    measure = rules.size(guess.shape[-1])
     first = fixed_point(slopes, guess, scale, rules)
-    done = first.converged
-    size = jax.lax.cond(done, lambda: jnp.zeros(()), noise)
+    # a branch, since what is carried to a loop, and back, is copied
+    return jax.lax.cond(
+        first.converged, lambda: first, lambda: _by_newton(slopes, guess, scale, inverted, noise, rules, first)
+    )
+
+
+def _by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solved) -> Solved:
+    """The second attempt; of trajectories side by side it does nothing for those that the first has solved."""
+    measure, done, size = rules.size(guess.shape[-1]), first.converged, noise()
 
     def misfit(k):
         return slopes(k) - k
@@ -172,13 +178,11 @@ def solve_stages(
         s, found, damped = carry
         return unsolved(s, found) & ~(damped & lost(s, damped))
 
-    start, start_misfit = jax.lax.cond(done, lambda: (guess, guess), lambda: better_start(misfit, guess))
-    second, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
-    k = jnp.where(done, first.k, second.k)
-    converged = ~unsolved(second, found) & jnp.isfinite(jnp.sum(k))
-    residual = jnp.where(done, first.residual, second.update)
-    size = jnp.where(second.settled(scale(second.k), rules), 0.0, size)
-    return Solved(k, converged, done | jnp.isfinite(second.update), residual, first.fixed_point, second.made, size)
+    start, start_misfit = better_start(misfit, guess)
+    s, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
+    converged = ~unsolved(s, found) & jnp.isfinite(jnp.sum(s.k))
+    size = jnp.where(s.settled(scale(s.k), rules), 0.0, size)
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, first.fixed_point, s.made, size)
 
 
 def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -55,6 +55,11 @@ class DiscreteGradient(Module):
         """Order of the midpoint scheme (BFM 4.5) built on it: 2 if it is symmetric in x and x + d, else 1."""
         return 2
 
+    @property
+    def orderless(self) -> bool:
+        """Whether it does not depend on the order of the coordinates."""
+        return False
+
     def __call__(self, energy: Energy, x, d, low=0.0) -> jax.Array:
         parts = [term.discrete_gradient(self, x, d, low) for term in energy.terms]
         return sum(parts[1:], parts[0])
@@ -75,6 +80,10 @@ class DiscreteGradient(Module):
 class Gonzalez(DiscreteGradient):
     """Midpoint discrete gradient ``grad H(z) + [H(x') - H(x) - grad H(z).d] d/|d|^2``, z = x + d/2 [BFM 4.3]."""
 
+    @property
+    def orderless(self) -> bool:
+        return True
+
     def general(self, term: Energy, x, d, low) -> jax.Array:
         left, middle, right = jax.vmap(lambda c: term.gradient(x + (low + c * d)))(_NODES_3)
         second = left + right - 2.0 * middle  # the prediction minus grad H(z).d is 5/18 second.d, free of cancellation
@@ -93,6 +102,10 @@ class MeanValue(DiscreteGradient):
     """
 
     nodes: int = eqx.field(static=True, default=5)
+
+    @property
+    def orderless(self) -> bool:
+        return True
 
     def __check_init__(self):
         if not isinstance(self.nodes, int) or self.nodes < 1:

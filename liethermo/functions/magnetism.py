@@ -7,6 +7,7 @@ States hold the spins first, site by site in C order, ``(s_1x, s_1y, s_1z, s_2x,
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -16,7 +17,18 @@ import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced, real_array
-from manifolds.structures.spins import cross
+from manifolds.structures.spins import (
+    Lattice,
+    Planes,
+    added,
+    cross,
+    cross_planes,
+    planes,
+    reshaped,
+    scaled,
+    spins_of,
+    state_of,
+)
 
 from ..errors import InputError
 from .each import Each
@@ -113,118 +125,144 @@ def zeeman(sites, field, moment=1.0) -> Energy:
     return OnSites(shape, None, -moment[..., None] * B, None)
 
 
-class OnSites(Energy):
-    """``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n ``sum_ic A_ic s_ic^2 / 2``, c a component.
+class SpinEnergy(Energy):
+    """A quadratic energy of spins on a lattice, written down by their components: arrays of the shape of the sites.
 
     Attributes
     ----------
     sites : tuple of int
-    A : array, shape () or that of the sites, (3,) or ``(*sites, 3)`` without n, or None
-    b, n : array, shape (3,) or ``(*sites, 3)``, or None
+    reach : tuple of int
+        How far, along each axis, the spins are that act on one.
     """
 
     sites: tuple[int, ...] = eqx.field(static=True)
-    A: jax.Array | None
-    b: jax.Array | None
-    n: jax.Array | None
+
+    @property
+    def reach(self) -> tuple[int, ...]:
+        return (0,) * len(self.sites)
+
+    @abstractmethod
+    def of(self, spins: Lattice) -> jax.Array:
+        """The value, shape ()."""
+
+    @abstractmethod
+    def gradients(self, spins: Lattice) -> Planes:
+        """The gradients by the spins."""
 
     @property
     def is_quadratic(self) -> bool:
         return True
 
     def value(self, x) -> jax.Array:
-        s = spins_of(x, self.sites)
-        linear = jnp.zeros(()) if self.b is None else _product(jnp.broadcast_to(self.b, s.shape), s)
-        return linear + (0.0 if self.A is None else 0.5 * _product(s, self._drawn(s)))
+        return self.of(Lattice(on_lattice(x, self.sites)))
 
     def gradient(self, x) -> jax.Array:
-        s = spins_of(x, self.sites)
-        found = jnp.zeros_like(s) if self.A is None else self._drawn(s)
-        return placed(found if self.b is None else found + self.b, x)
-
-    def _drawn(self, s) -> jax.Array:
-        """``A_i (n_i . s_i) n_i``."""
-        assert self.A is not None
-        if self.n is None:
-            return self.A * s
-        a, b, c = (self.n[..., i] * s[..., i] for i in range(3))
-        return (self.A * (a + b + c))[..., None] * self.n
-
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
+        return off_lattice(self.gradients(Lattice(on_lattice(x, self.sites))), x)
 
     def check_places(self, dim: int, role: str) -> None:
         check_room(self.sites, dim, role)
 
 
-class Bonds(Energy):
+class OnSites(SpinEnergy):
+    """``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n ``sum_ic A_ic s_ic^2 / 2``, c a component.
+
+    Attributes
+    ----------
+    A : array, shape () or that of the sites, (3,) or ``(*sites, 3)`` without n, or None
+    b, n : array, shape (3,) or ``(*sites, 3)``, or None
+    """
+
+    A: jax.Array | None
+    b: jax.Array | None
+    n: jax.Array | None
+
+    def of(self, spins: Lattice) -> jax.Array:
+        linear = jnp.zeros(()) if self.b is None else _product(planes(self.b), spins.here)
+        return linear + (0.0 if self.A is None else 0.5 * _product(self._drawn(spins.here), spins.here))
+
+    def gradients(self, spins: Lattice) -> Planes:
+        if self.A is None:
+            assert self.b is not None
+            a, b, c = (jnp.broadcast_to(component, self.sites) for component in planes(self.b))
+            return a, b, c
+        drawn = self._drawn(spins.here)
+        return drawn if self.b is None else added(drawn, planes(self.b))
+
+    def _drawn(self, spins: Planes) -> Planes:
+        """``A_i (n_i . s_i) n_i``."""
+        assert self.A is not None
+        if self.n is None:
+            A = planes(self.A)
+            return A[0] * spins[0], A[1] * spins[1], A[2] * spins[2]
+        n = planes(self.n)
+        return scaled(self.A * (n[0] * spins[0] + n[1] * spins[1] + n[2] * spins[2]), n)
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
+
+
+class Bonds(SpinEnergy):
     """``sum_i -J_i s_i . s_{i+o} + D_i . (s_i x s_{i+o})`` on a lattice, o an offset.
 
     Attributes
     ----------
-    sites, offset : tuple of int
+    offset : tuple of int
     J : array, shape () or that of the sites, or None
     D : array, shape (3,) or ``(*sites, 3)``, or None
     """
 
-    sites: tuple[int, ...] = eqx.field(static=True)
     offset: tuple[int, ...] = eqx.field(static=True)
     J: jax.Array | None
     D: jax.Array | None
 
     @property
-    def is_quadratic(self) -> bool:
-        return True
+    def reach(self) -> tuple[int, ...]:
+        return tuple(map(abs, self.offset))
 
-    def value(self, x) -> jax.Array:
-        s = spins_of(x, self.sites)
-        return _product(s, self._from_ahead(s))
+    def of(self, spins: Lattice) -> jax.Array:
+        return _product(self._given(spins.at(self.offset), self.J, self.D), spins.here)
 
-    def gradient(self, x) -> jax.Array:
-        s = spins_of(x, self.sites)
-        return placed(self._from_ahead(s) + self._from_behind(s), x)
+    def gradients(self, spins: Lattice) -> Planes:
+        ahead, behind = spins.at(self.offset), spins.at([-o for o in self.offset])
+        if self.D is None and self.J is not None and not self.J.ndim:
+            return scaled(-self.J, added(ahead, behind))
+        axes = range(len(self.sites))
+        J = self.J if self.J is None or not self.J.ndim else jnp.roll(self.J, self.offset, axes)
+        D = self.D if self.D is None or self.D.ndim == 1 else jnp.roll(self.D, self.offset, axes)
+        return added(self._given(ahead, self.J, self.D), self._given(behind, J, None if D is None else -D))
 
-    def _from_ahead(self, s) -> jax.Array:
-        """What a site is given by the one ahead of it: ``-J s' + s' x D``."""
-        ahead = self._shifted(s, -1)
-        found = jnp.zeros_like(s) if self.J is None else -self.J[..., None] * ahead
-        return found if self.D is None else found + cross(ahead, self.D)
-
-    def _from_behind(self, s) -> jax.Array:
-        found = jnp.zeros_like(s)
-        if self.J is not None:
-            found = self._shifted(-self.J[..., None] * s if self.J.ndim else s, 1)
-            found = found if self.J.ndim else -self.J * found
-        return found if self.D is None else found + self._shifted(cross(self.D, s), 1)
-
-    def _shifted(self, s, sign: int) -> jax.Array:
-        for axis, by in enumerate(self.offset):
-            s = s if by == 0 else jnp.roll(s, sign * by, axis=axis)
-        return s
+    @staticmethod
+    def _given(s: Planes, J: jax.Array | None, D: jax.Array | None) -> Planes:
+        """What a neighbour s gives to a site: ``-J s + s x D``."""
+        aligned = None if J is None else scaled(-J, s)
+        if D is not None:
+            turned = cross_planes(s, planes(D))
+            return turned if aligned is None else added(aligned, turned)
+        assert aligned is not None
+        return aligned
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         here = np.arange(math.prod(self.sites)).reshape(self.sites)
         ahead = np.roll(here, [-by for by in self.offset], axis=range(here.ndim))
         return cliques(_places(here.ravel(), ahead.ravel()), dim)
 
-    def check_places(self, dim: int, role: str) -> None:
-        check_room(self.sites, dim, role)
+
+def on_lattice(x, sites: tuple[int, ...], planar: bool = False) -> Planes:
+    """The components of the spins of a state, each of the shape of the sites."""
+    return reshaped(spins_of(x, math.prod(sites), planar), sites)
 
 
-def spins_of(x, sites: tuple[int, ...]) -> jax.Array:
-    """The spins of a state, shape ``(*sites, 3)``."""
-    return x[: 3 * math.prod(sites)].reshape(*sites, 3)
+def off_lattice(covectors: Planes, x, planar: bool = False) -> jax.Array:
+    """Covectors of the spins as one of the state x."""
+    return state_of(reshaped(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
 
 
-def placed(covectors, x) -> jax.Array:
-    """Covectors of the spins, shape ``(*sites, 3)``, as one of the state x."""
-    flat = covectors.reshape(-1)
-    return flat if flat.size == x.size else jnp.concatenate([flat, jnp.zeros(x.size - flat.size)])
-
-
-def _product(u, v) -> jax.Array:
-    """``sum u_i . v_i``; as the product of two vectors it is ten times as fast as a sum over what v is made of."""
-    return jnp.dot(u.reshape(-1), v.reshape(-1))
+def _product(u: Planes, v: Planes) -> jax.Array:
+    """``sum u_i . v_i``; as products of vectors it is ten times as fast as a sum over what v is made of."""
+    return sum(
+        (jnp.dot(jnp.broadcast_to(a, b.shape).reshape(-1), b.reshape(-1)) for a, b in zip(u, v, strict=True)),
+        jnp.zeros(()),
+    )
 
 
 def checked_sites(sites) -> tuple[int, ...]:

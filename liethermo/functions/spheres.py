@@ -13,6 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds.structures.spins import Planes, added, dotted, scaled, spins_of, state_of
+
 from .energy import Energy
 
 
@@ -25,16 +27,18 @@ class Spheres:
     count : int
     name : str
         Of the first integral that is the sum of their squares.
+    planar : bool
+        Whether the state has them component by component, and not one after another.
     """
 
     count: int
     name: str
+    planar: bool = False
 
     def along(self, x, v) -> jax.Array:
         """v, shape (n,), less its radial components at x."""
         s, part = self._vectors(x), self._vectors(v)
-        square = _dot(s, s)
-        return self._replaced(v, part - (_dot(s, part) / jnp.where(square > 0.0, square, 1.0)) * s)
+        return self._replaced(v, added(part, scaled(-_quotient(dotted(s, part), dotted(s, s)), s)))
 
     def reached(self, x, low, d) -> jax.Array:
         """The displacement from x + low that ends where d does, but at the lengths of the start.
@@ -42,23 +46,20 @@ class Spheres:
         From what the squares change by, not from their values: so it is as exact as d is small.
         """
         start, step = self._vectors(x + low), self._vectors(d)
-        change = _dot(step, 2.0 * start + step)
-        end = start + step
-        square = _dot(end, end)
-        share = change / jnp.where(square > 0.0, square, 1.0)
+        end = added(start, step)
+        share = _quotient(dotted(step, added(start, end)), dotted(end, end))
         root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
-        return self._replaced(d, step - (share / (1.0 + root)) * end)
+        return self._replaced(d, added(step, scaled(-share / (1.0 + root), end)))
 
-    def _vectors(self, v) -> jax.Array:
-        return v[: 3 * self.count].reshape(self.count, 3)
+    def _vectors(self, v) -> Planes:
+        return spins_of(v, self.count, self.planar)
 
-    def _replaced(self, v, vectors) -> jax.Array:
-        flat = vectors.reshape(-1)
-        return flat if flat.size == v.size else jnp.concatenate([flat, v[flat.size :]])
+    def _replaced(self, v, vectors: Planes) -> jax.Array:
+        return state_of(vectors, v[3 * self.count :], self.planar)
 
 
-def _dot(u, v) -> jax.Array:
-    return jnp.sum(u * v, axis=-1, keepdims=True)
+def _quotient(numerator, square) -> jax.Array:
+    return numerator / jnp.where(square > 0.0, square, 1.0)
 
 
 class Squares(Energy):

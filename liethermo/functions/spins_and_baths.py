@@ -38,10 +38,7 @@ class SpinsAndBaths(Energy):
         return jnp.concatenate([self.spins.gradient(x[: self.size]), self.baths.gradient(x[self.size :])])
 
     def sensitivity(self, x) -> jax.Array:
-        s = x[: self.size]
-        gradients = [term.gradient(s) for term in self.spins.terms]
-        of_spins = jnp.sqrt(jnp.dot(s, s)) * _total(jnp.sqrt(jnp.dot(g, g)) for g in gradients)
-        return jax.lax.stop_gradient(of_spins) + self.baths.sensitivity(x[self.size :])
+        return self.spins.sensitivity(x[: self.size]) + self.baths.sensitivity(x[self.size :])
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         low, n = jnp.zeros_like(x) + low, self.size
@@ -49,7 +46,11 @@ class SpinsAndBaths(Energy):
         def of(energy: Energy, *ends) -> jax.Array:
             return _total(term.discrete_gradient(scheme, *ends) for term in energy.terms)
 
-        return jnp.concatenate([of(self.spins, x[:n], d[:n], low[:n]), of(self.baths, x[n:], d[n:], low[n:])])
+        if self.spins.is_quadratic:  # at points of whole states, which others look at too
+            by_spins = _Front(self.spins, n).discrete_gradient(scheme, x, d, low)[:n]
+        else:
+            by_spins = of(self.spins, x[:n], d[:n], low[:n])
+        return jnp.concatenate([by_spins, of(self.baths, x[n:], d[n:], low[n:])])
 
     def stage_gradients(self, scheme, path: Path) -> jax.Array:
         def of(energy: Energy, components: slice) -> jax.Array:
@@ -71,6 +72,23 @@ class SpinsAndBaths(Energy):
 
     def __neg__(self) -> Energy:
         return SpinsAndBaths(-self.spins, -self.baths, self.size)
+
+
+class _Front(Energy):
+    """A quadratic energy of the first components."""
+
+    energy: Energy
+    size: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(x[: self.size])
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.concatenate([self.energy.gradient(x[: self.size]), jnp.zeros(x.size - self.size)])
 
 
 def _part(path: Path, components: slice) -> Path:

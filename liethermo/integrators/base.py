@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import ClassVar
 
 import equinox as eqx
@@ -84,6 +84,11 @@ class OneStepMethod(Module):
         """How far an explicit method misses the levels that its step has to end on, as a length of a slope."""
         del system, x, low, h
         return jnp.zeros_like(jnp.max(k))
+
+    @property
+    def orderless(self) -> bool:
+        """Whether a step does not depend on the order of components, so that large states may have another inside."""
+        return False
 
     @property
     def evaluations(self) -> int:
@@ -167,6 +172,10 @@ class OneStepMethod(Module):
         """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
         return self
 
+    def turned(self, k, change: Callable) -> jax.Array:
+        """Slopes whose components are changed as those of states, shape (..., n), are."""
+        return change(k)
+
     @property
     def increments(self) -> int:
         """Random numbers that a step is driven by: none of a method for equations without noise."""
@@ -204,6 +213,10 @@ class GaussMethod(OneStepMethod):
     @property
     def order(self) -> int:
         return 2 * self.number
+
+    @property
+    def orderless(self) -> bool:
+        return True
 
     def increment(self, h, k) -> jax.Array:
         return h * (gauss(self.number).b @ k)

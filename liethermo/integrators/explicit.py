@@ -124,6 +124,10 @@ class ExplicitMethod(OneStepMethod):
         return True
 
     @property
+    def orderless(self) -> bool:
+        return True
+
+    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law", "casimirs"})
 
@@ -266,6 +270,9 @@ class ExplicitMethod(OneStepMethod):
             assert system.entropy is not None
             laws.append(Law(system.entropy, LAWS[system.entropy_law]))
         return sorted(laws, key=lambda law: law.sign != 0.0)
+
+    def turned(self, k, change: Callable) -> jax.Array:
+        return change(k).at[LEVELS].set(k[LEVELS])
 
     def missed(self, system: System, x, low, h, k) -> jax.Array:
         del system, x, low, h

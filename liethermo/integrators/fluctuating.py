@@ -67,6 +67,10 @@ class Fluctuating(OneStepMethod):
         return self.method.preserves - {"entropy_law_quadratic"}
 
     @property
+    def orderless(self) -> bool:
+        return self.method.orderless
+
+    @property
     def increments(self) -> int:
         return self.dW.shape[0]
 

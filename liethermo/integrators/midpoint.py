@@ -55,6 +55,10 @@ class MetriplecticMidpoint(OneStepMethod):
         return self.gradient.order
 
     @property
+    def orderless(self) -> bool:
+        return self.gradient.orderless
+
+    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 

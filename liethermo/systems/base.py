@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,6 +25,24 @@ from .kinds import Kind
 
 SCALES = (1.0, 1e-4, 1e4)
 """Scales of the random points at which the system is asked which functions it conserves."""
+
+
+class Arranged(NamedTuple):
+    """A system with the components of its states in another order.
+
+    Attributes
+    ----------
+    system : System
+    there, back : functions of states, shape (..., n)
+        Into that order, and out of it.
+    pulled : function from an Energy to an Energy
+        A function of states, as one of states in that order.
+    """
+
+    system: System
+    there: Callable
+    back: Callable
+    pulled: Callable
 
 
 class System(Kind):
@@ -159,6 +177,10 @@ class System(Kind):
         With ``centred``, for use at that state alone.
         """
         return self, x
+
+    def arranged(self) -> Arranged | None:
+        """This system with its components in another order, in which programs for large states are faster, if any."""
+        return None
 
     def presented(self, solution: Any) -> Any:
         """A solution of this system, as its user is to see it."""

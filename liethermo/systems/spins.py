@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 
@@ -20,10 +21,11 @@ from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.each import Each
 from ..functions.energy import Energy, Function, Negative, Sum, TimeDependent, as_energy
-from ..functions.magnetism import checked_sites, spins_of
+from ..functions.magnetism import checked_sites
+from ..functions.planes import by_planes, reach, to_planes, to_sites
 from ..functions.spheres import Spheres, Squares
 from ..functions.spins_and_baths import SpinsAndBaths
-from .base import System
+from .base import Arranged, System
 
 LENGTHS = "sum |s|^2 / 2"
 
@@ -127,7 +129,24 @@ class SpinSystem(System):
 
     @property
     def spheres(self) -> Spheres:
-        return Spheres(math.prod(self.lattice), LENGTHS)
+        assert isinstance(self.poisson, mf.Spins)
+        return Spheres(math.prod(self.lattice), LENGTHS, self.poisson.planar)
+
+    def arranged(self) -> Arranged | None:
+        """With the spins component by component; what other dissipations do with components is not known."""
+        spins, known = self.poisson, self.dissipation is None or isinstance(self.dissipation, LandauLifshitz)
+        if type(self) is not SpinSystem or not isinstance(spins, mf.Spins) or spins.planar:
+            return None
+        if self.is_driven or not known:
+            return None
+        count = spins.count
+        planar = mf.Spins(spins.sites, spins.others, spins.ratio, reach(self.energy, spins.sites))
+        system = eqx.tree_at(lambda s: (s.poisson, s.energy), self, (planar, by_planes(self.energy, count)))
+        if self.momentum_maps:
+            maps = {name: by_planes(J, count) for name, J in self.momentum_maps.items()}
+            system = eqx.tree_at(lambda s: s.momentum_maps, system, maps)
+        change, back = (functools.partial(turn, count=count) for turn in (to_planes, to_sites))
+        return Arranged(system, change, back, lambda energy: by_planes(energy, count))
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         found = super().samples(count, seed, scale)
@@ -200,7 +219,7 @@ class _OfSpins(Module):
     lattice: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x, *time):
-        return self.function(spins_of(x, self.lattice), *time)
+        return self.function(x[: 3 * math.prod(self.lattice)].reshape(*self.lattice, 3), *time)
 
 
 class _LastSum(Energy):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -32,6 +33,9 @@ class Spins(PoissonStructure):
         Components behind the spins.
     ratio : float, or array of the shape of the sites
         gamma_i: with ``s' = s x grad H``, the physics of a moment ``-gamma s`` in the field ``-grad H``.
+    margins : tuple of int, optional
+        If given, states have the spins component by component, ``(s_1x, s_2x, …, s_1y, …)``, which large ones go
+        through the memory faster with. They are worked on with margins of so many sites, see :class:`Padded`.
 
     Raises
     ------
@@ -41,14 +45,15 @@ class Spins(PoissonStructure):
     ratio: jax.Array
     sites: tuple[int, ...] = eqx.field(static=True)
     others: int = eqx.field(static=True)
+    margins: tuple[int, ...] | None = eqx.field(static=True)
 
-    def __init__(self, sites, others: int = 0, ratio=1.0):
+    def __init__(self, sites, others: int = 0, ratio=1.0, margins: tuple[int, ...] | None = None):
         shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
         if not shape:
             raise ParameterError("spins need the number of sites")
         self.sites = tuple(checked_size(n, 1, "Spins", "each number of sites") for n in shape)
         self.others = checked_size(others, 0, "Spins", "the number of other components")
-        self.ratio = real_array(ratio)
+        self.ratio, self.margins = real_array(ratio), margins
         if self.ratio.shape not in ((), self.sites):
             raise ParameterError(f"the ratio is one number, or has shape {self.sites}, not {self.ratio.shape}")
         if not isinstance(self.ratio, jax.core.Tracer) and not np.isfinite(np.asarray(self.ratio)).all():
@@ -63,19 +68,28 @@ class Spins(PoissonStructure):
     def dim(self) -> int:
         return 3 * self.count + self.others
 
+    @property
+    def planar(self) -> bool:
+        """Whether states have the spins component by component."""
+        return self.margins is not None
+
     def spins(self, x) -> Planes:
         """The components of the spins of a state, shape (n,): three arrays, shape (count,)."""
-        return planes(x[: 3 * self.count].reshape(self.count, 3))
+        if self.margins is None:
+            return self.covectors(x)
+        return reshaped(Padded(reshaped(self.covectors(x), self.sites), self.margins).here, (self.count,))
+
+    def covectors(self, alpha) -> Planes:
+        """The components of covectors of the spins, likewise."""
+        return spins_of(alpha, self.count, self.planar)
 
     def joined(self, spins: Planes, others) -> jax.Array:
         """A state, shape (n,), from the components of its spins and the other components, shape (others,)."""
-        flat = interleaved(spins).reshape(3 * self.count)
-        return flat if self.others == 0 else jnp.concatenate([flat, others])
+        return state_of(spins, others, self.planar)
 
     def turned(self, x, alpha) -> Planes:
         """The components of ``gamma_i s_i x alpha_i``."""
-        ratio, (a, b, c) = self.ratio.reshape(-1), cross_planes(self.spins(x), self.spins(alpha))
-        return ratio * a, ratio * b, ratio * c
+        return scaled(self.ratio.reshape(-1), cross_planes(self.spins(x), self.covectors(alpha)))
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.joined(self.turned(x, alpha), jnp.zeros(self.others))
@@ -83,6 +97,52 @@ class Spins(PoissonStructure):
     def tensor(self, x) -> jax.Array:
         """The matrix Pi(x), shape (n, n): for few spins alone."""
         return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
+
+
+class Lattice:
+    """Spins on a lattice, by their components."""
+
+    def __init__(self, here: Planes):
+        self.here = here
+
+    def at(self, offset: Sequence[int]) -> Planes:
+        """For each site the spin so many sites ahead, beyond the end those at the start."""
+        a, b, c = (jnp.roll(component, [-o for o in offset], range(len(offset))) for component in self.here)
+        return a, b, c
+
+
+class Padded(Lattice):
+    """A large lattice, kept with a margin all around: it is put into the memory once, and neighbours are parts of it.
+
+    Parameters
+    ----------
+    reach : sequence of int
+        How far neighbours are at most, along each axis.
+    """
+
+    def __init__(self, spins: Planes, reach: Sequence[int]):
+        self.reach, self.sites = reach, spins[0].shape
+        margins = [(r, r) for r in reach]
+        self.whole = jax.lax.optimization_barrier([jnp.pad(component, margins, mode="wrap") for component in spins])
+        super().__init__(self.at([0 for _ in reach]))
+
+    def at(self, offset: Sequence[int]) -> Planes:
+        places = tuple(slice(r + o, r + o + n) for r, o, n in zip(self.reach, offset, self.sites, strict=True))
+        a, b, c = (component[places] for component in self.whole)
+        return a, b, c
+
+
+def spins_of(x, count: int, planar: bool = False) -> Planes:
+    """The components of the first vectors of a state, shape (n,): three arrays, shape (count,)."""
+    if planar:
+        return x[:count], x[count : 2 * count], x[2 * count : 3 * count]
+    return planes(x[: 3 * count].reshape(count, 3))
+
+
+def state_of(spins: Planes, others, planar: bool = False) -> jax.Array:
+    """The state, shape (n,), that has these, and the other components behind."""
+    parts = spins if planar else (interleaved(spins).reshape(-1),)
+    return jnp.concatenate([*parts, others]) if planar or others.size else parts[0]
 
 
 def planes(v) -> Planes:
@@ -102,6 +162,26 @@ def interleaved(spins: Planes) -> jax.Array:
 def cross_planes(u: Planes, v: Planes) -> Planes:
     """``u x v``, by components."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+def added(u: Planes, v: Planes) -> Planes:
+    """``u + v``, by components."""
+    return u[0] + v[0], u[1] + v[1], u[2] + v[2]
+
+
+def scaled(factor, vectors: Planes) -> Planes:
+    """Vectors times a factor, or one for each, by components."""
+    return factor * vectors[0], factor * vectors[1], factor * vectors[2]
+
+
+def dotted(u: Planes, v: Planes) -> jax.Array:
+    """``u . v`` of each, by components."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def reshaped(vectors: Planes, shape: tuple[int, ...]) -> Planes:
+    """Vectors on an array of sites of another shape, by components."""
+    return vectors[0].reshape(shape), vectors[1].reshape(shape), vectors[2].reshape(shape)
 
 
 def cross(u, v) -> jax.Array:

@@ -1,0 +1,132 @@
+"""Functions of many spins, for states that have these component by component, ``(s_1x, s_2x, …, s_1y, …)``.
+
+What is computed of all components x then goes through the memory without gaps, as vector instructions want it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from manifolds.structures.spins import Padded, added, reshaped
+
+from .energy import Energy, Negative, Sum
+from .magnetism import SpinEnergy, off_lattice, on_lattice
+from .spins_and_baths import SpinsAndBaths
+
+
+def to_planes(x, count: int) -> jax.Array:
+    """States that begin with ``count`` spins site by site, shape (..., n), with these component by component."""
+    return _exchanged(x, (count, 3))
+
+
+def to_sites(x, count: int) -> jax.Array:
+    """The inverse of :func:`to_planes`."""
+    return _exchanged(x, (3, count))
+
+
+def _exchanged(x, shape: tuple[int, int]) -> jax.Array:
+    front, size = x.shape[:-1], shape[0] * shape[1]
+    spins = jnp.swapaxes(x[..., :size].reshape(*front, *shape), -1, -2).reshape(*front, size)
+    return jnp.concatenate([spins, x[..., size:]], axis=-1)
+
+
+def by_planes(energy: Energy, count: int) -> Energy:
+    """A function of states that are site by site, as one of states that are component by component."""
+    terms: list[Energy] = []
+    lattice: list[SpinEnergy] = []
+    for term in energy.terms:
+        if isinstance(term, SpinEnergy) and math.prod(term.sites) == count:
+            lattice.append(term)
+        else:
+            terms.append(_by_planes(term, count))
+    if lattice:
+        terms.append(InPlanes(tuple(lattice)))
+    return terms[0] if len(terms) == 1 else Sum(tuple(terms))
+
+
+def _by_planes(term: Energy, count: int) -> Energy:
+    if isinstance(term, SpinsAndBaths):
+        return SpinsAndBaths(by_planes(term.spins, count), term.baths, term.size)
+    if isinstance(term, Negative):
+        return Negative(by_planes(term.term, count))
+    return Rearranged(term, count)
+
+
+class InPlanes(Energy):
+    """Energies of all spins: their gradients are added by components, before these become a state's."""
+
+    parts: tuple[SpinEnergy, ...]
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        spins = self._spins(x)
+        return sum((part.of(spins[part.sites]) for part in self.parts), jnp.zeros(()))
+
+    def gradient(self, x) -> jax.Array:
+        spins = self._spins(x)
+        found, *others = (part.gradients(spins[part.sites]) for part in self.parts)
+        for other in others:
+            found = added(found, reshaped(other, found[0].shape))
+        return off_lattice(found, x, planar=True)
+
+    def _spins(self, x) -> dict[tuple[int, ...], Padded]:
+        """On the lattice of each part."""
+        sites = {part.sites for part in self.parts}
+        return {shape: Padded(on_lattice(x, shape, planar=True), reach(self, shape)) for shape in sites}
+
+    def sensitivity(self, x) -> jax.Array:
+        return sum((Energy.sensitivity(InPlanes((part,)), x) for part in self.parts), jnp.zeros(()))
+
+
+def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
+    """How far the spins are, along each axis of a lattice, that act on one by its energies."""
+    found = [(0,) * len(sites)]
+    for term in energy.terms:
+        if isinstance(term, SpinsAndBaths):
+            found.append(reach(term.spins, sites))
+        elif isinstance(term, InPlanes):
+            found += [part.reach for part in term.parts if part.sites == sites]
+        elif isinstance(term, SpinEnergy) and term.sites == sites:
+            found.append(term.reach)
+    return tuple(map(max, *found)) if len(found) > 1 else found[0]
+
+
+class Rearranged(Energy):
+    """Any function of states that are site by site."""
+
+    term: Energy
+    count: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.term.is_quadratic
+
+    def value(self, x) -> jax.Array:
+        return self.term.value(self._of(x))
+
+    def gradient(self, x) -> jax.Array:
+        return to_planes(self.term.gradient(self._of(x)), self.count)
+
+    def sensitivity(self, x) -> jax.Array:
+        return self.term.sensitivity(self._of(x))
+
+    def rounded(self, x) -> jax.Array:
+        return self.term.rounded(self._of(x))
+
+    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+        ends = (self._of(v) for v in (x, d, jnp.zeros_like(x) + low))
+        return to_planes(self.term.discrete_gradient(scheme, *ends), self.count)
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        path, back = path.through(self._of)
+        return back(self.term.stage_gradients(scheme, path))
+
+    def _of(self, x) -> jax.Array:
+        return to_sites(x, self.count)

@@ -1,0 +1,223 @@
+"""Many spins component by component: the functions, steps and derivatives are those of states that are site by site."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines import array
+from liethermo.engines.rules import RULES
+from liethermo.engines.stepping import begin, in_order, take_step
+from liethermo.functions.gradients import GRADIENTS, stage_gradients
+from liethermo.functions.planes import to_planes, to_sites
+from liethermo.integrators.tableaus import finer, gauss
+
+from .test_spins import ENERGIES, SITES, unit
+
+COUNT = 12
+RANDOM = np.random.default_rng(11)
+RATES = 0.1 + RANDOM.random(SITES)
+
+
+def quartic(s):
+    return jnp.sum(s[..., 0] ** 4 * jnp.roll(s[..., 2], 1, axis=0))
+
+
+def spins(*terms, baths=None, dissipation=None, **more):
+    energy = sum(terms[1:], terms[0])
+    return lt.SpinSystem(SITES, energy, dissipation, baths, **more)
+
+
+BATHS = lt.HeatBaths(capacity=[3.0, 5.0], number=2)
+LATTICE = [ENERGIES[name][0] for name in ("exchange", "diagonal neighbours", "DMI", "anisotropy", "Zeeman")]
+SYSTEMS = {
+    **{name: spins(energy) for name, (energy, _) in ENERGIES.items()},
+    "all together": spins(*LATTICE, ENERGIES["edges"][0], dissipation=lt.LandauLifshitz(RATES)),
+    "minus": spins(-ENERGIES["exchange"][0]),
+    "a row of the sites": spins(lt.magnetism.exchange(COUNT, 0.3), lt.magnetism.exchange(SITES, 0.4)),
+    "some of the sites": spins(lt.magnetism.exchange(5, 0.3)),
+    "a function": spins(
+        lt.magnetism.exchange(SITES, 0.3), lt.functions.energy.Function(quartic), dissipation=lt.LandauLifshitz(0.1)
+    ),
+    "baths": spins(
+        *LATTICE, baths=BATHS, dissipation=lt.LandauLifshitz(RATES, np.arange(COUNT).reshape(SITES) % 2), ratio=RATES
+    ),
+    "one bath": spins(*LATTICE, baths=lt.HeatBaths(), dissipation=lt.LandauLifshitz(0.2)),
+    "a function with a bath": spins(
+        lt.functions.energy.Function(quartic), baths=lt.HeatBaths(), dissipation=lt.LandauLifshitz(RATES)
+    ),
+}
+SERIES = lt.MetriplecticTaylor(4)  # for systems without baths: |T| has none
+METHODS = [
+    lt.MetriplecticMidpoint(),
+    lt.MetriplecticMidpoint("mean_value"),
+    lt.MetriplecticGauss(1),
+    lt.MetriplecticGauss(2),
+    lt.MetriplecticRungeKutta(4),
+]
+
+
+def state(system, seed=0):
+    x = system.samples(1, seed)[0]
+    return jnp.asarray(x)
+
+
+@jax.jit
+def looked_at(system, x, d, low, k):
+    """What a step asks of a system: numbers, and vectors."""
+    A, b, _ = gauss(2)
+    energy = system.energy
+    gradients = [scheme(energy, x, d, low) for scheme in GRADIENTS.values() if scheme.orderless]
+    stages = stage_gradients(energy, x, low, 0.1, k, A, b, finer(2))
+    vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
+    return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounded(x), vectors
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.sampled(5)
+def test_functions_are_the_same(name):
+    system = SYSTEMS[name]
+    found, x = system.arranged(), state(system)
+    d, low, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
+    one = looked_at(system, x, d, low, k)
+    other = looked_at(found.system, *map(found.there, (x, d, low, k)))
+    assert found.system.energy.is_quadratic == system.energy.is_quadratic
+    np.testing.assert_allclose(other[0], one[0], rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(found.back(other[2]), one[2], rtol=1e-12, atol=1e-13)
+    assert 0.3 < float(other[1] / one[1]) < 3.0  # the size of a rounding, which sums have in another order
+
+
+def shapes(n):
+    return (0.1, (n,)), (1e-17, (n,)), (1.0, (2, n))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+@pytest.mark.parametrize("name", ["all together", "a function", "baths", "one bath"])
+@pytest.mark.slow
+def test_steps_are_the_same(name, method):
+    system, h = SYSTEMS[name], jnp.asarray(0.02)
+    method = method.suited(None).on(system)
+    found = system.arranged()
+    one = begin(system, method, state(system))
+    other = begin(found.system, method.pulled(found), found.there(state(system)))
+    step = jax.jit(take_step)
+    for _ in range(3):
+        one, other = step(system, method, one, h), step(found.system, method.pulled(found), other, h)
+    assert int(one.status) == int(other.status) == 0
+    for name in ("x", "energy", "entropy", "largest_energy_increment", "energy_sensitivity"):
+        ours = getattr(other, name)
+        np.testing.assert_allclose(
+            found.back(ours) if name == "x" else ours, getattr(one, name), rtol=1e-11, atol=1e-13
+        )
+
+
+LARGE = 400
+
+
+def ring(**changes):
+    return lt.models.spin_lattice(LARGE, anisotropy_constant=0.1, rate=0.2, **changes)
+
+
+@pytest.mark.parametrize("method", [METHODS[0], *METHODS[3:], SERIES], ids=str)
+@pytest.mark.sampled(2)
+def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
+    system = ring(baths=method is not SERIES)
+    x0 = system.state(unit(LARGE))
+    assert x0.size > RULES.large
+    run = (system, x0, (0.0, 0.2), 0.05, method)
+    found = lt.integrate(*run)
+    assert found.audit().passed
+    np.testing.assert_allclose(np.linalg.norm(system.spins(found.x), axis=-1), 1.0, atol=1e-14)
+    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    jax.clear_caches()
+    np.testing.assert_allclose(found.x, lt.integrate(*run).x, rtol=1e-11, atol=1e-13)
+    jax.clear_caches()
+
+
+def test_levels_keep_their_places():
+    """Levels of an explicit method are no components of a state."""
+    system, method = ring(), lt.MetriplecticRungeKutta(4)
+    own = method.on(system)
+    first = begin(system, own, jnp.asarray(system.state(unit(LARGE))))
+    _, _, inside, back = in_order(system, own, first)
+    np.testing.assert_array_equal(inside.k[3], first.k[3])
+    for name, value in first._asdict().items():
+        np.testing.assert_array_equal(getattr(back(inside), name), value)
+
+
+@pytest.mark.slow
+def test_adaptive_steps_are_the_same(monkeypatch):
+    def path():
+        system = ring()
+        return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
+
+    found = path()
+    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    jax.clear_caches()
+    np.testing.assert_allclose(found, path(), rtol=1e-10, atol=1e-12)
+    jax.clear_caches()
+
+
+@pytest.mark.slow
+def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
+    def path():
+        system = ring()
+        noise = lt.Fluctuations(1e-3, seed=1)
+        return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
+
+    found = path()
+    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    jax.clear_caches()
+    np.testing.assert_allclose(found, path(), rtol=1e-11, atol=1e-13)
+    jax.clear_caches()
+
+
+def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
+    system, method = SYSTEMS["one bath"], lt.MetriplecticMidpoint("coordinate_increment")
+    first = begin(system, method, state(system))
+    assert in_order(system, method, first, replace(RULES, large=1))[0] is system
+    assert in_order(system, lt.MetriplecticMidpoint(), first, replace(RULES, large=1))[0] is not system
+
+
+def test_derivatives_go_through():
+    system, method = ring(), lt.MetriplecticMidpoint()
+    x0, v = jnp.asarray(system.state(unit(LARGE))), jnp.asarray(RANDOM.standard_normal(3 * LARGE + 1))
+
+    def end(x):
+        return lt.flow(system, x, (0.0, 0.1), 0.05, method)
+
+    found = jax.jvp(end, (x0,), (v,))[1]
+    h = 1e-5
+    np.testing.assert_allclose(found, (end(x0 + h * v) - end(x0 - h * v)) / (2 * h), rtol=1e-5, atol=1e-6)
+
+
+def test_what_has_no_other_order():
+    assert mf.Spins(3).planar is False
+    assert ring(baths=False).arranged() is not None
+    other = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.DoubleBracket())
+    assert other.arranged() is None  # what that does with components is not known
+    assert ring().arranged().system.arranged() is None
+    driven = lt.SpinSystem(3, lambda s, t: t * jnp.sum(s))
+    assert driven.arranged() is None
+    assert lt.models.rigid_body().arranged() is None
+
+
+def test_the_two_orders():
+    x = np.arange(14.0)
+    assert to_planes(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
+    np.testing.assert_array_equal(to_sites(to_planes(np.stack([x, -x]), 4), 4), [x, -x])
+
+
+def test_control_a_wrong_order_is_seen(monkeypatch):
+    """Steps from a state in the other order, taken for one that is not."""
+    system = ring()
+    found = system.arranged()
+    first = begin(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
+    right = array.advance(system, lt.MetriplecticMidpoint(), first, 0.05, 1, 1, 1)[0]
+    wrong = first._replace(x=found.there(first.x))
+    other = array.advance(system, lt.MetriplecticMidpoint(), wrong, 0.05, 1, 1, 1)[0]
+    assert np.abs(right.x - found.back(other.x)).max() > 1e-3
