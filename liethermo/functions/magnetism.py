@@ -28,6 +28,7 @@ from manifolds.structures.spins import (
     scaled,
     spins_of,
     state_of,
+    summed,
 )
 
 from ..errors import InputError
@@ -177,8 +178,8 @@ class OnSites(SpinEnergy):
     n: jax.Array | None
 
     def of(self, spins: Lattice) -> jax.Array:
-        linear = jnp.zeros(()) if self.b is None else _product(planes(self.b), spins.here)
-        return linear + (0.0 if self.A is None else 0.5 * _product(self._drawn(spins.here), spins.here))
+        linear = jnp.zeros(()) if self.b is None else summed(planes(self.b), spins.here)
+        return linear + (0.0 if self.A is None else 0.5 * summed(self._drawn(spins.here), spins.here))
 
     def gradients(self, spins: Lattice) -> Planes:
         if self.A is None:
@@ -220,7 +221,7 @@ class Bonds(SpinEnergy):
         return tuple(map(abs, self.offset))
 
     def of(self, spins: Lattice) -> jax.Array:
-        return _product(self._given(spins.at(self.offset), self.J, self.D), spins.here)
+        return summed(self._given(spins.at(self.offset), self.J, self.D), spins.here)
 
     def gradients(self, spins: Lattice) -> Planes:
         ahead, behind = spins.at(self.offset), spins.at([-o for o in self.offset])
@@ -255,14 +256,6 @@ def on_lattice(x, sites: tuple[int, ...], planar: bool = False) -> Planes:
 def off_lattice(covectors: Planes, x, planar: bool = False) -> jax.Array:
     """Covectors of the spins as one of the state x."""
     return state_of(reshaped(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
-
-
-def _product(u: Planes, v: Planes) -> jax.Array:
-    """``sum u_i . v_i``; as products of vectors it is ten times as fast as a sum over what v is made of."""
-    return sum(
-        (jnp.dot(jnp.broadcast_to(a, b.shape).reshape(-1), b.reshape(-1)) for a, b in zip(u, v, strict=True)),
-        jnp.zeros(()),
-    )
 
 
 def checked_sites(sites) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.structures.spins import Padded, added, reshaped
+from manifolds.structures.spins import Padded, added, reshaped, summed
 
 from .energy import Energy, Negative, Sum
 from .magnetism import SpinEnergy, off_lattice, on_lattice
@@ -82,7 +82,11 @@ class InPlanes(Energy):
         return {shape: Padded(on_lattice(x, shape, planar=True), reach(self, shape)) for shape in sites}
 
     def sensitivity(self, x) -> jax.Array:
-        return sum((Energy.sensitivity(InPlanes((part,)), x) for part in self.parts), jnp.zeros(()))
+        spins, found = self._spins(x), jnp.zeros(())
+        for part in self.parts:
+            here, gradients = spins[part.sites].here, part.gradients(spins[part.sites])
+            found = found + jnp.sqrt(summed(gradients, gradients) * summed(here, here))
+        return jax.lax.stop_gradient(found)
 
 
 def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
