@@ -19,6 +19,7 @@ from .memory import STATUS, resident
 
 EXCHANGE, AXIS, RATE, STEP = 1.0, 0.1, 0.1, 0.02
 COUNT, FEW, STEPS = 100_000, 2, 12
+LEAST_WORK = 1_000_000  # steps times spins, for the time of a step to stand out
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 METHODS = {
     "midpoint": lt.MetriplecticMidpoint(),
@@ -93,16 +94,17 @@ def child(method: str, count: str) -> dict:
     """The part that runs in a process of its own."""
     system, x0 = ring(int(count)), start(int(count))
     work = functools.partial(of_library, system, x0, method=METHODS[method])
+    steps = max(STEPS, LEAST_WORK // int(count))
     times = [time.process_time()]  # of all threads: runs are long enough, and other work on the machine does not count
-    for steps in (FEW, FEW, STEPS):
-        solution = work(steps)
+    for number in (FEW, FEW, steps):
+        solution = work(number)
         times.append(time.process_time())
     first, few, many = np.diff(times)
     kept = of_stats(solution)
     lengths = np.linalg.norm(system.spins(solution.x[-1]), axis=-1)
     return {
         "first": first,
-        "step": (many - few) / (STEPS - FEW),
+        "step": (many - few) / (steps - FEW),
         "iterations": solution.stats.iterations_per_step,
         "peak": resident() if STATUS.is_file() else None,
         "lengths": float(np.abs(lengths - 1.0).max()),
