@@ -214,10 +214,6 @@ class GaussMethod(OneStepMethod):
     def order(self) -> int:
         return 2 * self.number
 
-    @property
-    def orderless(self) -> bool:
-        return True
-
     def increment(self, h, k) -> jax.Array:
         return h * (gauss(self.number).b @ k)
 

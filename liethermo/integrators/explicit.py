@@ -124,10 +124,6 @@ class ExplicitMethod(OneStepMethod):
         return True
 
     @property
-    def orderless(self) -> bool:
-        return True
-
-    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law", "casimirs"})
 

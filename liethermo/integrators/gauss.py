@@ -112,6 +112,10 @@ class MetriplecticGauss(GaussMethod):
         return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
 
     @property
+    def orderless(self) -> bool:
+        return True
+
+    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law", "casimirs"})
 

@@ -70,6 +70,10 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return LAST + 1
 
     @property
+    def orderless(self) -> bool:
+        return True
+
+    @property
     def evaluations(self) -> int:
         return len(self.tableau.b)
 

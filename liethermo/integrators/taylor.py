@@ -77,6 +77,10 @@ class MetriplecticTaylor(ExplicitMethod):
         return OWN + self.order
 
     @property
+    def orderless(self) -> bool:
+        return True
+
+    @property
     def evaluations(self) -> int:
         """Products of two series take as many multiplications as there are pairs; and the production at the nodes."""
         return self.order * (self.order + 1) // 2 + len(self._rule[0])
