@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -42,7 +43,7 @@ class EulerPoincareForce(Dissipation):
         shape = jax.eval_shape(lambda xi: jnp.asarray(self.F(xi)), xi).shape
         if shape != system.shape:
             raise InputError(f"the force F must map shape {system.shape} to the same, but it returns shape {shape}")
-        return EulerPoincareForce(_OnSites(self.F, system.shape)) if system.sites else self
+        return dataclasses.replace(self, F=_OnSites(self.F, system.shape)) if system.sites else self
 
     def momentum(self, dH, turned):
         return self.F(dH)

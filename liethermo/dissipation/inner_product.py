@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -113,7 +114,7 @@ class KillingDissipation(OfBracket):
                 f"{g.name} is solvable: its Killing form vanishes on brackets, so "
                 "KillingDissipation would do nothing; use ProjectedMetric() or InnerProductDissipation(K)"
             )
-        return KillingDissipation(self.rate, jnp.asarray(form) if isinstance(form, np.ndarray) else form)
+        return dataclasses.replace(self, form=jnp.asarray(form) if isinstance(form, np.ndarray) else form)
 
     def momentum(self, dH, turned):
         return self.rate * (self.form @ turned)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -99,7 +101,7 @@ class LandauLifshitz(Dissipation):
             if not (numbers.min() >= 0 and numbers.max() < spins.others):
                 outside = int(numbers[(numbers < 0) | (numbers >= spins.others)][0])
                 raise InputError(f"a site heats bath {outside}, but there are {spins.others}, which count from 0")
-        return LandauLifshitz(self.rate, self.bath, spins.others)
+        return dataclasses.replace(self, baths=spins.others)
 
     def force(self, system, x, dH, dS, dL):
         if not self.baths:

@@ -134,10 +134,9 @@ class SpinSystem(System):
 
     def arranged(self) -> Arranged | None:
         """With the spins component by component; what other dissipations do with components is not known."""
-        spins, known = self.poisson, self.dissipation is None or isinstance(self.dissipation, LandauLifshitz)
-        if type(self) is not SpinSystem or not isinstance(spins, mf.Spins) or spins.planar:
-            return None
-        if self.is_driven or not known:
+        spins = self.poisson
+        known = type(self) is SpinSystem and type(self.dissipation) in (type(None), LandauLifshitz)
+        if not known or not isinstance(spins, mf.Spins) or spins.planar or self.is_driven:
             return None
         count = spins.count
         planar = mf.Spins(spins.sites, spins.others, spins.ratio, reach(self.energy, spins.sites))

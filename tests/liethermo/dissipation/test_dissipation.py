@@ -334,3 +334,21 @@ def test_every_transcendental_casimir_is_one():
         if g.name in TRANSCENDENTAL:
             system = lt.LiePoissonSystem(g, energy_of(3, 0), entropy_of(g), validate=False)
             assert system.check(points=points(g)).passed
+
+
+def test_a_dissipation_that_extends_another_stays_what_it_is():
+    """What a system fills in is no reason to forget the class: a force of its own would be lost without a word."""
+
+    class Twice(lt.KillingDissipation):
+        def momentum(self, dH, turned):
+            return 2.0 * super().momentum(dH, turned)
+
+    def friction(dissipation):
+        system = lt.LiePoissonSystem(
+            mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lt.Quadratic(-np.ones(3)), dissipation=dissipation
+        )
+        return np.asarray(system.friction_matrix(np.array([0.3, -1.0, 0.7])))
+
+    once = friction(lt.KillingDissipation(0.3))
+    assert np.abs(once).max() > 0.01
+    np.testing.assert_allclose(friction(Twice(0.3)), 2.0 * once, rtol=1e-14)

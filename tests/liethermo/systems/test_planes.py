@@ -205,6 +205,13 @@ def test_what_has_no_other_order():
     assert driven.arranged() is None
     assert lt.models.rigid_body().arranged() is None
 
+    class Own(lt.LandauLifshitz):
+        pass
+
+    mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), Own(0.1))
+    assert type(mine.dissipation) is Own  # which may say something else of components
+    assert mine.arranged() is None
+
 
 def test_the_two_orders():
     x = np.arange(14.0)
