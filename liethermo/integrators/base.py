@@ -173,7 +173,7 @@ class OneStepMethod(Module):
         return self
 
     def turned(self, k, change: Callable) -> jax.Array:
-        """Slopes whose components are changed as those of states, shape (..., n), are."""
+        """Slopes with their components changed as those of states are, by ``change``, a function of arrays (..., n)."""
         return change(k)
 
     @property
