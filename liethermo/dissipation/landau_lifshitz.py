@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import real_array
-from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled
+from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled, summed
 
 from ..errors import InputError
 from ..functions.indices import Indices
@@ -149,10 +149,7 @@ class LandauLifshitz(Dissipation):
 
     def _heat(self, size, torque: Planes, pull: Planes) -> jax.Array:
         """``sum size t . pull`` over the sites of each bath, shape (m,)."""
-        if self.bath is None and size.size == 1:
-            heat = sum(jnp.dot(t, p) for t, p in zip(torque, pull, strict=True))
-            return jnp.zeros(self.baths).at[0].set(size.reshape(()) * heat)
-        each = size * dotted(torque, pull)
-        if self.bath is None:
-            return jnp.zeros(self.baths).at[0].set(jnp.sum(each))
-        return jax.ops.segment_sum(each, np.asarray(self.bath).ravel(), self.baths)
+        if self.bath is not None:
+            return jax.ops.segment_sum(size * dotted(torque, pull), np.asarray(self.bath).ravel(), self.baths)
+        whole = size[0] * summed(torque, pull) if size.size == 1 else jnp.sum(size * dotted(torque, pull))
+        return jnp.zeros(self.baths).at[0].set(whole)

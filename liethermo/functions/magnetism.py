@@ -23,6 +23,7 @@ from manifolds.structures.spins import (
     added,
     cross,
     cross_planes,
+    dotted,
     planes,
     reshaped,
     scaled,
@@ -196,7 +197,7 @@ class OnSites(SpinEnergy):
             A = planes(self.A)
             return A[0] * spins[0], A[1] * spins[1], A[2] * spins[2]
         n = planes(self.n)
-        return scaled(self.A * (n[0] * spins[0] + n[1] * spins[1] + n[2] * spins[2]), n)
+        return scaled(self.A * dotted(n, spins), n)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)

@@ -79,7 +79,7 @@ class InPlanes(Energy):
     def _spins(self, x) -> dict[tuple[int, ...], Padded]:
         """On the lattice of each part."""
         sites = {part.sites for part in self.parts}
-        return {shape: Padded(on_lattice(x, shape, planar=True), reach(self, shape)) for shape in sites}
+        return {shape: Padded(on_lattice(x, shape, planar=True), reach(Sum(self.parts), shape)) for shape in sites}
 
     def sensitivity(self, x) -> jax.Array:
         spins, found = self._spins(x), jnp.zeros(())
@@ -95,11 +95,9 @@ def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
     for term in energy.terms:
         if isinstance(term, SpinsAndBaths):
             found.append(reach(term.spins, sites))
-        elif isinstance(term, InPlanes):
-            found += [part.reach for part in term.parts if part.sites == sites]
         elif isinstance(term, SpinEnergy) and term.sites == sites:
             found.append(term.reach)
-    return tuple(map(max, *found)) if len(found) > 1 else found[0]
+    return tuple(max(along) for along in zip(*found, strict=True))
 
 
 class Rearranged(Energy):

@@ -11,6 +11,7 @@ import scipy
 
 from .energy import Energy
 from .indices import as_pattern
+from .of_first import OfFirst
 from .path import Path
 
 
@@ -47,7 +48,7 @@ class SpinsAndBaths(Energy):
             return _total(term.discrete_gradient(scheme, *ends) for term in energy.terms)
 
         if self.spins.is_quadratic:  # at points of whole states, which others look at too
-            by_spins = _Front(self.spins, n).discrete_gradient(scheme, x, d, low)[:n]
+            by_spins = scheme.quadratic(OfFirst(self.spins, n), x, d, low)[:n]
         else:
             by_spins = of(self.spins, x[:n], d[:n], low[:n])
         return jnp.concatenate([by_spins, of(self.baths, x[n:], d[n:], low[n:])])
@@ -72,23 +73,6 @@ class SpinsAndBaths(Energy):
 
     def __neg__(self) -> Energy:
         return SpinsAndBaths(-self.spins, -self.baths, self.size)
-
-
-class _Front(Energy):
-    """A quadratic energy of the first components."""
-
-    energy: Energy
-    size: int = eqx.field(static=True)
-
-    @property
-    def is_quadratic(self) -> bool:
-        return True
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(x[: self.size])
-
-    def gradient(self, x) -> jax.Array:
-        return jnp.concatenate([self.energy.gradient(x[: self.size]), jnp.zeros(x.size - self.size)])
 
 
 def _part(path: Path, components: slice) -> Path:

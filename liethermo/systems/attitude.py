@@ -15,30 +15,10 @@ from manifolds.groups import maps
 from ..dissipation.base import Carried
 from ..errors import InputError
 from ..functions.energy import Energy, Sum
+from ..functions.of_first import OfFirst
 from ..tracing.interpret import at_points
 from .base import System
 from .lie_poisson import LiePoissonSystem
-
-
-class OfMomentum(Energy):
-    """A function of the momentum, the first ``dim`` components of a state."""
-
-    energy: Energy
-    dim: int = eqx.field(static=True)
-
-    @property
-    def is_quadratic(self) -> bool:
-        return self.energy.is_quadratic
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(x[: self.dim])
-
-    def gradient(self, x) -> jax.Array:
-        rest = jnp.zeros(x.shape[0] - self.dim)
-        return jnp.concatenate([self.energy.gradient(x[: self.dim]), rest])
-
-    def sensitivity(self, x) -> jax.Array:
-        return self.energy.sensitivity(x[: self.dim])
 
 
 class AttitudeSystem(System):
@@ -138,7 +118,7 @@ class AttitudeSystem(System):
         return self.join(self.body._vector_field(mu), g @ self.body.algebra.hat(self.body.energy.gradient(mu)))
 
     def _of_momentum(self, energy: Energy) -> Energy:
-        terms = tuple(OfMomentum(term, self.body.dim) for term in energy.terms)
+        terms = tuple(OfFirst(term, self.body.dim) for term in energy.terms)
         return terms[0] if len(terms) == 1 else Sum(terms)
 
     @property

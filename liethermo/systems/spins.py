@@ -14,6 +14,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 from manifolds._module import Module
+from manifolds.structures.spins import added
 
 from ..dissipation.base import Dissipation
 from ..dissipation.landau_lifshitz import LandauLifshitz
@@ -85,12 +86,11 @@ class SpinSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """As for every system, the motion and the damping of the spins joined before they become a state's."""
-        if not isinstance(self.dissipation, LandauLifshitz) or not isinstance(self.poisson, mf.Spins):
-            return super().field(x, dH, dS, dL)
+        if type(self.dissipation) is not LandauLifshitz or not isinstance(self.poisson, mf.Spins):
+            return super().field(x, dH, dS, dL)  # a class of its own may have a force of its own
         heating = None if self.entropy is None else dS[self._size :]  # the entropy is that of the baths
         damped, warmed = self.dissipation.parts(self, x, dH, None, heating)
-        a, b, c = self.poisson.turned(x, dH)
-        return self.poisson.joined((a + damped[0], b + damped[1], c + damped[2]), warmed)
+        return self.poisson.joined(added(self.poisson.turned(x, dH), damped), warmed)
 
     def numbers(self, x, batch: bool = False):
         """A state in one row; also from the spins alone, with every bath at entropy zero.
@@ -111,8 +111,7 @@ class SpinSystem(System):
 
     def spins(self, x) -> jax.Array:
         """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""
-        x = jnp.asarray(x)
-        return x[..., : self._size].reshape(*x.shape[:-1], *self.lattice, 3)
+        return _on_sites(jnp.asarray(x), self.lattice)
 
     def temperatures(self, x) -> jax.Array:
         """The temperatures of the baths: states of shape (..., n) give (..., m)."""
@@ -140,12 +139,10 @@ class SpinSystem(System):
             return None
         count = spins.count
         planar = mf.Spins(spins.sites, spins.others, spins.ratio, reach(self.energy, spins.sites))
-        system = eqx.tree_at(lambda s: (s.poisson, s.energy), self, (planar, by_planes(self.energy, count)))
-        if self.momentum_maps:
-            maps = {name: by_planes(J, count) for name, J in self.momentum_maps.items()}
-            system = eqx.tree_at(lambda s: s.momentum_maps, system, maps)
-        change, back = (functools.partial(turn, count=count) for turn in (to_planes, to_sites))
-        return Arranged(system, change, back, lambda energy: by_planes(energy, count))
+        there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, by_planes))
+        functions = [pulled(f) for f in (self.energy, *self.momentum_maps.values())]
+        system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [planar, *functions])
+        return Arranged(system, there, back, pulled)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         found = super().samples(count, seed, scale)
@@ -218,7 +215,12 @@ class _OfSpins(Module):
     lattice: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x, *time):
-        return self.function(x[: 3 * math.prod(self.lattice)].reshape(*self.lattice, 3), *time)
+        return self.function(_on_sites(x, self.lattice), *time)
+
+
+def _on_sites(x, lattice: tuple[int, ...]) -> jax.Array:
+    """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""
+    return x[..., : 3 * math.prod(lattice)].reshape(*x.shape[:-1], *lattice, 3)
 
 
 class _LastSum(Energy):

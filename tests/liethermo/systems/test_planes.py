@@ -206,11 +206,15 @@ def test_what_has_no_other_order():
     assert lt.models.rigid_body().arranged() is None
 
     class Own(lt.LandauLifshitz):
-        pass
+        def force(self, system, x, dH, dS, dL):
+            return 2.0 * super().force(system, x, dH, dS, dL)
 
     mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), Own(0.1))
     assert type(mine.dissipation) is Own  # which may say something else of components
     assert mine.arranged() is None
+    once = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.LandauLifshitz(0.1))
+    x, motion = state(mine), mine.poisson.sharp(state(mine), mine.energy.gradient(state(mine)))
+    np.testing.assert_allclose(mine.vector_field(x) - motion, 2.0 * (once.vector_field(x) - motion), atol=1e-15)
 
 
 def test_the_two_orders():
@@ -219,7 +223,7 @@ def test_the_two_orders():
     np.testing.assert_array_equal(to_sites(to_planes(np.stack([x, -x]), 4), 4), [x, -x])
 
 
-def test_control_a_wrong_order_is_seen(monkeypatch):
+def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
     found = system.arranged()

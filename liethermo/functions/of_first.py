@@ -1,0 +1,30 @@
+"""Functions of the first components of a state, such as a momentum before an attitude, or spins before their baths."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .energy import Energy
+
+
+class OfFirst(Energy):
+    """A function of the first ``dim`` components of a state."""
+
+    energy: Energy
+    dim: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.energy.is_quadratic
+
+    def value(self, x) -> jax.Array:
+        return self.energy.value(x[: self.dim])
+
+    def gradient(self, x) -> jax.Array:
+        rest = jnp.zeros(x.shape[0] - self.dim)
+        return jnp.concatenate([self.energy.gradient(x[: self.dim]), rest])
+
+    def sensitivity(self, x) -> jax.Array:
+        return self.energy.sensitivity(x[: self.dim])
