@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 from llvmlite import ir
 
-from liethermo.engines.compiled.machine_code import NUMBER, WHOLE, MachineCode, Writer
+from liethermo.engines.compiled.machine_code import MachineCode
+from liethermo.engines.compiled.writer import NUMBER, WHOLE, Writer
 from liethermo.tracing.scalarize import Program
 
 CALL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)

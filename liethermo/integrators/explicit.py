@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Self
@@ -31,10 +30,6 @@ for the states between. Error and what is missed are over h."""
 NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
 """What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
 back, and the most that one takes back: far below what its rounding is."""
-
-
-FEW = 64
-"""Components of a state from which on a correction takes longer than finding out whether there is need of it."""
 
 
 class Law(NamedTuple):
@@ -230,30 +225,27 @@ class ExplicitMethod(OneStepMethod):
             found = [system.raised(end, gradient) for gradient in ends]
             return found if spheres is None else [spheres.along(end, v) for v in found]
 
-        def left(d, ends, found) -> jax.Array:
-            squares = jnp.stack([jnp.dot(v, v) for v in found])
-            missed = misses(d, ends) / jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
-            return jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, missed)))
+        def corrected(made: int, d, ends, found) -> tuple:
+            """The displacement at last, what it misses of the levels, and the squares of the directions."""
+            missed, squares = misses(d, ends), jnp.stack([jnp.dot(v, v) for v in found])
 
-        def corrected(i: int, d, ends, found, missed) -> tuple:
-            del missed
-            found = directions(d, ends) if 0 < i < 3 else found  # the last time they are as good as they get
-            d = landed(d + towards(found, misses(d, ends)))
-            ends = gradients(d)
-            return d, ends, found, left(d, ends, found)
+            def again() -> tuple:
+                better = directions(d, ends) if 0 < made < 3 else found  # the last time they are as good as they get
+                nearer = landed(d + towards(better, missed))
+                return corrected(made + 1, nearer, gradients(nearer), better)
+
+            if made >= self.corrections:
+                return d, missed, squares
+            if made == 0:
+                return again()
+            done = (missed**2 <= EPS**2 * jnp.dot(d, d) * squares) | (squares == 0.0)
+            return jax.lax.cond(done.all(), lambda: (d, missed, squares), again)  # of a short step one is enough
 
         d = landed(d)
         ends = gradients(d)
-        found = directions(d, ends)
-        state = d, ends, found, left(d, ends, found)
-        for i in range(self.corrections):
-            correct = functools.partial(corrected, i)
-            if i and x.shape[0] > FEW:  # of a short step one is enough
-                done = state[-1] <= EPS * jnp.linalg.norm(state[0])
-                state = jax.lax.cond(done, lambda *same: same, correct, *state)
-            else:
-                state = correct(*state)
-        return state[0], state[-1]
+        d, missed, squares = corrected(0, d, ends, directions(d, ends))
+        lengths = jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
+        return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, missed / lengths)))
 
     def _laws(self, system: System) -> list[Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""

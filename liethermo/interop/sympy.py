@@ -50,6 +50,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "ceil": sympy.ceiling,
     "atan2": sympy.atan2,
     "select": lambda condition, a, b: sympy.Piecewise((a, condition), (b, True)),
+    "branch": lambda condition, number: condition,
     "and": sympy.And,
     "or": sympy.Or,
     "xor": sympy.Xor,

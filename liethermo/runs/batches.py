@@ -120,15 +120,16 @@ def run_compiled(
 ) -> None:
     """Blocks of lanes; the loop does not hold the interpreter's lock."""
     lanes = Lanes(family, method)
-    stepper, course = lanes.stepper, record.course
+    stepper, course, turn = lanes.stepper, record.course, threading.Lock()
 
     def work(chosen: slice, stop: threading.Event) -> None:
         if stop.is_set():
             return
         number = chosen.stop - chosen.start
-        blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
-        before = {name: value[:number].copy("K") for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
-        record.begin(chosen, before["x"], before["energy"], before["entropy"])
+        with turn:  # NumPy lets other threads in at every operation, and each change takes longer than the operation
+            blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
+            before = {name: value[:number].copy("K") for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
+            record.begin(chosen, before["x"], before["energy"], before["entropy"])
         taken = 0
         for h, saves, every, place in calls(course, CHUNK_STEPS * 16 // max(number, LANES)):
             if stop.is_set():
@@ -141,8 +142,9 @@ def run_compiled(
             if place is not None:
                 record.keep(chosen, place, states)
             tally.add(number * saves * every / course.steps)
-        after = {name: value[:number] for name, value in stepper.fields(blocks, TELLING).items()}
-        record.put(chosen, before, after)
+        with turn:
+            after = {name: value[:number] for name, value in stepper.fields(blocks, TELLING).items()}
+            record.put(chosen, before, after)
 
     by_threads(work, len(record.x0), course.steps)
 

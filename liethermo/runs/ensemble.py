@@ -158,6 +158,7 @@ def ensemble(
                 chosen = "array"
         if chosen == "array":
             take(chosen, Tally(bar.update))
+    record.close()
     first = FirstSteps(record, method, first_compiled if chosen == "compiled" else first_array)
     return record.result(
         run,

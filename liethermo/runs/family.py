@@ -13,7 +13,7 @@ import numpy as np
 
 from manifolds import ManifoldsError
 
-from ..engines.compiled.form import Form
+from ..engines.compiled.form import Form, arrays_of
 from ..errors import InputError, LiethermoError
 from ..systems import System
 from ..tracing.remembered import fingerprint
@@ -73,8 +73,7 @@ class Family:
     @classmethod
     def _of_named(cls, system: System, parameters) -> Family:
         if parameters is None:
-            own = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
-            return cls(Form.of(system), [np.asarray(leaf)[None] for leaf in own], system)
+            return cls(Form.of(system), [array[None] for array in arrays_of(system)], system)
         if not isinstance(parameters, Mapping):
             raise InputError(
                 "parameters of a system are a dict from names to arrays; "

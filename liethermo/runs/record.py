@@ -60,14 +60,15 @@ class Record:
         self.family, self.member, self.x0, self.course = family, member, x0, course
         self.times, self.counts, self.total = course.times, course.counts, course.steps
         size = len(x0)
-        self.rows: dict[str, np.ndarray] = {name: np.full(size, np.nan) for name in NUMBERS}
+        self.rows: dict[str, np.ndarray] = {name: np.empty(size) for name in NUMBERS}
+        self.finished = np.zeros(size, dtype=bool)
         self.status = np.full(size, Code.INTERRUPTED, dtype=np.int8)
         self.steps, self.iterations, self.rejected = (np.zeros(size, dtype=np.int64) for _ in range(3))
         self.rows["first_step"][:] = course.parts[0].h if course.parts[0].full else course.parts[0].last
         self.rows["end_time"][:] = course.start
-        self.x = np.full((size, member.dim), np.nan) if outputs == "final" else None
+        self.x = np.empty((size, member.dim)) if outputs == "final" else None
         self.path = np.full((size, len(self.times), member.dim + 2), np.nan) if outputs == "trajectory" else None
-        self.work = np.full(size, np.nan)
+        self.work = np.empty(size)
 
     def begin(self, chosen: Part, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
         """The states at the start."""
@@ -96,6 +97,7 @@ class Record:
     def finish(self, chosen: Part, before: Mapping, after: Mapping, status: np.ndarray, end_time: np.ndarray) -> None:
         """How some trajectories ended, and when."""
         rows, energy, first = self.rows, after["energy"], before["energy"]
+        self.finished[chosen] = True
         rows["energy"][chosen], rows["entropy"][chosen] = energy, after["entropy"]
         drift = np.maximum(after["largest_energy"] - first, first - after["smallest_energy"])
         rows["energy_drift"][chosen] = drift / Rounding(first, after["energy_sensitivity"]).size
@@ -117,6 +119,13 @@ class Record:
             self.x[chosen] = after["x"]
         if isinstance(self.member, DrivenSystem):
             self.work[chosen] = self.member.work(after["x"])
+
+    def close(self) -> None:
+        """Nothing is known of trajectories that were not finished."""
+        if not self.finished.all():
+            known = [values for name, values in self.rows.items() if name not in ("first_step", "end_time")]
+            for values in [*known, self.work, *([] if self.x is None else [self.x])]:
+                values[~self.finished] = np.nan
 
     # -- the result ---------------------------------------------------------------------------------------------------
 

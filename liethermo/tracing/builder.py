@@ -60,13 +60,14 @@ OPERATIONS: dict[str, Callable[..., Any]] = ELEMENTARY | {
     "float": lambda a: np.asarray(a, dtype=np.float64),
     "int": lambda a: np.asarray(a, dtype=np.int64),
     "truncate": _truncated,
+    "branch": lambda condition, number: condition,
 }
 """What each operation means, on numbers and on NumPy arrays of them."""
 
 TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 """Operations on numbers that give a truth value."""
 
-OF_TESTS = {"and", "or", "xor", "not"}
+OF_TESTS = {"and", "or", "xor", "not", "branch"}
 """Those on truth values."""
 
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
@@ -89,6 +90,7 @@ class Builder:
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
+        self._branches: dict[tuple[str, ...], int] = {}
 
     def op(self, op: str, *args: Scalar) -> Scalar:
         """The result of an operation, with no simplification but constants folded and equal expressions merged."""
@@ -189,6 +191,12 @@ class Builder:
         if type(condition) is not str:
             return a if condition else b
         return a if type(a) is type(b) and repr(a) == repr(b) else self.op("select", condition, a, b)
+
+    def branch(self, condition, then: Sequence[Scalar], otherwise: Sequence[Scalar]) -> list[Scalar]:
+        """The scalars of one side, by a test that is theirs alone: see :mod:`.branches`."""
+        key = tuple(a if type(a) is str else repr(a) for a in (condition, *then, *otherwise))
+        own = self.op("branch", condition, self._branches.setdefault(key, len(self._branches)))
+        return [self.select(own, a, b) for a, b in zip(then, otherwise, strict=True)]
 
     def max(self, a, b):
         return self.op("max", a, b)

@@ -7,6 +7,7 @@ the few products that it stands for. The result is the same to rounding as JAX's
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -28,7 +29,6 @@ from .builder import (
     Scalar,
     array,
     constant,
-    elementwise,
 )
 from .primitives import PARAMETERS, RULES
 
@@ -314,6 +314,7 @@ def _linear_solve(b, eqn, *arguments):
 
 def _cond(b, eqn, index, *arguments):
     """Every branch, then a choice of results: the branches are pure."""
+    shapes = [var.aval.shape for var in eqn.outvars]
     branches = eqn.params["branches"]
     which = index.item()
     if type(which) is not str:
@@ -321,9 +322,9 @@ def _cond(b, eqn, index, *arguments):
     *others, chosen = (_unroll(b, branch.jaxpr, branch.consts, arguments) for branch in branches)
     for i in reversed(range(len(others))):
         first = b.op("le", which, i)
-        chosen = [
-            elementwise(lambda u, v, c=first: b.select(c, u, v), x, y) for x, y in zip(others[i], chosen, strict=True)
-        ]
+        sides = ([a for x in side for a in x.ravel().tolist()] for side in (others[i], chosen))
+        entries = iter(b.branch(first, *sides))
+        chosen = [array(list(itertools.islice(entries, math.prod(shape))), shape) for shape in shapes]
     return chosen
 
 

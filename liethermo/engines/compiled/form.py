@@ -57,7 +57,13 @@ class Form:
         return self.rebuild(arrays)
 
 
+@remembered
+def arrays_of(tree: eqx.Module) -> tuple[np.ndarray, ...]:
+    """The parameters of a system, a method or a pacing."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
+    return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
+
+
 def numbers_of(tree: eqx.Module) -> np.ndarray:
     """The parameters of a system, a method or a pacing, shape (p,)."""
-    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
-    return np.concatenate([np.zeros(0), *(np.asarray(leaf, dtype=np.float64).ravel() for leaf in leaves)])
+    return np.concatenate([np.zeros(0), *(array.ravel() for array in arrays_of(tree))])

@@ -16,7 +16,8 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.scalarize import Program
-from .machine_code import NUMBER, WHOLE, MachineCode, Writer
+from .machine_code import MachineCode
+from .writer import NUMBER, WHOLE, Writer
 
 POINTER, NUMBERS, WHOLES = ir.IntType(8).as_pointer(), NUMBER.as_pointer(), WHOLE.as_pointer()
 

@@ -15,7 +15,8 @@ from llvmlite import ir
 from ..rules import Rules
 from ..stages import Iteration, noise_of, scale_of
 from .loop import NUMBERS, SOLVED, Layout, Piece
-from .machine_code import NUMBER, WHOLE, MachineCode, Writer
+from .machine_code import MachineCode
+from .writer import NUMBER, WHOLE, Writer
 
 GIVEN = ("dW", "x", "low", "h", "k", "before")
 """What is taken from a block, beside the trajectory's own parameters."""

@@ -236,11 +236,12 @@ class Stepper:
         return self._shapes.get(name, ())
 
     def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Blocks of trajectories with the given fields of :class:`.stepping.State`, trajectories first."""
+        """Blocks of trajectories with the given fields, trajectories first; nothing else is set but their status."""
         if self._varies.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._varies]}
         number = len(fields["x"])
-        whole = np.zeros((-(-number // self.lanes), self.height, self.lanes))
+        whole = np.empty((-(-number // self.lanes), self.height, self.lanes))
+        whole[:, self.rows("status")] = 0.0
         for name, values in fields.items():
             whole[:, self.rows(name)] = self._in_lanes(np.reshape(values, (number, -1)))
         return self._marked(whole, number)

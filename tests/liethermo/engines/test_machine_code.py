@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from llvmlite import ir
 
 from liethermo.engines.compiled import machine_code
-from liethermo.engines.compiled.machine_code import NUMBER, MachineCode, Writer
+from liethermo.engines.compiled.machine_code import MachineCode
+from liethermo.engines.compiled.writer import NUMBER, Writer
 from liethermo.tracing.builder import OF_TESTS, OPERATIONS, TESTS, Instruction
 from liethermo.tracing.scalarize import Program, UnsupportedPrimitive
 from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
@@ -26,7 +27,8 @@ def of_one_operation(op: str) -> Program:
     """A program of two numbers."""
     first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
     if op in OF_TESTS:
-        chosen = [Instruction("t", op, ("p",) if op == "not" else ("p", "q"))]
+        second = {"not": (), "branch": (0,)}.get(op, ("q",))
+        chosen = [Instruction("t", op, ("p", *second))]
     elif op == "select":
         chosen = [Instruction("t", op, ("p", "a", "b"))]
     elif op in ("float", "int"):

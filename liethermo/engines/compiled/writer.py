@@ -1,0 +1,260 @@
+"""Scalar programs as LLVM instructions."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import ChainMap, Counter
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from llvmlite import ir
+
+from ...tracing.branches import Branch, branched
+from ...tracing.builder import Instruction, Scalar
+from ...tracing.scalarize import Program, UnsupportedPrimitive
+
+NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
+
+INTRINSICS = {name: name for name in "sqrt exp exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
+"""Operations that LLVM has functions for."""
+
+LIBRARY = frozenset("cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc".split())
+"""Operations that are functions of the C library, by the same names."""
+
+COMPARED = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
+ARITHMETIC |= {"div": ("fdiv", ""), "rem": ("frem", "")}
+LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
+
+
+class Writer:
+    """Writes programs where a builder stands, on numbers, or on vectors with a number for each lane.
+
+    Truth values are bits, integers have 64. Sums are never reassociated. A product that is only added to something is
+    fused with the sum, and rounded once, on processors that can; which ones are does not depend on the lanes. What one
+    side of a branch alone needs is jumped over where no lane takes that side. Each lane chooses for itself, so that its
+    numbers do not depend on the others.
+    """
+
+    def __init__(self, builder: ir.IRBuilder, lanes: int):
+        self.builder, self.lanes = builder, lanes
+        self.number, self.test, self.whole = (
+            kind if lanes == 1 else ir.VectorType(kind, lanes) for kind in (NUMBER, TEST, WHOLE)
+        )
+
+    def write(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
+        """The values of the outputs, array by array.
+
+        Parameters
+        ----------
+        read : function from the places of an array among the inputs, and of an entry in it, to its value
+            Asked for what the program uses.
+        """
+        written = _Written(self, program, read)
+        written.all(branched(program))
+        return [[self._as_number(written.value(a)) for a in entries] for entries in program.outputs]
+
+    def constant(self, number: bool | int | float) -> ir.Value:
+        kind = {bool: self.test, int: self.whole}.get(type(number), self.number)
+        plain = int(number) if isinstance(number, bool) else number
+        return ir.Constant(kind, plain if self.lanes == 1 else [plain] * self.lanes)
+
+    def operation(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
+        """The result of one operation, a key of :data:`liethermo.tracing.builder.OPERATIONS`."""
+        build, (x, *rest) = self.builder, args
+        real = x.type == self.number
+        if op in ARITHMETIC:
+            name = ARITHMETIC[op][0 if real else 1]
+            return getattr(build, name)(*args)
+        if op in LOGICAL and x.type == self.test:
+            return getattr(build, LOGICAL[op])(*args)
+        if op in COMPARED:
+            compare = build.fcmp_ordered if real else build.icmp_signed
+            return compare(COMPARED[op], *args)
+        if op == "ne":
+            return build.fcmp_unordered("!=", *args) if real else build.icmp_signed("!=", *args)
+        if op == "select":
+            return build.select(x, *rest)
+        if op in ("max", "min"):  # like XLA's, NaN if either is
+            better = self.operation("gt" if op == "max" else "lt", args)
+            if real:
+                better = build.or_(better, build.fcmp_unordered("uno", x, x))
+            return build.select(better, x, rest[0])
+        if op == "branch":
+            return x
+        if op == "float":
+            return self._as_number(x)
+        if op == "int":
+            return build.zext(x, self.whole) if x.type == self.test else x
+        if real and op in INTRINSICS:
+            return self._intrinsic(f"llvm.{INTRINSICS[op]}", args, self.number)
+        if real and op in LIBRARY:
+            return self._of_each_lane(op, args)
+        if real and op == "truncate":  # NaN to 0, and what is too large to the nearest integer
+            return self._intrinsic("llvm.fptosi.sat", args, self.whole)
+        if real and op == "is_finite":
+            return build.fcmp_ordered("<", self.operation("abs", args), self.constant(np.inf))
+        if real and op == "sign":  # NaN of NaN, a zero of a zero
+            signed = self._intrinsic("llvm.copysign", [self.constant(1.0), x], self.number)
+            return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed, x)
+        raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
+
+    def fused(self, op: str, place: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]) -> ir.Value:
+        """A sum or difference whose term at a place is a product."""
+        (x, y), other = factors, terms[1 - place]
+        if op == "sub":
+            x, other = (x, self.builder.fneg(other)) if place == 0 else (self.builder.fneg(x), other)
+        return self._intrinsic("llvm.fmuladd", (x, y, other), self.number)
+
+    def larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """The larger of two numbers without a sign, NaN if either is: their bits are in the order of the numbers."""
+        build, count = self.builder, max(self.lanes, 2)
+        number, whole = ir.VectorType(NUMBER, count), ir.VectorType(WHOLE, count)
+        first = ir.Constant(ir.IntType(32), 0)
+        if self.lanes == 1:
+            x, y = (build.insert_element(ir.Constant(number, ir.Undefined), v, first) for v in (x, y))
+        bits = [build.bitcast(v, whole) for v in (x, y)]
+        found = build.bitcast(build.call(self._declared(f"llvm.smax.v{count}i64", whole, bits), bits), number)
+        return build.extract_element(found, first) if self.lanes == 1 else found
+
+    def any(self, tests: ir.Value) -> ir.Value:
+        """Whether a truth value holds in any lane, as one bit."""
+        if self.lanes == 1:
+            return tests
+        bits = ir.IntType(self.lanes)
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(tests, bits), ir.Constant(bits, 0))
+
+    @staticmethod
+    def whole_number(n: int) -> ir.Constant:
+        return ir.Constant(WHOLE, n)
+
+    @contextlib.contextmanager
+    def repeated(self, goes_on: Callable[[], ir.Value]) -> Iterator[None]:
+        """While a test holds."""
+        build = self.builder
+        head, body, after = (build.append_basic_block(name) for name in ("head", "body", "after"))
+        build.branch(head)
+        build.position_at_end(head)
+        build.cbranch(goes_on(), body, after)
+        build.position_at_end(body)
+        yield
+        build.branch(head)
+        build.position_at_end(after)
+
+    @contextlib.contextmanager
+    def counted(self, count: ir.Value) -> Iterator[ir.Value]:
+        """For each number from zero to before ``count``."""
+        build = self.builder
+        with build.goto_entry_block():  # else each pass would take more of the stack
+            counter = build.alloca(WHOLE)
+        build.store(self.whole_number(0), counter)
+        with self.repeated(lambda: build.icmp_signed("<", build.load(counter), count)):
+            yield build.load(counter)
+            build.store(build.add(build.load(counter), self.whole_number(1)), counter)
+
+    def alike(self, op: str, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
+        """Constants as numbers of the type of what stands beside them."""
+        chosen = slice(1, None) if op == "select" else slice(None)
+        types = [v.type for v, a in zip(values[chosen], args[chosen], strict=True) if isinstance(a, str)]
+        for i in range(len(values))[chosen]:
+            if not isinstance(args[i], str) and types and values[i].type != types[0] and types[0] == self.number:
+                values[i] = self.constant(float(args[i]))
+        return values
+
+    def _as_number(self, value: ir.Value) -> ir.Value:
+        if value.type == self.number:
+            return value
+        convert = self.builder.uitofp if value.type == self.test else self.builder.sitofp
+        return convert(value, self.number)
+
+    def _intrinsic(self, name: str, args: Sequence[ir.Value], result: ir.Type) -> ir.Value:
+        suffix = "" if self.lanes == 1 else f"v{self.lanes}"
+        kinds = [f"{suffix}i64"] if result == self.whole else []
+        name = ".".join([name, *kinds, f"{suffix}f64"])
+        return self.builder.call(self._declared(name, result, args), args)
+
+    def _of_each_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
+        if self.lanes == 1:
+            return self.builder.call(self._declared(name, NUMBER, args), args)
+        result = ir.Constant(self.number, ir.Undefined)
+        for lane in range(self.lanes):
+            place = ir.Constant(ir.IntType(32), lane)
+            own = [self.builder.extract_element(a, place) for a in args]
+            found = self.builder.call(self._declared(name, NUMBER, own), own)
+            result = self.builder.insert_element(result, found, place)
+        return result
+
+    def _declared(self, name: str, result: ir.Type, args: Sequence[ir.Value]) -> ir.Function:
+        module = self.builder.module
+        if name in module.globals:
+            return module.globals[name]
+        function = ir.Function(module, ir.FunctionType(result, [a.type for a in args]), name)
+        if not name.startswith("llvm."):
+            for attribute in ("nounwind", "readnone"):
+                function.attributes.add(attribute)
+        return function
+
+
+class _Written:
+    """The variables of a program so far, as it is written: those of one side of a branch are known there alone."""
+
+    def __init__(self, writer: Writer, program: Program, read: Callable[[int, int], ir.Value]):
+        self.writer, self.read = writer, read
+        self.places = {name: (i, j) for i, names in enumerate(program.inputs) for j, name in enumerate(names)}
+        self.uses = Counter(a for _, _, args in program.instructions for a in args)
+        self.uses.update(a for entries in program.outputs for a in entries)
+        self.values: ChainMap[str, ir.Value] = ChainMap()
+        self.products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
+        self.sizes: set[Scalar] = set()  # numbers without a sign
+
+    def value(self, a: Scalar) -> ir.Value:
+        if not isinstance(a, str):
+            return self.writer.constant(a)
+        if a not in self.values:
+            self.values[a] = self.read(*self.places[a])
+        return self.values[a]
+
+    def all(self, items: Sequence[Instruction | Branch]) -> None:
+        for item in items:
+            if isinstance(item, Branch):
+                self.branch(item)
+            else:
+                self.instruction(item)
+
+    def instruction(self, instruction: Instruction) -> None:
+        writer, (target, op, args) = self.writer, instruction
+        given = writer.alike(op, [self.value(a) for a in args], args)
+        unsigned = op == "max" and self.sizes.issuperset(args)
+        fused = [i for i, a in enumerate(args) if a in self.products] if op in ("add", "sub") else []
+        if fused:
+            found = writer.fused(op, fused[-1], self.products[args[fused[-1]]], given)
+        elif unsigned:
+            found = writer.larger(*given)
+        else:
+            found = writer.operation(op, given)
+        self.values[target] = found
+        if op == "mul" and self.uses[target] == 1 and found.type == writer.number:
+            self.products[target] = given
+        if op == "abs" or unsigned:
+            self.sizes.add(target)
+
+    def branch(self, branch: Branch) -> None:
+        """Each side where any lane takes it, then what each lane chooses."""
+        writer, build = self.writer, self.writer.builder
+        self.instruction(branch.test)
+        test = self.values[branch.test.target]
+        for place, (side, taken) in enumerate(zip(branch.sides, (test, build.not_(test)), strict=True), start=1):
+            if not side:
+                continue
+            before, outside = build.block, self.values
+            inside = self.values = outside.new_child()
+            with build.if_then(writer.any(taken)):
+                self.all(side)
+                after = build.block
+            self.values = outside
+            for a in dict.fromkeys(choice.args[place] for choice in branch.choices):
+                if isinstance(a, str) and a in inside.maps[0] and a not in self.places:
+                    outside[a] = build.phi(inside[a].type)
+                    outside[a].add_incoming(inside[a], after)
+                    outside[a].add_incoming(ir.Constant(inside[a].type, None), before)  # which no lane chooses
+        self.all(branch.choices)
