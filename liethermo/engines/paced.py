@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -52,10 +52,6 @@ class ManyPaces(Paces, Protocol):
 
     def follow(self, most: int) -> None:
         """So many attempts of each, or as many as it takes until it pauses."""
-        ...
-
-    def stepped(self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = ...) -> dict[str, np.ndarray]:
-        """Fields, by default all, of the states after steps of these sizes from those that some have."""
         ...
 
 
@@ -146,13 +142,6 @@ class VmapPaces(_ArrayPaces):
     def follow(self, most: int) -> None:
         given = self.form, self.parameters, self.axes, self.method, self.pacing
         self.pace = _follow_all(*given, self.pace, jnp.asarray(most))
-
-    def stepped(self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = State._fields) -> dict[str, np.ndarray]:
-        sizes = np.ones(self.number)
-        sizes[chosen] = h
-        state = self.pace.state._replace(status=jnp.zeros_like(self.pace.state.status))
-        found = step_all(self.form, self.parameters, self.axes, self.method, state, jnp.asarray(sizes))
-        return {name: np.asarray(getattr(found, name))[chosen] for name in names}
 
 
 @program

@@ -2,7 +2,8 @@
 
 A run that looks at every step carries a :class:`Pace`. One attempt takes a step, judges it by its estimated error, and
 chooses the next. Where something is wanted that no engine does by itself, the run pauses: at a time where a state is
-kept, where what grows near the state has to be looked at, and where an event has happened on the way.
+kept, and where what grows near the state has to be looked at. A step in which an event happens is tried again in
+shorter and shorter parts, until one ends there.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from manifolds._module import Module
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
+from . import searching
 from .codes import Code
 from .growth import FEW, growing, stretch
 from .rules import EPS, RULES, Rules
@@ -59,7 +61,7 @@ CHANGED = 0.05
 
 ARRIVED, LOOKING, CAUGHT, FINISHED = 20, 21, 22, 23
 """Why a run pauses, beside the :class:`Code` of how it ended: it is where steps had to end; what grows near its state
-is to be looked at; an event happens in the step that was tried; it is at its end."""
+is to be looked at; it is at an event; it is at its end."""
 
 
 TOLD = ("x", "energy", "entropy", "step", "t", "taken")
@@ -117,6 +119,7 @@ class Pace(NamedTuple):
     speed: jax.Array  # the largest at which the state has changed, relative to its size
     growth: jax.Array  # rate of what grows fastest, when it was looked at last,
     seen: jax.Array  # and how the motion stretched what lay near
+    search: jax.Array  # for the event in a step: a searching.Search
 
 
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
@@ -147,6 +150,7 @@ def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
         speed=speed,
         growth=zero,
         seen=jnp.full_like(now, jnp.nan),
+        search=searching.NONE,
     )
     return held_back(method, pace, now) if pacing.adaptive else pace
 
@@ -160,7 +164,17 @@ def shape_seen(system: System, method: OneStepMethod, pacing: Pacing) -> tuple[i
 
 
 def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
-    """The size of the next step, so that none ends just short of where one has to end, and the time after it."""
+    """The size of the next step, and the time after it."""
+    h, reached = fitted_whole(pacing, pace)
+    if pacing.watched is None:
+        return h, reached
+    search = searching.Search(*pace.search)
+    part = search.share * search.whole
+    return jnp.where(search.whole > 0.0, part, h), jnp.where(search.whole > 0.0, pace.t + part, reached)
+
+
+def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
+    """The same for one that is no part of another: none ends just short of where one has to end."""
     if pacing.adaptive:
         left = pace.stop - pace.t
         arrives = left <= pace.wish * (1 + 1e-12)
@@ -201,38 +215,35 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         fair = jnp.where(h < CUT * wish, pace.fair, fair)
         wish = jnp.where(good, longer, after_bad(error, h, power))
         code = jnp.where(good | (wish >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
-    value = pacing.watch(system, new.x)
-    crosses = (pace.value > 0.0) & (value <= 0.0)
-    if not pacing.falling:
-        crosses = crosses | ((pace.value < 0.0) & (value >= 0.0))
-    caught = good & crosses & (pacing.watched is not None)
-    if pacing.adaptive and pacing.watched is not None and not pacing.falling:
-        share = first_change(system, method, pacing, pace.value, old.x, h * new.k)
-        cut = good & ~crosses & (share < 1.0)  # there and back within the step: a shorter one ends there
-        good, wish = good & ~cut, jnp.where(cut, share * h, wish)
-    code = jnp.where(caught, CAUGHT, jnp.where(good & (reached >= pace.stop), ARRIVED, code))
+    sight = Sight(good, jnp.zeros((), dtype=bool), pace.value, reached, wish, code, 1.0 * ~good, pace.search)
+    if pacing.watched is not None:
+        sight = sighted(system, method, pacing, pace, h, new, sight)
+    good, ends, value, reached, wish, code, rejected, search = sight
+    goes_on = good & ~ends
 
     def kept(after, before):
-        return jnp.where(good & ~caught, after, before)
+        return jnp.where(goes_on, after, before)
 
-    state = jax.tree_util.tree_map(kept, new, old)
+    state = jax.tree_util.tree_map(lambda after, before: jnp.where(good, after, before), new, old)
+    code = jnp.where(goes_on & (reached >= pace.stop), ARRIVED, code)
     tried = pace.tried + 1.0
     after = Pace(
         state=state._replace(status=code.astype(old.status.dtype), residual=new.residual),
-        t=kept(reached, pace.t),
+        t=jnp.where(good | ends, reached, pace.t),
         stop=pace.stop,
         base=pace.base,
         since=pace.since,
-        wish=jnp.where(caught, pace.wish, wish),
+        wish=wish,
         taken=h,
         fair=kept(fair, pace.fair),
         tried=tried,
-        rejected=pace.rejected + jnp.where(good, 0.0, 1.0),
+        rejected=pace.rejected + rejected,
         cause=cause,
         value=kept(value, pace.value),
         speed=kept(speed, pace.speed),
         growth=pace.growth,
         seen=pace.seen,
+        search=search,
     )
     if not pacing.adaptive:
         return after
@@ -243,13 +254,82 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     return after._replace(state=after.state._replace(status=status))
 
 
-def first_change(system: System, method: OneStepMethod, pacing: Pacing, before, x, d) -> jax.Array:
-    """The first share of a step from x, among the method's looks, after which what is watched has another sign."""
-    share = jnp.ones(())
-    for theta in method.looks[::-1]:
-        value = pacing.watch(system, method.along(system, x, jnp.asarray(method.weights(theta)) @ d))
-        share = jnp.where((before * value < 0.0) & jnp.isfinite(value), theta, share)
-    return share
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+class Sight(NamedTuple):
+    """What an attempt means, for what is watched too."""
+
+    good: jax.Array  # whether its state is the next one
+    ends: jax.Array  # whether the event is there
+    value: jax.Array
+    reached: jax.Array
+    wish: jax.Array
+    code: jax.Array
+    rejected: jax.Array
+    search: jax.Array
+
+
+def sighted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h, new: State, sight: Sight) -> Sight:
+    """An attempt as it was judged, with a view to the event.
+
+    A step in which it happens begins a search among steps from the same state, so that the event is as accurate as the
+    method, and the laws hold there. Where it happens and is undone within a step, as the polynomial of the step tells,
+    a shorter one is tried first; and where a part of a step fails of which the whole did not.
+    """
+    value, search = pacing.watch(system, new.x), searching.Search(*pace.search)
+    looking, solved = search.whole > 0.0, (new.status == Code.COMPLETED) & jnp.isfinite(value)
+    begins = sight.good & changes(pacing, pace.value, value) & ~looking
+    cut, first = jnp.zeros((), dtype=bool), jnp.ones(())
+    if pacing.adaptive:
+        first, undone = first_change(system, method, pacing, pace, h * new.k, value)
+        cut = sight.good & undone & ~looking
+        begins = begins & ~cut
+    narrower, found = searching.narrowed(search, value)
+    at_root = looking & solved & found
+    at_start = looking & solved & ~found & (narrower.share * search.whole <= pacing.shortest)
+    lost, ends = looking & ~solved, at_root | at_start
+    wish = jnp.where(cut, first * h, jnp.where(looking | begins, pace.wish, sight.wish))
+    code = jnp.where(ends, CAUGHT, jnp.where(looking, Code.COMPLETED, sight.code))
+    if pacing.adaptive:
+        wish = jnp.where(lost, UNSOLVED * search.whole, wish)
+        code = jnp.where(lost & (wish < pacing.shortest), Code.STEP_UNDERFLOW, code)
+    else:
+        code = jnp.where(lost, jnp.where(new.status == Code.COMPLETED, Code.NON_FINITE, new.status), code)
+    begun = jnp.stack(searching.begun(h, pace.value, value))
+    goes_on = jnp.where(looking & ~ends & ~lost, jnp.stack(narrower), searching.NONE)
+    return Sight(
+        good=jnp.where(looking, at_root & (h > pacing.shortest), sight.good & ~cut & ~begins),
+        ends=ends,
+        value=value,
+        reached=jnp.where(at_start, pace.t + narrower.share * search.whole, sight.reached),
+        wish=wish,
+        code=code,
+        rejected=jnp.where(looking, 1.0 * lost, jnp.where(cut, 1.0, sight.rejected)),
+        search=jnp.where(begins, begun, goes_on),
+    )
+
+
+def changes(pacing: Pacing, before, after) -> jax.Array:
+    """Whether what is watched changes its sign as an event does."""
+    falls = (before > 0.0) & (after <= 0.0)
+    return falls if pacing.falling else falls | ((before < 0.0) & (after >= 0.0))
+
+
+def first_change(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, d, end):
+    """The first share of a step, among the method's looks, with another sign; and whether a later one undoes that."""
+
+    def value(weights) -> jax.Array:
+        return pacing.watch(system, method.along(system, pace.state.x, weights @ d))
+
+    share, changed, undone = jnp.ones(()), jnp.zeros((), dtype=bool), jnp.zeros((), dtype=bool)
+    seen = jax.vmap(value)(jnp.asarray(method.weights(method.looks))) if len(method.looks) else ()
+    for theta, there in zip([*method.looks, 1.0], [*seen, end], strict=True):
+        other = pace.value * there < 0.0
+        undone = undone | (changed & (pace.value * there > 0.0))
+        share = jnp.where(other & ~changed, theta, share)
+        changed = changed | other
+    return share, undone
 
 
 # -- the size of the next step ----------------------------------------------------------------------------------------

@@ -110,8 +110,8 @@ class OneStepMethod(Module):
     @property
     def looks(self) -> np.ndarray:
         """Shares of an adaptive step at which the sign of an event is looked at, on its way: the more, the longer."""
-        count = self.order // 2
-        return np.arange(1, count) / max(count, 1)
+        count = 2 * self.order
+        return np.arange(1, count) / count
 
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""

@@ -84,7 +84,7 @@ def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, even
         numbers = [step.rtol, step.atol, step.first or 0.0, step.largest or math.inf]
         numbers += [UNDERFLOW * length, step.most_steps]
     else:
-        numbers = [0.0, 0.0, step, math.inf, 0.0, math.inf]
+        numbers = [0.0, 0.0, step, math.inf, UNDERFLOW * length, math.inf]
     watched, falling = (None, False) if event is None else (event.function, event.falling)
     rtol, atol, first, largest, shortest, most = (np.asarray(float(number)) for number in numbers)
     return Pacing(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)

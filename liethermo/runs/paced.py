@@ -8,15 +8,14 @@ from collections.abc import Callable
 import numpy as np
 
 from ..engines.codes import Code
-from ..engines.compiled.form import Form, numbers_of
+from ..engines.compiled.form import numbers_of
 from ..engines.compiled.paced import LanePaces, paced_stepper_of
 from ..engines.paced import Guide, ManyPaces, VmapPaces
 from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
-from ..tracing.interpret import at_points
 from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads, in_whole_vectors
-from .events import Event, located
+from .events import Event
 from .family import Family
 from .record import Record
 
@@ -65,7 +64,7 @@ class Many:
             number = chosen.stop - chosen.start
             own = lanes.parameters(chosen, number)
             own = whole if own.ndim == 1 else np.hstack([own, np.broadcast_to(added, (number, len(added)))])
-            paces = LanePaces(stepper, lanes.stepper, whole, own, self.record.x0[chosen], *self._times)
+            paces = LanePaces(stepper, whole, own, self.record.x0[chosen], *self._times)
             self._follow(paces, np.arange(chosen.start, chosen.stop), paces.only, stop.is_set)
 
         by_threads(work, size)
@@ -107,8 +106,7 @@ class Many:
                     record.keep_at(places[there], paces.read("t", there), np.hstack(columns))
                 caught = np.setdiff1d(guide.paused(CAUGHT), np.flatnonzero(~followed))
                 if caught.size:
-                    fields, times = self._happened(paces, places, caught)
-                    finish(caught, np.full(caught.size, Code.EVENT), fields, times)
+                    finish(caught, np.full(caught.size, Code.EVENT), fields_of(caught), paces.read("t", caught))
                 guide.resume()
                 status = paces.read("status")
                 ended = np.flatnonzero(followed & ~np.isin(status, (Code.COMPLETED, ARRIVED, CAUGHT, LOOKING)))
@@ -127,38 +125,3 @@ class Many:
         left = np.flatnonzero(followed)
         if left.size:
             finish(left, np.full(left.size, Code.INTERRUPTED), fields_of(left), paces.read("t", left))
-
-    def _happened(self, paces: ManyPaces, places: np.ndarray, caught: np.ndarray):
-        """The fields of the states at events, and their times."""
-        assert self.event is not None
-        form, h = self.family.form, paces.read("taken", caught)
-        own = self.family.flat(places[caught], caught.size)
-        function, p = self.event.function, own.shape[1]
-        whole = paces.stepped(caught, h, ("x", "k"))
-        x = paces.read("x", caught)
-
-        def watched(x: np.ndarray, some: np.ndarray) -> np.ndarray:
-            """At as many states as a power of two: few shapes, where this is compiled."""
-            at = np.hstack([own[some], x])
-            rows = np.minimum(np.arange(1 << (len(at) - 1).bit_length()), len(at) - 1)
-            return np.asarray(at_points(_watched, (form, function, p), at[rows]))[: len(at)]
-
-        def value(shares: np.ndarray, some: np.ndarray) -> np.ndarray:
-            end = paces.stepped(caught[some], shares * h[some], ("x", "status"))
-            found = watched(end["x"], some)
-            failed = np.flatnonzero((end["status"] != Code.COMPLETED) | ~np.isfinite(found))
-            for j in failed:  # a part of the step that fails is replaced by the polynomial of the whole
-                i = some[j]
-                v = h[i] * self.method.weights(shares[j]) @ whole["k"][i]
-                along = self.method.along(self.family.member(int(places[caught[i]])), x[i], v)
-                found[j] = watched(np.asarray(along)[None], np.array([i]))[0]
-            return found
-
-        everyone = np.arange(caught.size)
-        shares = located(value, watched(x, everyone), watched(whole["x"], everyone))
-        return paces.stepped(caught, shares * h, TELLING), paces.read("t", caught) + shares * h
-
-
-def _watched(model: tuple[Form, Callable, int], at):
-    form, function, p = model
-    return function(form.build(at[:p]), at[p:])

@@ -6,7 +6,6 @@ they hold for every step size.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -16,11 +15,11 @@ import numpy as np
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.paced import Guide
-from ..engines.pacing import CAUGHT, TOLD
+from ..engines.pacing import CAUGHT, FINISHED, TOLD
 from ..engines.stepping import State
 from ..errors import InputError
-from .adaptive import UNDERFLOW, Adaptive, pacing_of
-from .events import Event, located
+from .adaptive import Adaptive, pacing_of
+from .events import Event
 from .timetable import Timetable
 
 TOGETHER = 64
@@ -99,17 +98,17 @@ def run(
     """
     outcome, stops = Outcome(state), stops[stops > span[0]]
     try:
-        if isinstance(step, Adaptive):
-            _adaptive(engine, outcome, span, step, stops, event, keep, most_kept, 1 if singly else TOGETHER)
+        if isinstance(step, Adaptive) or event is not None:
+            _paced(engine, outcome, span, step, stops, event, keep, most_kept, 1 if singly else TOGETHER)
         else:
-            _fixed(engine, outcome, span, step, stops, event, keep)
+            _fixed(engine, outcome, span, step, stops, keep)
     except KeyboardInterrupt:
         outcome.interrupted = True
     return outcome
 
 
-def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep, most_kept, together: int) -> None:
-    """By the paces that ensembles have too, so many attempts together."""
+def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, together: int) -> None:
+    """Adaptive steps or events, by the paces that ensembles have too, so many attempts together."""
     length = span[1] - span[0]
     pacing = pacing_of(step, engine.method, length, event)
     paces = engine.paces(pacing, np.asarray(outcome.state.x), span[0], float(stops[0]), length)
@@ -121,8 +120,8 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
     while True:
         guide.resume()
         code, t = int(told("status")), told("t")
-        if code == CAUGHT and event is not None:
-            _happened(engine, outcome, event, keep, t, told("taken"), float(pacing.shortest))
+        if code == CAUGHT:
+            outcome.event_time = t
         if code != Code.COMPLETED:
             break
         if int(outcome.state.step) >= most_kept:
@@ -141,11 +140,12 @@ def _adaptive(engine, outcome: Outcome, span, step: Adaptive, stops, event, keep
     elif code == Code.STEP_UNDERFLOW:
         outcome.underflow = told("wish")
         outcome.state = outcome.state._replace(status=np.int64(told("cause")), residual=told("residual"))
+    elif code not in (CAUGHT, FINISHED):
+        outcome.state = outcome.state._replace(status=np.int64(code), residual=told("residual"))
 
 
-def _fixed(engine, outcome: Outcome, span, step: float, stops, event, keep) -> None:
-    t, shortest = span[0], UNDERFLOW * (span[1] - span[0])
-    value = event(np.asarray(outcome.state.x)) if event else 0.0
+def _fixed(engine, outcome: Outcome, span, step: float, stops, keep) -> None:
+    t = span[0]
     for stop in map(float, stops):
         table, since = Timetable((t, stop), step, None), int(outcome.state.step)
         while t < table.end:
@@ -155,40 +155,13 @@ def _fixed(engine, outcome: Outcome, span, step: float, stops, event, keep) -> N
             if int(new.status) != Code.COMPLETED:
                 outcome.state = new
                 return
-            after = event(np.asarray(new.x)) if event else 0.0
-            if event and event.happens(value, after):
-                _happened(engine, outcome, event, keep, t, h, shortest)
-                return
             keep(_single(t, reached, h, state, new))
-            t, outcome.state, value = reached, new, after
+            t, outcome.state = reached, new
 
 
 def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:
     x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in TOLD[:4])
     return Steps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)
-
-
-def _happened(engine, outcome: Outcome, event: Event, keep, t: float, h: float, shortest: float) -> None:
-    """The step of at most h that ends where the event happens."""
-    state = outcome.state
-    whole = engine.step(state, h)
-
-    def value(shares: np.ndarray, places: np.ndarray) -> np.ndarray:
-        del places
-        end = engine.step(state, shares[0] * h)
-        found = event(np.asarray(end.x)) if int(end.status) == Code.COMPLETED else math.nan
-        if not math.isfinite(found):  # a part of the step that fails is replaced by the polynomial of the whole
-            weights = engine.method.weights(shares[0])
-            v = h * weights @ np.asarray(whole.k)
-            found = event(np.asarray(engine.method.along(engine.system, np.asarray(state.x), v)))
-        return np.array([found])
-
-    ends = (np.array([event(np.asarray(s.x))]) for s in (state, whole))
-    share = float(located(value, *ends)[0])
-    if share * h > shortest:
-        outcome.state = whole if share == 1.0 else engine.step(state, share * h)
-        keep(_single(t, t + share * h, share * h, state, outcome.state))
-    outcome.event_time = t + share * h
 
 
 def stops_of(save_at, start: float, end: float) -> np.ndarray:

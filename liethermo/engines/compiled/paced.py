@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ...integrators import OneStepMethod
@@ -11,9 +9,10 @@ from ...systems import System
 from ...tracing.scalarize import UnsupportedPrimitive
 from ..pacing import TOLD, Pace, Pacing, begun, fitted, judged, shape_seen
 from ..rules import RULES, Rules
+from ..searching import NONE
 from ..stepping import State
 from .form import Form, numbers_of
-from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper, stepper_for
+from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper
 
 OWN = tuple(name for name in Pace._fields if name != "state")
 NAMES = (*FIELDS, *OWN)
@@ -41,7 +40,7 @@ class PacedStepper(Stepper):
         super().__init__(form, own, parameters, method, lanes, varies, rules)
 
     def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
-        self._shapes["seen"] = self._seen
+        self._shapes |= {"seen": self._seen, "search": NONE.shape}
         both, way, skip = self._both, self._way, self._skip
 
         def joined(fields) -> Pace:
@@ -104,8 +103,6 @@ class LanePaces:
     Parameters
     ----------
     stepper : PacedStepper
-    plain : Stepper
-        Takes steps of any size from their states.
     first : array, shape (p,)
         The parameters of one of them, those of the method and the pacing among them.
     parameters : array, shape (p,) or (trajectories, p)
@@ -114,8 +111,8 @@ class LanePaces:
         See :func:`..pacing.begun`.
     """
 
-    def __init__(self, stepper: PacedStepper, plain: Stepper, first, parameters, x: np.ndarray, t, stop, length):
-        self.stepper, self.plain, self.first, self.number = stepper, plain, first, len(x)
+    def __init__(self, stepper: PacedStepper, first, parameters, x: np.ndarray, t, stop, length):
+        self.stepper, self.first, self.number = stepper, first, len(x)
         each = {name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop", stop), ("length", length))}
         self.blocks = stepper.begin(parameters, x, **each)
 
@@ -145,17 +142,6 @@ class LanePaces:
         block, lane = np.divmod(chosen, self.stepper.lanes)
         self.stepper.part(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
 
-    def stepped(self, chosen: np.ndarray, h: np.ndarray, names: Sequence[str] = FIELDS) -> dict[str, np.ndarray]:
-        """Fields of the states after steps of these sizes from those that some have."""
-        own, plain = self._rows(chosen), self.plain
-        rows = np.zeros((len(chosen), plain.height))
-        of_state = slice(plain.rows(FIELDS[-1]).stop)  # the first rows of both
-        rows[:, of_state], rows[:, plain.rows("p")] = own[:, of_state], own[:, self.stepper.rows("p")]
-        rows[:, plain.rows("status")] = 0.0
-        blocks = plain.of_rows(rows)
-        plain.run(self.first, blocks, np.resize(h, len(blocks) * plain.lanes), 1, 1)
-        return {name: values[: len(chosen)] for name, values in plain.fields(blocks, names).items()}
-
     def _rows(self, chosen: np.ndarray, name: str | None = None) -> np.ndarray:
         """A field of some of them, or all that is known of them, shape (trajectories, rows)."""
         block, lane = np.divmod(chosen, self.stepper.lanes)
@@ -170,6 +156,6 @@ def lane_pace(
     system: System, method: OneStepMethod, pacing: Pacing, x, t: float, stop: float, length: float
 ) -> LanePaces:
     """One trajectory, a block by itself."""
-    plain, parameters = stepper_for(system, method)
+    parameters = np.concatenate([numbers_of(system), numbers_of(method)])
     stepper, whole = paced_stepper_of(Form.of(system), parameters, method, pacing)
-    return LanePaces(stepper, plain, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)
+    return LanePaces(stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)
