@@ -239,7 +239,7 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         tried=tried,
         rejected=pace.rejected + rejected,
         cause=cause,
-        value=kept(value, pace.value),
+        value=jnp.where(jnp.isnan(value), pace.value, kept(value, pace.value)),  # the last sign that is known
         speed=kept(speed, pace.speed),
         growth=pace.growth,
         seen=pace.seen,

@@ -34,10 +34,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
     Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
     quadrature.
 
-    A step costs 4, 7 or 11 evaluations of the field; and with four corrections, five values of what each function
-    changes by. Large systems are corrected only where something is left to correct. There is nothing to iterate, so it
-    is many times as fast as an implicit step; but stiff systems ask for short steps. A step that is too long for its
-    corrections fails with a status.
+    A step costs 4, 7 or 11 evaluations of the field, and one to four corrections, as many as it takes: for each, one
+    value of what each function changes by. There is nothing to iterate, so it is many times as fast as an implicit
+    step; but stiff systems ask for short steps. A step that is too long for its corrections fails with a status.
 
     On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
     same laws. See :class:`InCharts`.

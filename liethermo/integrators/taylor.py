@@ -38,8 +38,8 @@ class MetriplecticTaylor(ExplicitMethod):
     What they decide by ``jnp.where`` or ``lax.cond`` they decide at the start of each step.
 
     A step costs about ``p^2 / 2`` times the products of the field, ``p / 2`` evaluations of the entropy production, and
-    four corrections. Steps are long: in double precision no method takes fewer. It is for accuracies from 1e-8 on, and
-    for states between the steps: ``solution(t)`` is of the order of the method.
+    one correction or a few. Steps are long: in double precision no method takes fewer. It is for accuracies from 1e-8
+    on, and for states between the steps: ``solution(t)`` is of the order of the method.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ def integrate(
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
         Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
         located to rounding by a step that ends there. ``solution.event_time`` and the status tell whether it happened.
-        Two crossings within a step of given size are not seen; adaptive steps of high order are looked at between.
+        Two crossings within a step of given size are not seen; adaptive steps are looked at between their ends too.
     dense : bool
         Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
     engine : {"auto", "array", "compiled", "sparse"}

@@ -454,31 +454,6 @@ def test_bad_tolerances(options, message):
         lt.Relaxed(0.0)
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(lt.MetriplecticRungeKutta(8), id="8"),
-        pytest.param(lt.MetriplecticTaylor(20), id="Taylor", marks=pytest.mark.slow),
-    ],
-)
-def test_an_event_that_comes_and_goes_within_a_step_is_seen(method):
-    """A body turns about two axes in turn, and is above a level for a fraction of a step each time."""
-    body, x0 = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.0), np.array([1.0, 0.2, 0.1])
-    fine = lt.integrate(body, x0, (0.0, 40.0), 1e-3, lt.MetriplecticGauss(3))
-    level = 0.998 * fine.x[:, 1].max()
-    above = np.flatnonzero(fine.x[:, 1] > level)
-    rises = fine.t[above[0]]
-    falls = fine.t[above[np.argmax(np.diff(above) > 1)]]
-    arguments = (0.0, 40.0), lt.Adaptive(1e-8), method
-    steps = np.diff(lt.integrate(body, x0, *arguments, dense=True).t)
-    assert falls - rises < steps.mean() / 2
-    found = lt.integrate(body, x0, *arguments, until=lambda x: x[1] - level)
-    assert found.event_time == pytest.approx(rises, abs=1.5e-3)
-    assert abs(found.x[-1, 1] - level) < 1e-13
-    many = lt.ensemble(body, np.tile(x0, (3, 1)), *arguments, until=lambda x: x[1] - level)
-    assert np.abs(many.event_time - found.event_time).max() < 1e-12
-
-
 # -- the method -------------------------------------------------------------------------------------------------------
 
 
