@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .rules import EPS
 
@@ -33,7 +34,7 @@ class Search(NamedTuple):
     fc: jax.Array
 
 
-NONE = jnp.zeros(len(Search._fields))
+NONE = np.zeros(len(Search._fields))
 """No search, as an array."""
 
 
