@@ -150,7 +150,7 @@ def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
         speed=speed,
         growth=zero,
         seen=jnp.full_like(now, jnp.nan),
-        search=searching.NONE,
+        search=jnp.asarray(searching.NONE),
     )
     return held_back(method, pace, now) if pacing.adaptive else pace
 
