@@ -215,7 +215,16 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         fair = jnp.where(h < CUT * wish, pace.fair, fair)
         wish = jnp.where(good, longer, after_bad(error, h, power))
         code = jnp.where(good | (wish >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
-    sight = Sight(good, jnp.zeros((), dtype=bool), pace.value, reached, wish, code, 1.0 * ~good, pace.search)
+    sight = Sight(
+        good=good,
+        ends=jnp.zeros((), dtype=bool),
+        value=pace.value,
+        reached=reached,
+        wish=wish,
+        code=code,
+        rejected=1.0 * ~good,
+        search=pace.search,
+    )
     if pacing.watched is not None:
         sight = sighted(system, method, pacing, pace, h, new, sight)
     good, ends, value, reached, wish, code, rejected, search = sight
@@ -258,15 +267,15 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
 
 
 class Sight(NamedTuple):
-    """What an attempt means, for what is watched too."""
+    """What an attempt means."""
 
     good: jax.Array  # whether its state is the next one
-    ends: jax.Array  # whether the event is there
-    value: jax.Array
-    reached: jax.Array
-    wish: jax.Array
-    code: jax.Array
-    rejected: jax.Array
+    ends: jax.Array  # whether an event is there
+    value: jax.Array  # of what is watched
+    reached: jax.Array  # when it ends
+    wish: jax.Array  # size of the next
+    code: jax.Array  # whether the run goes on, pauses or fails
+    rejected: jax.Array  # 1 for an attempt in vain, or 0
     search: jax.Array
 
 

@@ -38,7 +38,7 @@ class Outcome:
     event_time: float | None = None
     underflow: float | None = None
     interrupted: bool = False
-    limit: str = ""  # what an adaptive run has used up, "steps" or "memory"
+    limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
 
 
 class Steps(NamedTuple):
@@ -142,6 +142,7 @@ def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, 
         outcome.state = outcome.state._replace(status=np.int64(told("cause")), residual=told("residual"))
     elif code not in (CAUGHT, FINISHED):
         outcome.state = outcome.state._replace(status=np.int64(code), residual=told("residual"))
+        outcome.limit = "sight" if told("cause") == Code.COMPLETED else ""
 
 
 def _fixed(engine, outcome: Outcome, span, step: float, stops, keep) -> None:

@@ -47,7 +47,10 @@ def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
     least : int
         Instructions that a side has at least; a shorter one stands before the choice.
     """
-    guards = _guards(program)
+    tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
+    if not tests:
+        return list(program.instructions)
+    guards = _guards(program, tests)
     sizes = Counter(guard[:depth] for guard in guards.values() for depth in range(1, len(guard) + 1))
     for target, guard in guards.items():
         while guard and sizes[guard] < least:
@@ -56,13 +59,12 @@ def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
     return _ordered(program.instructions, guards, 0)
 
 
-def _guards(program: Program) -> dict[str, Guard]:
-    """Where each instruction is needed.
+def _guards(program: Program, tests: set[str]) -> dict[str, Guard]:
+    """Where each instruction is needed, by these tests.
 
     The choices of a branch stand together, so all are where any of them is needed. That moves what they depend on, and
     with it other choices: it is repeated until nothing moves.
     """
-    tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
     together: dict[str, Guard] = {}
     while True:
         guards: dict[str, Guard] = {a: () for entries in program.outputs for a in entries if isinstance(a, str)}

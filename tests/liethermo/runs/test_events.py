@@ -80,6 +80,7 @@ def test_a_part_of_a_step_that_fails_is_not_passed_over(engine, step):
     )
     assert found.event_time is None
     assert found.status.code == ("non_finite" if step == 0.1 else "step_underflow")
+    assert ("the event function is not a number" in found.status.message) == (step == 0.1)
     assert found.t[-1] == pytest.approx(np.arccos(0.5), abs=0.11)
 
 
