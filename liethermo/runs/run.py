@@ -136,8 +136,8 @@ class Run:
         if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit):
             self.status = given_up(outcome, step, end, now)
         elif event is not None and outcome.limit:
-            text = f"{event.name} is not a number at some states of the step from t = {now:g}, so it is not known when it "
-            text += "happens: extend the function, or take adaptive steps"
+            text = f"{event.name} is not a number at some states of the step from t = {now:g}, so it is not known when "
+            text += "it happens: extend the function, or take adaptive steps"
             self.status = Status(Code.NON_FINITE, text, steps, now, float(state.residual))
         elif event is not None and outcome.event_time is not None:
             text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
