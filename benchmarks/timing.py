@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-SLICE = 0.02
-"""Seconds that a turn lasts at least: short work is repeated, each repetition timed by itself."""
+SLICE = 0.1
+"""Seconds that a turn lasts at least: short work, which a disturbance spoils most, is repeated and timed each time."""
 
 
 @dataclass(frozen=True)

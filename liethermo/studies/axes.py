@@ -200,6 +200,13 @@ class Axis:
     def __len__(self) -> int:
         return len(self.labels)
 
+    def same(self, other: Axis) -> bool:
+        """Whether the places of another axis, of the same columns, are told apart by the same numbers in its order."""
+        pairs = [(self.labels, other.labels), *((column, other.columns[n]) for n, column in self.columns.items())]
+        if self.states is not None or other.states is not None:
+            pairs.append((np.asarray(self.states), np.asarray(other.states)))
+        return all(np.array_equal(one, another) for one, another in pairs)
+
     def rows(self) -> list[tuple]:
         """What tells the places along the axis apart; numbers that rounding alone tells apart are the same."""
         states = [] if self.states is None else [[tuple(map(_key, row)) for row in self.states.tolist()]]
