@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,7 @@ import liethermo as lt
 from .. import laws, peers, reference
 from ..native import Body
 from ..problems import X0, body, body_parameters
-from ..report import Report, Table, take_part
+from ..report import Report, Table, Target, take_part
 from ..timing import race
 
 RATE, T_END = 0.1, 100.0
@@ -19,12 +20,15 @@ RATE, T_END = 0.1, 100.0
 
 STEPS = (500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 LARGE_STEPS = (100, 200, 500, 1000, 2000)
+EXPLICIT_STEPS, TAYLOR_STEPS = (100, 150, 200, 250, 300, 400, 500, 700), (40, 50, 60, 70, 80, 100)
 
 TOLERANCES = tuple(10.0**-n for n in range(3, 14))
 
 METHODS: dict[str, tuple[lt.OneStepMethod, tuple[int, ...]]] = {
     "midpoint": (lt.MetriplecticMidpoint(), STEPS),
     **{f"Gauss, order {2 * s}": (lt.MetriplecticGauss(stages=s), LARGE_STEPS) for s in (2, 3, 4)},
+    "explicit, order 8": (lt.MetriplecticRungeKutta(8), EXPLICIT_STEPS),
+    "Taylor, order 16": (lt.MetriplecticTaylor(16), TAYLOR_STEPS),
 }
 """The library's methods and the numbers of steps to run each with. Another method is one more line."""
 
@@ -36,6 +40,9 @@ PEERS: dict[str, tuple[Callable[..., peers.Run], tuple[float, ...]]] = {
 }
 
 WANTED = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+
+TARGETS, CALL = (1e-10, 1e-12), "a call of one step"
+"""Errors at which explicit methods are compared with heyoka, and what their calls take beside the steps."""
 
 
 def run(quick: bool) -> Report:
@@ -51,6 +58,8 @@ def run(quick: bool) -> Report:
             }
             if name == "midpoint":
                 builders["midpoint, C", f"{steps} steps"] = _c(steps)
+        if method.explicit:
+            builders[name, CALL] = _library(method, 1, "compiled", T_END / counts[-1])
     for name, (solver, tolerances) in PEERS.items():
         for tolerance in tolerances[:1] if quick else tolerances:
             builders[name, f"tolerance {tolerance:.0e}"] = _peer(solver, tolerance)
@@ -60,7 +69,10 @@ def run(quick: bool) -> Report:
     exact = reference.states(X0, RATE, T_END)
     rows: list[list] = []
     series: dict[str, list[list[float]]] = {}
+    calls = {name: outcome.processor for (name, setting), outcome in outcomes.items() if setting == CALL}
     for (name, setting), outcome in outcomes.items():
+        if setting == CALL:
+            continue
         state, kept = contestants[name, setting][1](outcome.result)
         error = float(np.abs(state - exact).max() / np.abs(exact).max())
         rows.append([name, setting, error, outcome.processor, *kept.cells()])
@@ -76,9 +88,26 @@ def run(quick: bool) -> Report:
         "Work and precision",
         text,
         [_fastest(series), Table("Every run.", columns, rows)],
+        [] if quick else _targets(series, calls),
         skipped={name: reason for (name, _), reason in skipped.items()},
         series=series,
     )
+
+
+def _targets(series: dict[str, list[list[float]]], calls: dict[str, float]) -> list[Target]:
+    """The best explicit method for each error: its steps against heyoka, and its whole call."""
+
+    def fastest(name: str, wanted: float) -> float:
+        return min((seconds for error, seconds in series.get(name, []) if error <= wanted), default=math.inf)
+
+    found = []
+    for wanted in TARGETS:
+        whole, call = min((fastest(f"{name}, compiled engine", wanted), call) for name, call in calls.items())
+        work, heyoka = f"one body to t = {T_END:g} at {wanted:.0e}, explicit", fastest("heyoka Taylor", wanted)
+        steps = (whole - call) / heyoka if math.isfinite(heyoka) else None
+        found.append(Target(f"{work}: steps against heyoka", 1.3, steps))
+        found.append(Target(f"{work}: a whole call", 2e-4, whole, "seconds"))
+    return found
 
 
 def _fastest(series: dict[str, list[list[float]]]) -> Table:
@@ -94,10 +123,10 @@ def _fastest(series: dict[str, list[list[float]]]) -> Table:
 # Each builder returns what to time, and what makes of its result the last state and the laws.
 
 
-def _library(method, steps, engine):
+def _library(method, steps, engine, end_time=T_END):
     def build():
-        system, span = body(RATE), (0.0, T_END)
-        end = lambda: lt.integrate(system, X0, span, T_END / steps, method, save_every=steps, engine=engine)  # noqa: E731
+        system, span = body(RATE), (0.0, end_time)
+        end = lambda: lt.integrate(system, X0, span, end_time / steps, method, save_every=steps, engine=engine)  # noqa: E731
         return end, lambda solution: (solution.x[-1], laws.of_solution(solution))
 
     return build
