@@ -6,6 +6,9 @@ from pathlib import Path
 
 import matplotlib
 
+STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
+"""Lines by what runs a method, whose colour is the same for all."""
+
 
 def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
     """Time against error, a curve for each method; the format is that of the file name."""
@@ -14,10 +17,14 @@ def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
 
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
+        colours: dict[str, str] = {}
         for name, points in series.items():
             errors, seconds = zip(*points, strict=True)
             width = 2.0 if name.endswith("engine") else 1.0  # the library's own stand out
-            axes.loglog(errors, seconds, marker="o", markersize=2 + width, linewidth=width, label=name)
+            by = next((end for end in STYLES if name.endswith(end)), "")
+            colour = colours.setdefault(name.removesuffix(by), f"C{len(colours)}")
+            line = {"linestyle": STYLES.get(by, "-"), "linewidth": width, "color": colour}
+            axes.loglog(errors, seconds, marker="o", markersize=2 + width, label=name, **line)
         axes.invert_xaxis()
         axes.set_xlabel("relative error at the end")
         axes.set_ylabel("time of a run (s)")

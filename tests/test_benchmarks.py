@@ -150,8 +150,8 @@ def test_the_reference_is_the_trajectory(monkeypatch):
 def test_a_process_is_not_charged_its_parent_s_memory():
     """getrusage would: its figure survives the start of another program."""
     large = np.ones(100_000_000)
-    small = child.python("-c", "from benchmarks.measurements.memory import _resident; print(_resident())")
-    assert 1e7 < float(small) < large.nbytes < memory._resident()
+    small = child.python("-c", "from benchmarks.measurements.memory import resident; print(resident())")
+    assert 1e7 < float(small) < large.nbytes < memory.resident()
 
 
 @needs_compiler
