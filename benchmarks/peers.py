@@ -9,13 +9,19 @@ from __future__ import annotations
 import copy
 import functools
 import importlib
+import operator
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numba
 import numpy as np
 from scipy.integrate import solve_ivp
+
+import liethermo as lt
+from liethermo.tracing.scalarize import scalarize
 
 from .machine import cores
 from .problems import body_field
@@ -170,8 +176,13 @@ def heyoka(tolerance: float, x0, t_end: float, rate: float) -> Run:
 
 def heyoka_batches(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """The states at the end from all of the x0s: a SIMD integrator for each core, and the batches dealt out to them."""
+    return heyoka_batches_of(_heyoka_system(rate), tolerance, x0s, t_end)
+
+
+def heyoka_batches_of(equations: list, tolerance: float, x0s: np.ndarray, t_end: float) -> Callable:
+    """The same for other equations: pairs of a variable and its derivative."""
     hy, (batches, states) = module("heyoka"), _batches(x0s)
-    first = hy.taylor_adaptive_batch(_heyoka_system(rate), states[0].copy(), tol=tolerance)
+    first = hy.taylor_adaptive_batch(equations, states[0].copy(), tol=tolerance)
     integrators = [copy.deepcopy(first) for _ in range(cores())]
 
     def work(which: int) -> np.ndarray:
@@ -189,7 +200,7 @@ def heyoka_batches(tolerance: float, x0s: np.ndarray, t_end: float, rate: float)
         with ThreadPoolExecutor(len(integrators)) as threads:
             for which, part in enumerate(threads.map(work, range(len(integrators)))):
                 found[which :: len(integrators)] = part
-        return found.swapaxes(1, 2).reshape(-1, 3)[: len(x0s)]
+        return found.swapaxes(1, 2).reshape(-1, x0s.shape[1])[: len(x0s)]
 
     return ends
 
@@ -212,15 +223,28 @@ def heyoka_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float
 
 
 def _batches(x0s: np.ndarray) -> tuple[int, np.ndarray]:
-    """States as batches for heyoka, shape (batches, 3, lanes); the last is filled up with states from the front."""
+    """States as batches for heyoka, shape (batches, n, lanes); the last is filled up with states from the front."""
     lanes = module("heyoka").recommended_simd_size()
     batches = -(-len(x0s) // lanes)
-    return batches, np.resize(x0s, (batches, lanes, 3)).swapaxes(1, 2).copy()
+    return batches, np.resize(x0s, (batches, lanes, x0s.shape[1])).swapaxes(1, 2).copy()
 
 
 def _heyoka_system(rate: float) -> list:
     x, y, z = module("heyoka").make_vars("x", "y", "z")
     return list(zip((x, y, z), body_field(x, y, z, rate), strict=True))
+
+
+def heyoka_equations(system: lt.System) -> list:
+    """The equations of motion of a system, from its scalar program: nothing is typed twice."""
+    hy = module("heyoka")
+    program = scalarize(jax.make_jaxpr(system.vector_field)(jnp.zeros(system.dim)))
+    variables = [hy.make_vars(f"x{i}") for i in range(system.dim)]
+    values = dict(zip(program.inputs[0], variables, strict=True))
+    for target, op, args in program.instructions:
+        function = getattr(operator, {"div": "truediv"}.get(op, op), None) or getattr(hy, op)
+        values[target] = function(*(values[a] if isinstance(a, str) else a for a in args))
+    found = [values[a] if isinstance(a, str) else hy.expression(a) for a in program.outputs[0]]
+    return list(zip(variables, found, strict=True))
 
 
 def _check_heyoka(hy, outcome) -> None:

@@ -7,6 +7,7 @@ NAMES = (
     "spin",
     "fluids",
     "ensemble",
+    "others",
     "work_precision",
     "dimension",
     "bodies",
