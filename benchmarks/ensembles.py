@@ -29,6 +29,31 @@ def by_library(
     return functools.partial(lt.ensemble, system, x0s, span, step, method, outputs=outputs, engine=engine)
 
 
+TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 60))
+
+
+def loosest(build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float) -> tuple[Callable, float, float]:
+    """A peer's work with the loosest tolerance that reaches an error; that tolerance, and its error.
+
+    Parameters
+    ----------
+    build : function from a tolerance and initial states to a work
+    exact : array, shape (m, n)
+        The ends of the first states.
+    """
+    for tolerance in TOLERANCES:
+        reached = error(build(tolerance, x0s[: len(exact)])(), exact)
+        if reached <= wanted:
+            return build(tolerance, x0s), tolerance, reached
+    raise RuntimeError(f"no tolerance reaches an error of {wanted:.1e}")
+
+
+def error(ends, exact: np.ndarray) -> float:
+    """Largest error of the first ends, relative to their states."""
+    errors = np.abs(np.asarray(ends)[: len(exact)] - exact).max(axis=1) / np.abs(exact).max(axis=1)
+    return float(errors.max())
+
+
 def laws(result: lt.Ensemble) -> Laws:
     """The worst of all bodies, over every step.
 

@@ -10,7 +10,7 @@ import numpy as np
 import liethermo as lt
 
 from .. import laws, peers, reference
-from ..ensembles import by_library
+from ..ensembles import by_library, error, loosest
 from ..ensembles import laws as ensemble_laws
 from ..machine import cores
 from ..native import SUMMARY, Bodies
@@ -22,8 +22,6 @@ RATE, T_END = 1.0, 10.0
 
 SAMPLE = 32
 """Bodies whose errors are taken; the worst counts."""
-
-TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 52))
 
 SCIPY, C, COMPILED = "SciPy DOP853, one by one", "C with SIMD", "compiled engine"
 
@@ -85,7 +83,7 @@ def _contest(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, e
         COMPILED: by_library(system, x0s, T_END, steps, "compiled", method),
         "array engine": by_library(system, x0s, T_END, steps, "array", method),
     }
-    reached = _error(by_library(system, x0s[: len(exact)], T_END, steps, "compiled", method)().x, exact)
+    reached = error(by_library(system, x0s[: len(exact)], T_END, steps, "compiled", method)().x, exact)
     builders: dict[str, Callable] = {
         title: functools.partial(_peer, build, x0s[:SAMPLE] if title == SCIPY else x0s, exact, reached)
         for title, build in PEERS.items()
@@ -110,7 +108,7 @@ def _contest(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, e
             ends, kept = found, laws.of_ends(x0s[: len(found)], found, system)
         times[title] = outcome.seconds / len(ends)
         setting = others[title][1] if title in others else f"{steps} steps"
-        rows.append([title, setting, _error(ends, exact), times[title], None, *kept.cells()])
+        rows.append([title, setting, error(ends, exact), times[title], None, *kept.cells()])
     for row in rows:
         row[4] = ratio(row[3], times.get(C))
     rows.sort(key=lambda row: row[3])
@@ -121,18 +119,10 @@ def _contest(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, e
 
 def _peer(build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float) -> tuple[Callable, str]:
     """A peer's work with the loosest tolerance that reaches an error, and that tolerance as text."""
-    for tolerance in TOLERANCES:
-        if _error(build(tolerance, x0s[: len(exact)], T_END, RATE)(), exact) <= wanted:
-            return build(tolerance, x0s, T_END, RATE), f"tolerance {tolerance:.1e}"
-    raise RuntimeError(f"no tolerance reaches an error of {wanted:.1e}")
+    work, tolerance, _ = loosest(lambda tolerance, some: build(tolerance, some, T_END, RATE), x0s, exact, wanted)
+    return work, f"tolerance {tolerance:.1e}"
 
 
 def _c(x0s: np.ndarray, steps: int, threads: int) -> Callable[[], np.ndarray]:
     program = Bodies(body_parameters(RATE))
     return lambda: program.integrate(x0s, T_END / steps, steps, threads)
-
-
-def _error(ends, exact: np.ndarray) -> float:
-    """Largest error of the first bodies, relative to their states."""
-    errors = np.abs(np.asarray(ends)[: len(exact)] - exact).max(axis=1) / np.abs(exact).max(axis=1)
-    return float(errors.max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,7 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import laws, peers
-from ..ensembles import by_library
+from ..ensembles import by_library, error, loosest
 from ..ensembles import laws as ensemble_laws
 from ..machine import cores
 from ..problems import general_body
@@ -20,7 +21,6 @@ from ..timing import race
 from . import spin
 
 T_END, SAMPLE, EXACT = 10.0, 32, 1e-18
-TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 60))
 METHOD = lt.MetriplecticRungeKutta(8)
 
 
@@ -63,37 +63,27 @@ def _contest(name: str, system: lt.System, number: int, counts: tuple[int, ...],
         random[:, 3] = 0.0  # of the bath
     x0s = random / np.linalg.norm(random, axis=1)[:, None]
     rows: list[list] = []
-    skipped: dict[str, str] = {}
+    prepared, skipped = take_part({"heyoka": lambda: _heyoka(system, x0s[:SAMPLE])})
     for steps in counts:
         ours = by_library(system, x0s, T_END, steps, "compiled", METHOD)
-        found, missing = take_part({"heyoka": functools.partial(_heyoka, system, x0s, np.asarray(ours().x))})
-        skipped |= missing
-        works = {"compiled engine": ours} | {title: work for title, (work, *_) in found.items()}
+        works, missed = {"compiled engine": ours}, math.nan
+        if "heyoka" in prepared:
+            build, exact = prepared["heyoka"]
+            missed = error(ours().x, exact)
+            works["heyoka"], tolerance, reached = loosest(build, x0s, exact, missed)
         outcomes = race(works, rounds=1 if quick else 5)
         seconds = {title: outcome.seconds / number for title, outcome in outcomes.items()}
-        error, tolerance, reached = found["heyoka"][1:] if "heyoka" in found else (np.nan, np.nan, np.nan)
         kept = ensemble_laws(outcomes["compiled engine"].result)
-        rows.append(["compiled engine", f"{steps} steps", error, seconds["compiled engine"],
+        rows.append(["compiled engine", f"{steps} steps", missed, seconds["compiled engine"],
                      ratio(seconds["compiled engine"], seconds.get("heyoka")), *kept.cells()])  # fmt: skip
-        if "heyoka" in found:
+        if "heyoka" in prepared:
             ends = laws.of_ends(x0s, outcomes["heyoka"].result, system)
             rows.append(["heyoka", f"tolerance {tolerance:.1e}", reached, seconds["heyoka"], 1.0, *ends.cells()])
     columns = {"": "text", "Setting": "text", "Error": "error", "Time a state": "seconds", "Relative": "ratio"}
     return Table(f"{name}.", columns | laws.COLUMNS, rows), skipped
 
 
-def _heyoka(system: lt.System, x0s: np.ndarray, ends: np.ndarray) -> tuple[Callable, float, float, float]:
-    """The work with the loosest tolerance that is as accurate as some ends; their error, the tolerance, its own."""
-    equations = peers.heyoka_equations(system)
-    some = x0s[:SAMPLE]
-    exact = peers.heyoka_batches_of(equations, EXACT, some, T_END)()
-
-    def error(found: np.ndarray) -> float:
-        return float((np.abs(found[:SAMPLE] - exact).max(axis=1) / np.abs(exact).max(axis=1)).max())
-
-    wanted = error(ends)
-    for tolerance in (t for t in TOLERANCES if t < 1e4 * wanted):
-        reached = error(peers.heyoka_batches_of(equations, tolerance, some, T_END)())
-        if reached <= wanted:
-            return peers.heyoka_batches_of(equations, tolerance, x0s, T_END), wanted, tolerance, reached
-    raise RuntimeError(f"no tolerance reaches an error of {wanted:.1e}")
+def _heyoka(system: lt.System, some: np.ndarray) -> tuple[Callable, np.ndarray]:
+    """What makes a work of a tolerance and states, and where some states end."""
+    build = functools.partial(peers.heyoka_batches_of, peers.heyoka_equations(system), t_end=T_END)
+    return build, build(EXACT, some)()

@@ -140,7 +140,7 @@ def ensemble(
 
     def take(engine: str, tally: Tally) -> None:
         if pacing is not None:
-            many = Many(family, method, pacing, event, record, stops, tally)
+            many = Many(family, method, pacing, record, stops, tally)
             (many.run_compiled if engine == "compiled" else many.run_array)()
         else:
             (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)

@@ -15,7 +15,6 @@ from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
 from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads, in_whole_vectors
-from .events import Event
 from .family import Family
 from .record import Record
 
@@ -34,18 +33,14 @@ class Many:
     family : Family
     method : OneStepMethod
     pacing : Pacing
-    event : Event, optional
     record : Record
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
     tally : Tally
     """
 
-    def __init__(
-        self, family: Family, method: OneStepMethod, pacing: Pacing, event, record: Record, stops, tally: Tally
-    ):
+    def __init__(self, family: Family, method: OneStepMethod, pacing: Pacing, record: Record, stops, tally: Tally):
         self.family, self.method, self.pacing, self.record, self.tally = family, method, pacing, record, tally
-        self.event: Event | None = event
         self.interrupted = False
         self.stops = stops[stops > record.course.start]
 

@@ -64,6 +64,6 @@ def arrays_of(tree: eqx.Module) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
 
 
-def numbers_of(tree: eqx.Module) -> np.ndarray:
-    """The parameters of a system, a method or a pacing, shape (p,)."""
-    return np.concatenate([np.zeros(0), *(array.ravel() for array in arrays_of(tree))])
+def numbers_of(*trees: eqx.Module) -> np.ndarray:
+    """The parameters of systems, methods or pacings, one after another, shape (p,)."""
+    return np.concatenate([np.zeros(0), *(array.ravel() for tree in trees for array in arrays_of(tree))])

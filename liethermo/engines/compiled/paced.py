@@ -156,6 +156,6 @@ def lane_pace(
     system: System, method: OneStepMethod, pacing: Pacing, x, t: float, stop: float, length: float
 ) -> LanePaces:
     """One trajectory, a block by itself."""
-    parameters = np.concatenate([numbers_of(system), numbers_of(method)])
+    parameters = numbers_of(system, method)
     stepper, whole = paced_stepper_of(Form.of(system), parameters, method, pacing)
     return LanePaces(stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)

@@ -405,5 +405,5 @@ def remembered_stepper(key: tuple, make: Callable[[], Any]) -> Any:
 @remembered
 def stepper_for(system: System, method: OneStepMethod, rules: Rules = RULES) -> tuple[Stepper, np.ndarray]:
     """The stepper for one trajectory of a system, and the parameters of both."""
-    parameters = np.concatenate([numbers_of(system), numbers_of(method)])
+    parameters = numbers_of(system, method)
     return stepper_of(Form.of(system), parameters, method, rules=rules), parameters
