@@ -6,6 +6,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --no-deps
 
+# Extras with a lock of their own, of what they need beside requirements.lock.
+LOCKS := studies test docs bench
+
 # Held back where a newer release refuses an early 3.11.
 LOCK_CONSTRAINTS := soupsieve<3
 
@@ -22,10 +25,10 @@ help:
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
 	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/reference/benchmarks.md"
 	@echo "make format     format the code and repair what the linter can"
-	@echo "make lock       choose new exact versions for both locks (needs Python 3.11)"
+	@echo "make lock       choose new exact versions for all locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
 	@echo
-	@echo "Each sets up .venv by itself. Another interpreter: make test PYTHON=python3.12"
+	@echo "Each sets up .venv by itself, with what it needs. Another interpreter: make test PYTHON=python3.12"
 
 # Each stamp is written last, so a set-up that was interrupted starts again.
 .venv: .venv/installed
@@ -41,26 +44,28 @@ help:
 	$(PIP_INSTALL) --no-build-isolation -e .
 	@touch $@
 
-.venv/bench: .venv/installed requirements-bench.lock
-	$(PIP_INSTALL) -r requirements-bench.lock
+# .venv/studies, .venv/test, .venv/docs, .venv/bench: what one of them needs beside what a run needs.
+.venv/%: requirements-%.lock .venv/installed
+	$(PIP_INSTALL) -r $<
 	@touch $@
 
 comma := ,
+space := $(subst ,, )
 
 demo: .venv
 	$(BIN)/liethermo run examples/relaxed_rigid_body.toml --out demo_output
 
-test: .venv
+test: .venv/test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-test-slow: .venv
+test-slow: .venv/test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
-docs: .venv
+docs: .venv/docs
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
 docs-check: docs
@@ -77,30 +82,35 @@ wheel: .venv
 	venv/bin/liethermo --version; \
 	venv/bin/liethermo run relaxed_rigid_body.toml --out out
 
-bench: .venv .venv/bench
+bench: .venv/bench
 	$(BIN)/python -m benchmarks --page docs/reference/benchmarks.md
 
-format: .venv
+format: .venv/test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# One resolution of everything, from which each lock takes its part.
 lock:
 	$(call require,[:2] == (3$(comma) 11),The lock is made with Python 3.11$(comma) the oldest one supported: make lock PYTHON=python3.11)
 	@set -e; folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
-	"$(PYTHON)" -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; print(*p["dependencies"], *e["test"], *e["docs"], *e["studies"], "setuptools", "wheel", sep="\n")' > "$$folder/wanted"; \
-	echo "$(LOCK_CONSTRAINTS)" > "$$folder/constraints"; \
 	"$(PYTHON)" -m venv "$$folder/venv"; \
-	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check --upgrade -c "$$folder/constraints" -r "$$folder/wanted"; \
-	{ echo "# Exact versions of everything that the library, its tests and its documentation need."; \
+	needed() { \
+	  "$$folder/venv/bin/python" -m pip install --disable-pip-version-check -q --dry-run --ignore-installed \
+	    --report "$$folder/report" -c "$$folder/constraints" "$$@" setuptools wheel; \
+	  "$(PYTHON)" -c 'import json, sys; found = ["{name}=={version}".format_map(p["metadata"]) for p in json.load(open(sys.argv[1]))["install"]]; print(*sorted((p for p in found if not p.startswith("liethermo==")), key=str.lower), sep="\n")' "$$folder/report"; }; \
+	headed() { \
+	  echo "# Exact versions of what $$1."; \
 	  echo "# Written from pyproject.toml by 'make lock'; not edited by hand."; \
-	  "$$folder/venv/bin/python" -m pip freeze --all --exclude pip; } > "$$folder/lock"; \
-	"$(PYTHON)" -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' > "$$folder/peers"; \
-	"$$folder/venv/bin/python" -m pip install --disable-pip-version-check -c "$$folder/lock" -r "$$folder/peers"; \
-	{ echo "# Exact versions of what the benchmarks need beside requirements.lock."; \
-	  echo "# Written from pyproject.toml by 'make lock'; not edited by hand."; \
-	  "$$folder/venv/bin/python" -m pip freeze --all --exclude pip | grep -vxFf "$$folder/lock"; } > "$$folder/lock-bench"; \
-	cp "$$folder/lock" requirements.lock; \
-	cp "$$folder/lock-bench" requirements-bench.lock
+	  cat; }; \
+	echo "$(LOCK_CONSTRAINTS)" > "$$folder/constraints"; \
+	needed ".[$(subst $(space),$(comma),$(LOCKS))]" > "$$folder/all"; \
+	cp "$$folder/all" "$$folder/constraints"; \
+	needed . > "$$folder/run"; \
+	for extra in $(LOCKS); do \
+	  needed ".[$$extra]" > "$$folder/$$extra"; \
+	  grep -vxFf "$$folder/run" "$$folder/$$extra" | headed "the extra '$$extra' needs beside requirements.lock" > "requirements-$$extra.lock"; \
+	done; \
+	headed "a run of the library needs" < "$$folder/run" > requirements.lock
 
 clean:
 	rm -rf .venv build dist *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/reference/generated

@@ -57,6 +57,33 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker("slow")
 
 
+COMPILED_BY_READING = 10
+"""Programs that reading one module of tests may compile: constants and one small system. The most seen is 8."""
+
+_compiled: list[str] = []
+
+
+@jax.monitoring.register_event_duration_secs_listener
+def _count(event, *_, **__):
+    if event == "/jax/core/compile/backend_compile_duration":
+        _compiled.append(event)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_make_collect_report(collector):
+    """Every worker reads every module: what a module builds when it is read costs all of them, for any selection."""
+    before = len(_compiled)
+    outcome = yield
+    count = len(_compiled) - before
+    if isinstance(collector, pytest.Module) and count > COMPILED_BY_READING:
+        report = outcome.get_result()
+        report.outcome = "failed"
+        report.longrepr = (
+            f"{collector.nodeid} compiles {count} programs when it is read, more than {COMPILED_BY_READING}: "
+            "build systems where they are used (tests.cases.BuiltOnUse, functools.cache)"
+        )
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _own_cache(tmp_path_factory):
     """Compiled modules of this test run, for all its processes."""

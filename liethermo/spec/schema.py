@@ -77,7 +77,7 @@ class AdaptiveStep(Section):
 class Until(Section):
     """Where a run ends before its time."""
 
-    relaxed: FiniteFloat = Field(gt=0, description="the entropy production below which the run ends: `lt.Relaxed(tol)`")
+    relaxed: FiniteFloat = Field(gt=0, description="the rate of relaxation below which the run ends: `lt.Relaxed(tol)`")
 
 
 def _kind(value: Any) -> str:
@@ -159,7 +159,7 @@ class MeasureOfFile(Section):
     """A measure with a parameter."""
 
     relaxed: FiniteFloat | None = Field(
-        None, gt=0, description="the time at which the entropy production falls below this, where the run ends"
+        None, gt=0, description="the time of relaxation to a rate below this, where the run ends: `lt.Relaxed(tol)`"
     )
     at: list[FiniteFloat] | None = Field(None, min_length=1, description="values at these times")
     what: str = Field("x", description="of which series: x, energy, entropy or attitude")

@@ -1,5 +1,6 @@
 """Each addition goes through the suite of its kind in one call, and runs."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,22 @@ from tests.additions.integrator import Simpson
 from tests.additions.space import Ring
 from tests.additions.system import LotkaVolterra
 
-PREY = LotkaVolterra([[0.0, -1.0, 0.5], [1.0, 0.0, -0.8], [-0.5, 0.8, 0.0]], [1.0, 1.2, 0.9])
 START = [1.5, 0.7, 1.0]
-RING = lt.MetriplecticSystem(
-    None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, lt.ProjectedMetric(normalized=True), space=Ring()
-)
+
+
+@functools.cache
+def prey():
+    return LotkaVolterra([[0.0, -1.0, 0.5], [1.0, 0.0, -0.8], [-0.5, 0.8, 0.0]], [1.0, 1.2, 0.9])
+
+
+@functools.cache
+def on_the_ring():
+    friction = lt.ProjectedMetric(normalized=True)
+    return lt.MetriplecticSystem(None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, friction, space=Ring())
+
+
+def moved_on_the_ring(method):
+    return lt.integrate(on_the_ring(), Ring().random(0), (0.0, 2.0), 0.1, method)
 
 
 def test_the_algebra():
@@ -36,10 +48,10 @@ def test_the_group():
 
 
 def test_the_space():
-    run = lt.integrate(RING, RING.space.random(0), (0.0, 2.0), 0.1, lt.MetriplecticMidpoint())
+    run = moved_on_the_ring(lt.MetriplecticMidpoint())
     assert np.ptp(run.energy) < 1e-14
     assert run.entropy[-1] > run.entropy[0]
-    assert RING.space.belongs(run.x).all()
+    assert Ring().belongs(run.x).all()
 
 
 def test_the_dissipation():
@@ -58,10 +70,10 @@ def test_the_integrator():
     [
         lambda: mf.testing.check_group(AFFINE),
         lambda: mf.testing.check_space(Ring()),
-        lambda: lt.integrate(RING, RING.space.random(0), (0.0, 2.0), 0.1, lt.MetriplecticRungeKutta(4)).audit(),
+        lambda: moved_on_the_ring(lt.MetriplecticRungeKutta(4)).audit(),
         lambda: lt.testing.check_dissipation(Steep(0.2), mf.so(3)),
         lambda: lt.testing.check_method(Simpson()),
-        lambda: lt.testing.check_system(PREY, START),
+        lambda: lt.testing.check_system(prey(), START),
     ],
     ids=["group", "space", "motion in it", "dissipation", "integrator", "system"],
 )
@@ -70,10 +82,10 @@ def test_each_in_the_suite_of_its_kind(suite):
 
 
 def test_the_system():
-    run = lt.integrate(PREY, START, (0.0, 20.0), 0.1, lt.MetriplecticRungeKutta(6))
+    run = lt.integrate(prey(), START, (0.0, 20.0), 0.1, lt.MetriplecticRungeKutta(6))
     assert run.audit().passed
     with pytest.raises(lt.InputError, match="no members"):
-        lt.integrate(PREY, [1.0, -1.0, 1.0], (0.0, 1.0), 0.1)
+        lt.integrate(prey(), [1.0, -1.0, 1.0], (0.0, 1.0), 0.1)
 
 
 def test_what_an_addition_costs():

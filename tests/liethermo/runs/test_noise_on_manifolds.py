@@ -1,5 +1,7 @@
 """Noise on manifolds: points of them, exact energy on every path, and the measure with the volume of each space."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import manifolds as mf
 from liethermo.testing import check_equilibrium
 from tests.additions.group import AFFINE
 from tests.additions.space import Ring
+from tests.cases import BuiltOnUse
 
 SPHERE, T = mf.Sphere(2), 0.8
 BATH, NOISE = lt.Fluctuations(1.0, seed=1, temperature=T), lt.Fluctuations(1.0, seed=1)
@@ -39,17 +42,25 @@ def on_level(dissipation):
     return lt.MetriplecticSystem(None, level, tilted, dissipation, space=SPHERE)
 
 
-ON_LEVEL = on_level(lt.ProjectedMetric(normalized=True, rate=0.5))
-SPIN = damped(SPHERE, field, lt.DoubleBracket(0.5), spins)
+@functools.cache
+def held():
+    return on_level(lt.ProjectedMetric(normalized=True, rate=0.5))
+
+
+@functools.cache
+def spin():
+    return damped(SPHERE, field, lt.DoubleBracket(0.5), spins)
+
+
 START = np.array([0.6, 0.0, 0.8])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "noise"), [(SPIN, BATH), (ON_LEVEL, NOISE)], ids=["bath", "level"])
+@pytest.mark.parametrize(("system", "noise"), [(spin, BATH), (held, NOISE)], ids=["bath", "level"])
 def test_paths_stay_on_the_space_and_on_their_level(system, noise):
     """By both engines the same."""
     array, compiled = (
-        lt.integrate(system, START, (0.0, 5.02), 0.05, noise=noise, engine=e) for e in ("array", "compiled")
+        lt.integrate(system(), START, (0.0, 5.02), 0.05, noise=noise, engine=e) for e in ("array", "compiled")
     )
     assert np.abs(array.x - compiled.x).max() < 1e-12
     assert np.abs(np.diff(array.x, axis=0)).max() > 0.1
@@ -62,20 +73,20 @@ def test_paths_stay_on_the_space_and_on_their_level(system, noise):
 
 
 def test_ensembles_take_the_paths_of_single_runs():
-    many = lt.ensemble(SPIN, np.tile(START, (5, 1)), (0.0, 1.0), 0.05, noise=BATH)
-    one = lt.integrate(SPIN, START, (0.0, 1.0), 0.05, noise=BATH.of(3))
+    many = lt.ensemble(spin(), np.tile(START, (5, 1)), (0.0, 1.0), 0.05, noise=BATH)
+    one = lt.integrate(spin(), START, (0.0, 1.0), 0.05, noise=BATH.of(3))
     assert np.abs(one.x[-1] - many.x[3]).max() < 1e-13
     assert len({x.tobytes() for x in many.x}) == 5
 
 
 def test_no_noise_is_the_run_without_to_the_bit():
-    arguments = SPIN, START, (0.0, 2.0), 0.05
+    arguments = spin(), START, (0.0, 2.0), 0.05
     quiet = lt.integrate(*arguments, noise=lt.Fluctuations(0.0), engine="compiled")
     assert np.array_equal(quiet.x, lt.integrate(*arguments, method=lt.MetriplecticMidpoint(), engine="compiled").x)
 
 
 def test_noise_and_motion_are_checked():
-    report = BATH.check(SPIN)
+    report = BATH.check(spin())
     assert report.passed
     assert "no: what the states tend to" not in str(report)
     shrinking = damped(SPHERE, field, poisson=lambda x: (1.0 + 0.5 * x[0]) * spins(x))  # a Poisson tensor too
@@ -183,18 +194,20 @@ def _pair(x):
     return x[3] ** 2 * (1.0 + 0.5 * x[2]) - x[2]
 
 
-CASES = {
-    "spin": (SPIN, BATH, spin_states, START),
-    "rotations": (damped(mf.SpecialOrthogonal(3), lambda R: -jnp.sum(A * R)), BATH, rotations, np.eye(3)),
-    "frames": (damped(mf.Stiefel(3, 2), lambda R: -jnp.sum(A[:, :2] * R)), BATH, frames, np.eye(3)[:, :2]),
-    "hyperbolic": (damped(mf.Hyperbolic(2), _hyperbolic), BATH, hyperbolic_points, [1.0, 0.0, 0.0]),
-    "definite": (damped(mf.SPD(2), lambda x: _definite(x.ravel())), BATH, definite_matrices, np.eye(2)),
-    "affine": (damped(mf.GroupSpace(AFFINE), lambda x: _affine(x.ravel())), BATH, affine_maps, np.eye(2)),
-    "ring": (damped(Ring(), _ring), BATH, ring_points, None),
-    "product": (damped(PAIR, _pair), BATH, pairs, [0.6, 0.0, 0.8, 0.0]),
-    "level": (ON_LEVEL, NOISE, states_near_the_level, START),
-    "level, not normalised": (on_level(lt.ProjectedMetric(rate=0.1)), NOISE, states_near_the_level, START),
-}
+CASES = BuiltOnUse(
+    {
+        "spin": lambda: (spin(), BATH, spin_states, START),
+        "rotations": lambda: (damped(mf.SpecialOrthogonal(3), lambda R: -jnp.sum(A * R)), BATH, rotations, np.eye(3)),
+        "frames": lambda: (damped(mf.Stiefel(3, 2), lambda R: -jnp.sum(A[:, :2] * R)), BATH, frames, np.eye(3)[:, :2]),
+        "hyperbolic": lambda: (damped(mf.Hyperbolic(2), _hyperbolic), BATH, hyperbolic_points, [1.0, 0.0, 0.0]),
+        "definite": lambda: (damped(mf.SPD(2), lambda x: _definite(x.ravel())), BATH, definite_matrices, np.eye(2)),
+        "affine": lambda: (damped(mf.GroupSpace(AFFINE), lambda x: _affine(x.ravel())), BATH, affine_maps, np.eye(2)),
+        "ring": lambda: (damped(Ring(), _ring), BATH, ring_points, None),
+        "product": lambda: (damped(PAIR, _pair), BATH, pairs, [0.6, 0.0, 0.8, 0.0]),
+        "level": lambda: (held(), NOISE, states_near_the_level, START),
+        "level, not normalised": lambda: (on_level(lt.ProjectedMetric(rate=0.1)), NOISE, states_near_the_level, START),
+    }
+)
 
 
 @pytest.mark.sampled("spin")
@@ -212,6 +225,6 @@ def test_equilibria_with_the_volume_of_the_space(name):
 
 @pytest.mark.slow
 def test_the_energy_is_exact_on_a_thousand_paths_of_ten_thousand_steps():
-    many = lt.ensemble(ON_LEVEL, np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
+    many = lt.ensemble(held(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
     assert many.ok.all()
     assert many.energy_drift.max() < 1e-13

@@ -12,6 +12,7 @@ import scipy.sparse
 import liethermo as lt
 import manifolds as mf
 from liethermo.models.spins import single_spin_solution, spin_wave_frequency
+from tests.cases import BuiltOnUse
 
 SITES = (3, 4)
 COUNT = 12
@@ -57,40 +58,51 @@ def turned(a, b, D):
 
 
 mag = lt.magnetism
-ENERGIES = {
-    "exchange": (
-        mag.exchange(SITES, 0.7),
-        lambda s: over_pairs(s, NEAREST, (True, True), lambda site, a, b: -0.7 * a @ b),
-    ),
-    "open, of each pair": (
-        mag.exchange(SITES, JS, periodic=(False, True)),
-        lambda s: over_pairs(s, NEAREST, (False, True), lambda site, a, b: -JS[site] * (a @ b)),
-    ),
-    "diagonal neighbours": (
-        mag.exchange(SITES, [JS, 2.0 * JS], neighbours=[(1, -1), (0, 2)]),
-        lambda s: (
-            over_pairs(s, [(1, -1)], (True, True), lambda site, a, b: -JS[site] * (a @ b))
-            + over_pairs(s, [(0, 2)], (True, True), lambda site, a, b: -2.0 * JS[site] * (a @ b))
+ENERGIES = BuiltOnUse(
+    {
+        "exchange": lambda: (
+            mag.exchange(SITES, 0.7),
+            lambda s: over_pairs(s, NEAREST, (True, True), lambda site, a, b: -0.7 * a @ b),
         ),
-    ),
-    "matrix": (mag.exchange(COUNT, MATRIX + MATRIX.T), lambda s: on_edges(s, EDGES, aligned)),
-    "sparse": (mag.exchange(COUNT, scipy.sparse.csr_array(MATRIX + MATRIX.T)), lambda s: on_edges(s, EDGES, aligned)),
-    "edges": (mag.exchange(SITES, EDGES), lambda s: on_edges(s, EDGES, aligned)),
-    "DMI": (
-        mag.dzyaloshinskii_moriya(SITES, DS, periodic=False),
-        lambda s: over_pairs(s, NEAREST, (False, False), lambda site, a, b: turned(a, b, DS[site])),
-    ),
-    "DMI on edges": (mag.dzyaloshinskii_moriya(SITES, VECTORS), lambda s: on_edges(s, VECTORS, turned)),
-    "anisotropy": (
-        mag.anisotropy(SITES, JS, DS),
-        lambda s: -jnp.sum(JS * jnp.sum(DS * s, axis=-1) ** 2),
-    ),
-    "along axes": (
-        mag.anisotropy(SITES, JS, (0.0, 2.0, 0.0)),
-        lambda s: -jnp.sum(JS * (2.0 * s[..., 1]) ** 2),
-    ),
-    "Zeeman": (mag.zeeman(SITES, (0.1, 0.2, 0.3), JS), lambda s: -jnp.sum(JS * (s @ jnp.array([0.1, 0.2, 0.3])))),
-}
+        "open, of each pair": lambda: (
+            mag.exchange(SITES, JS, periodic=(False, True)),
+            lambda s: over_pairs(s, NEAREST, (False, True), lambda site, a, b: -JS[site] * (a @ b)),
+        ),
+        "diagonal neighbours": lambda: (
+            mag.exchange(SITES, [JS, 2.0 * JS], neighbours=[(1, -1), (0, 2)]),
+            lambda s: (
+                over_pairs(s, [(1, -1)], (True, True), lambda site, a, b: -JS[site] * (a @ b))
+                + over_pairs(s, [(0, 2)], (True, True), lambda site, a, b: -2.0 * JS[site] * (a @ b))
+            ),
+        ),
+        "matrix": lambda: (mag.exchange(COUNT, MATRIX + MATRIX.T), lambda s: on_edges(s, EDGES, aligned)),
+        "sparse": lambda: (
+            mag.exchange(COUNT, scipy.sparse.csr_array(MATRIX + MATRIX.T)),
+            lambda s: on_edges(s, EDGES, aligned),
+        ),
+        "edges": lambda: (mag.exchange(SITES, EDGES), lambda s: on_edges(s, EDGES, aligned)),
+        "DMI": lambda: (
+            mag.dzyaloshinskii_moriya(SITES, DS, periodic=False),
+            lambda s: over_pairs(s, NEAREST, (False, False), lambda site, a, b: turned(a, b, DS[site])),
+        ),
+        "DMI on edges": lambda: (
+            mag.dzyaloshinskii_moriya(SITES, VECTORS),
+            lambda s: on_edges(s, VECTORS, turned),
+        ),
+        "anisotropy": lambda: (
+            mag.anisotropy(SITES, JS, DS),
+            lambda s: -jnp.sum(JS * jnp.sum(DS * s, axis=-1) ** 2),
+        ),
+        "along axes": lambda: (
+            mag.anisotropy(SITES, JS, (0.0, 2.0, 0.0)),
+            lambda s: -jnp.sum(JS * (2.0 * s[..., 1]) ** 2),
+        ),
+        "Zeeman": lambda: (
+            mag.zeeman(SITES, (0.1, 0.2, 0.3), JS),
+            lambda s: -jnp.sum(JS * (s @ jnp.array([0.1, 0.2, 0.3]))),
+        ),
+    }
+)
 
 
 @pytest.mark.sampled(2)
