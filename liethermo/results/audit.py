@@ -58,14 +58,14 @@ class Tolerances:
     entropy : float
         Fall of the entropy in one step: four roundings of the state.
     casimirs : float
-        Drift of the functions that the system conserves; and the fall of the entropy in all.
+        Drift of the functions that the system conserves, and of the momentum in space; the fall of the entropy in all.
     residual : float
         Of the stage equations: their rounding plateau.
     attitude : float
         Distance from the group, relative to the size of the attitude, as ``manifolds.MatrixGroup.belongs`` has it.
     accuracy : float
-        Estimated local error of a step relative to the distance that it goes (or to a hundredth of the whole motion,
-        where that is more): a second-order method has 0.05 where it takes eight steps to a period.
+        Local error of a step, measured against short ones, relative to the distance that it goes (or to a hundredth
+        of the whole motion, where that is more): a second-order method has 0.05 where it takes eight steps to a period.
     consistency : float
         How far the slope of a step is from the vector field, relative to that, as the step gets shorter.
     """
@@ -133,8 +133,12 @@ class Audit:
         Whether the laws hold along the motion of the system. How accurate the steps are is another question: see
         ``verdict``, and ``resolved``.
     resolved : bool or None
-        Whether the steps resolve the motion; None where the method has no estimate of its error.
+        Whether the steps that were looked at resolve the motion: whether the worst of them, measured against short
+        ones, is within the tolerance ``accuracy``. It is about each step by itself, not about what errors add up to.
+        None where nothing is known of the steps.
     rows : tuple of AuditRow
+    coverage : str
+        How many of the steps were looked at for that, where it was not all; the verdict says it too.
     """
 
     energy_drift: float
@@ -142,6 +146,7 @@ class Audit:
     casimir_drift: float
     worst_residual: float
     rows: tuple[AuditRow, ...]
+    coverage: str = ""
 
     @property
     def passed(self) -> bool:
@@ -164,7 +169,7 @@ class Audit:
         if self.resolved is None:
             return "the laws hold"
         if self.resolved:
-            return "the laws hold, and the steps resolve the motion"
+            return f"the laws hold, and the steps resolve the motion{self.coverage and f' ({self.coverage})'}"
         return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __str__(self) -> str:
@@ -205,7 +210,10 @@ class Rounding:
 
     def allowed(self, tolerance: float) -> Any:
         """The largest change accepted, relative to the size."""
-        return (tolerance * self.sensitivity + VALUE * np.maximum(np.abs(self.value), self.terms)) / self.size
+        parts = self.sensitivity, np.maximum(np.abs(self.value), self.terms)
+        with np.errstate(invalid="ignore"):  # of what has overflowed all is as large as the size
+            shares = (np.where(np.isinf(self.size), 1.0, part / self.size) for part in parts)
+            return sum(share * allowed for share, allowed in zip(shares, (tolerance, VALUE), strict=True))
 
 
 def audit(solution: Record, tolerances: Tolerances) -> Audit:
@@ -244,7 +252,8 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED))
         else:
-            rows.append(AuditRow(f"change of {name}", change, None, None, "not a constant of this system"))
+            note = UNKNOWN if name in laws.unknown else "not a constant of this system"
+            rows.append(AuditRow(f"change of {name}", change, None, None, note))
     for name in laws.ledger:
         series = solution.casimirs[name]
         rows.append(
@@ -253,14 +262,29 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
     if stats.attitude_residual is not None:
         rows.append(_verdict("attitude in group", stats.attitude_residual, tolerances.attitude))
+    if stats.spatial_momentum_change is not None:
+        rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
     rows += _of_the_steps(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     failed = not status.ok and status.code != Code.INTERRUPTED.text
     rows.append(
         AuditRow(TAKEN, float(stats.steps), None, False if failed else None, "" if status.ok else str(status.code))
     )
-    return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows))
+    coverage = coverage_of(evidence, stats.steps)
+    return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows), coverage)
 
+
+def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:
+    """The momentum in space is a constant where no torque acts from outside."""
+    name = "momentum in space"
+    if name in laws.conserved:
+        return _verdict(f"drift of {name}", change, tolerances.casimirs)
+    if name in laws.unpromised:
+        return AuditRow(f"drift of {name}", change, None, None, UNPROMISED)
+    return AuditRow(f"change of {name}", change, None, None, "a torque acts: not a constant of this system")
+
+
+UNKNOWN = "whether this is a constant of this system is not known: it could be evaluated at no point that was tried"
 
 UNPROMISED = "a constant of this system, which the method does not promise to keep exactly"
 
@@ -302,6 +326,12 @@ def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     row = _verdict(ACCURACY, evidence.local_error, tolerances.accuracy)
     where = f"local error of a step, of the distance it goes; worst at t = {evidence.error_time:.4g}"
     return replace(row, note=where if row.passed else f"the steps do not resolve the motion: try suggest_step; {where}")
+
+
+def coverage_of(evidence: Evidence, steps: int) -> str:
+    """How many of the steps were looked at, where it was not all of them."""
+    looked = evidence.looked
+    return "" if looked is None or looked >= steps else f"looked at: {looked:,} steps of {steps:,}"
 
 
 def _rounding(series: np.ndarray, sensitivity: float | None, terms: float | None) -> Rounding:

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,13 +20,14 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.interpret import at_points
 from ..tracing.scalarize import UnsupportedPrimitive
+from .looking import Steps, field_at, looked_at, misfit
 
 MEASURED = 256
 """States of a run at which the sensitivities of its functions are evaluated."""
 
 STEPS_AGAIN, STATE_NUMBERS = 32, 2_000
-"""Steps that are taken again for their local errors; fewer of large systems, so that their states have no more numbers
-than the second together, but four at least."""
+"""Steps that are taken again for their local errors, each as a whole and in as many parts; fewer of large systems, so
+that their states have no more numbers than the second together, but four at least."""
 
 PLACES, RUNGS = 3, 7
 """States at which short steps are compared with the vector field, and how many, each an eighth of the one before."""
@@ -37,6 +38,11 @@ SHORT = 1e-3
 WHOLE = 0.01
 """Fraction of the whole motion below which the distance of a step does not count: a body that has come to rest may take
 long steps."""
+
+ROUNDED = 1e-10
+"""Slope of a step that rounding may have left of none, relative to the state over the step."""
+
+TINY = float(np.finfo(float).tiny)
 
 STILL = 1e-12
 """A step that moves the state by less, relative to its size, tells nothing: what it does is rounding."""
@@ -56,10 +62,13 @@ class Evidence:
         Largest size at which the value of ``"energy"``, of ``"entropy"`` and of the others is rounded along the run:
         that of the largest terms inside, which may cancel in the value.
     local_error : float or None
-        Largest estimated local error of a step, relative to the distance that it goes, or to a hundredth of the whole
-        motion where that is more; None where the method has no estimate or nothing moves.
+        Largest local error of a step, measured: the step against short ones in its place, relative to the distance that
+        it goes, or to a hundredth of the whole motion where that is more; None where nothing moves.
     error_time : float or None
         Where it is that large.
+    looked : int or None
+        Steps that were looked at for it: each was compared with the vector field at its ends and at places between, and
+        the worst were taken again.
     inconsistency : float or None
         Largest distance between the slope of a step and the vector field, relative to the field, that is left as the
         step gets shorter.
@@ -71,7 +80,20 @@ class Evidence:
     terms: Mapping[str, float] = field(default_factory=dict)
     local_error: float | None = None
     error_time: float | None = None
+    looked: int | None = None
     inconsistency: float | None = None
+
+
+class Replay(Protocol):
+    """Takes steps again."""
+
+    def __call__(self, x: np.ndarray, h: float, steps: int = 1) -> Any:
+        """The state of the engine after so many steps of size h from x."""
+        ...
+
+    def path(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
+        """The states after each of them, shape (steps, n); fewer where one cannot be taken."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +107,10 @@ class Witness:
     functions : dict of Energy
         The recorded ones beside energy and entropy.
     x : ndarray, shape (m, n)
-        Some states, in their order.
+        The states that are kept.
     t, h : ndarray, shape (m,) and at most (m,)
         Their times, and the steps that the run took from them.
-    again : function of (x, h) to the state of the engine after one step
+    again : Replay
     """
 
     system: System
@@ -97,7 +119,7 @@ class Witness:
     x: np.ndarray
     t: np.ndarray
     h: np.ndarray
-    again: Callable
+    again: Replay
 
     def __call__(self) -> Evidence:
         return self._found
@@ -106,83 +128,145 @@ class Witness:
     def _found(self) -> Evidence:
         functions = [*laws_functions(self.system), *self.functions.values()]
         names = [*("energy", "entropy")[: len(functions) - len(self.functions)], *self.functions]
-        sensitivities, terms = at_points(sizes, tuple(functions), self.x)
+        some = self.x[spread(len(self.x), MEASURED)]
+        sensitivities, terms = at_points(sizes, tuple(functions), some)
         own = dict(zip(names, _largest(sensitivities), strict=True))
         energy, entropy = own.pop("energy"), own.pop("entropy", None)
         found = Evidence(energy, entropy, own, dict(zip(names, _largest(terms), strict=True)))
         if not isinstance(self.method, OneStepMethod) or self.method.increments:  # noise is what a short step shows
             return found
-        number = min(STEPS_AGAIN, max(4, STATE_NUMBERS // self.x.shape[1]))
-        tried = (self._step(i, self.h[i]) for i in spread(len(self.h), number))
-        steps = [step for step in tried if step is not None and step.length > STILL * np.abs(step.x).max()]
+        count = len(self.h)
+        if not count:
+            return found
+        places = np.asarray(self.system.points(some)).reshape(len(some), -1)
+        whole = WHOLE * float(np.ptp(places, axis=0).max())
+        looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
+        again, missed = self._worst(looked, whole)
+        tried = [self._step(looked.x[i], looked.h[i], looked.t[i]) for i in again]
+        steps = [step for step in tried if step is not None and step.length > STILL]
         if not steps:  # nothing moves
             return found
         found = dataclasses.replace(found, inconsistency=self._inconsistency(steps))
-        steps = [step for step in steps if step.moved > STILL * np.abs(step.x).max()]
-        if not steps or not has_estimate(self.method):
+        told = [step is None or step.moved > STILL * step.size for step in tried]
+        if not any(told):
             return found
-        places = np.asarray(self.system.points(self.x)).reshape(len(self.x), -1)
-        whole = WHOLE * float(np.ptp(places, axis=0).max())
-        at = np.array([np.concatenate([step.x, [step.h], step.k.ravel()]) for step in steps])
-        errors = at_points(_local_errors, (self.system, self.method), at) / [max(step.moved, whole) for step in steps]
-        worst = int(np.argmax(np.nan_to_num(errors)))
+        errors = np.array([self._local_error(*step, whole) for step in zip(tried, told, strict=True)])
+        errors = np.where(np.isfinite(errors), errors, missed)  # nothing better is known
+        worst = int(np.argmax(errors))
         return dataclasses.replace(
-            found, local_error=float(errors[worst]), error_time=float(self.t[steps[worst].place])
+            found, local_error=float(errors[worst]), error_time=float(looked.t[again[worst]]), looked=len(looked.h)
         )
+
+    def _worst(self, steps: Steps, whole: float) -> tuple[np.ndarray, np.ndarray]:
+
+        def field(at: np.ndarray, x: np.ndarray) -> np.ndarray:
+            return field_at(self.system, x.reshape(-1, x.shape[-1])).reshape(x.shape)
+
+        return worst_of(steps, field, whole, taken_again(self.system.dim))
+
+    def _local_error(self, step: _Step | None, told: bool, whole: float) -> float:
+        """How far from the end of a step the short ones in its place end; NaN where they cannot be taken."""
+        if step is None or not told:
+            return np.nan if step is None else 0.0
+        parts = taken_again(self.system.dim)
+        short = self._step(step.x, step.h / parts, step.t, parts)
+        if short is None:
+            return np.nan
+        ends = np.asarray(self.system.points(np.stack([step.x + step.d, step.x + short.d])))
+        return float(np.abs(ends[1] - ends[0]).max()) / max(step.moved, whole)
 
     def _inconsistency(self, steps: list[_Step]) -> float | None:
         """The largest over a few states of what short steps miss of the field: the least over the steps from one."""
-        fastest = max(step.length / step.h for step in steps)
+        blocks, fastest = self.system.blocks, max(step.length / step.h for step in steps)
         moving = [step for step in steps if step.length > 1e-6 * fastest * step.h]
         short: list[list[_Step]] = []
         for i in spread(len(moving), PLACES):
-            size, speed = np.abs(moving[i].x).max(), moving[i].length / moving[i].h
-            first = min(moving[i].h, SHORT * size / speed) if size > 0.0 else moving[i].h
-            tried = (self._step(moving[i].place, first / 8.0**n) for n in range(RUNGS))
+            first = min(moving[i].h, SHORT * moving[i].h / moving[i].length)
+            tried = (self._step(moving[i].x, first / 8.0**n, moving[i].t) for n in range(RUNGS))
             short.append([step for step in tried if step is not None])
         starts = [step.x for steps in short for step in steps]
         ends = [step.x + step.d for steps in short for step in steps]
         if not starts:
             return None
-        found = iter(at_points(_field, self.system, np.array(starts + ends)).reshape(2, len(starts), -1).swapaxes(0, 1))
-        missed = [[_missed(step, *next(found)) for step in steps] for steps in short]
+        found = iter(field_at(self.system, np.array(starts + ends)).reshape(2, len(starts), -1).swapaxes(0, 1))
+        missed = [[_missed(step, blocks, *next(found)) for step in steps] for steps in short]
         return max((np.nanmin(values) for values in missed if np.isfinite(values).any()), default=None)
 
-    def _step(self, place: int, h: float) -> _Step | None:
-        """One step from a state of the run; None where it cannot be taken."""
-        x, points = self.x[place], self.system.points
+    def _step(self, x: np.ndarray, h: float, t: float, steps: int = 1) -> _Step | None:
+        """A step from a state at a time, or so many in its place; None where it cannot be taken."""
+        points = self.system.points
         try:
-            state = self.again(x, float(h))
+            state = self.again(x, float(h), steps)
         except UnsupportedPrimitive:  # Newton's method, where the run went without it
             return None
         if int(state.status) != 0:
             return None
         d = (np.asarray(state.x) - x) + np.asarray(state.low)
-        moved = float(np.abs(np.asarray(points(x + d)) - np.asarray(points(x))).max())
-        return _Step(place, float(h), x, d, np.asarray(state.k), moved)
+        start = np.asarray(points(x))
+        moved = float(np.abs(np.asarray(points(x + d)) - start).max())
+        length = max(_relative(d[block], x[block]) for block in self.system.blocks)
+        return _Step(float(t), float(h), x, d, moved, float(np.abs(start).max()), length)
 
 
 class _Step(NamedTuple):
-    """A step from a state x of the run, which displaces it by d, and what its user sees of it by ``moved``."""
+    """A step from a state x of the run, which displaces it by d, and what its user sees of it, of a size, by ``moved``.
 
-    place: int
+    ``length`` is that of d relative to the state, the largest over its blocks.
+    """
+
+    t: float
     h: float
     x: np.ndarray
     d: np.ndarray
-    k: np.ndarray
     moved: float
-
-    @property
-    def length(self) -> float:
-        return float(np.abs(self.d).max())
+    size: float
+    length: float
 
 
-def _missed(step: _Step, before: np.ndarray, after: np.ndarray) -> float:
-    """How far the slope of a step is from the mean of the field at its ends, relative to that."""
-    mean = 0.5 * (before + after)
-    size = float(np.abs(mean).max())
-    missed = float(np.abs(step.d / step.h - mean).max())
-    return missed / size if size > 0.0 else missed
+def _missed(step: _Step, blocks: tuple[slice, ...], before: np.ndarray, after: np.ndarray) -> float:
+    """How far the slope of a step is from the mean of the field at its ends, relative to that; the worst of the blocks.
+
+    A block that is all but still is measured by what rounding leaves of its slope.
+    """
+    mean, slope = 0.5 * (before + after), step.d / step.h
+    least = [ROUNDED * np.abs(step.x[block]).max() / step.h for block in blocks]
+    return max(
+        _relative(slope[block] - mean[block], mean[block], size) for block, size in zip(blocks, least, strict=True)
+    )
+
+
+def _relative(v: np.ndarray, of: np.ndarray, least: float = 0.0) -> float:
+    size = max(float(np.abs(of).max()), least)
+    length = float(np.abs(v).max())
+    return length / size if size > 0.0 else length
+
+
+def taken_again(dim: int) -> int:
+    """Steps of a system that are taken again, and the parts of each."""
+    return min(STEPS_AGAIN, max(4, STATE_NUMBERS // dim))
+
+
+def worst_of(steps: Steps, field: Callable, whole, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The places of some steps, half of them by how far they miss the field, half evenly spread; and how far they do.
+
+    Parameters
+    ----------
+    field
+        As for :func:`misfit`.
+    whole : float or array, shape (m,)
+        The least distance that what they miss is taken relative to.
+    """
+    moved = np.abs(steps.end - steps.x).max(axis=1)
+    missed = misfit(field, steps) / np.fmax(np.fmax(moved, whole), TINY)
+    chosen = most_and_others(missed, number)
+    return chosen, missed[chosen]
+
+
+def most_and_others(values: np.ndarray, number: int) -> np.ndarray:
+    """The places of some values, in order: half of them the largest, half evenly spread among the others."""
+    order = np.argsort(-values, kind="stable")
+    others = np.sort(order[number // 2 :])
+    return np.sort(np.append(order[: number // 2], others[spread(len(others), number - number // 2)]))
 
 
 def spread(count: int, most: int) -> np.ndarray:
@@ -203,21 +287,6 @@ def sizes(functions: Sequence[Energy], x) -> tuple[jnp.ndarray, jnp.ndarray]:
     """The sensitivities of functions at a state, and the sizes at which their values are rounded."""
     sensitivities = jnp.stack([f.sensitivity(x) for f in functions])
     return sensitivities, jnp.stack([with_rounding(f.value, x)[1] for f in functions])
-
-
-def _field(system: System, x):
-    return system.vector_field(x)
-
-
-def _local_errors(model: tuple[System, OneStepMethod], step):
-    return error_at(*model, step)
-
-
-def error_at(system: System, method: OneStepMethod, step) -> jnp.ndarray:
-    """The method's estimate of the local error of a step: state, size and slopes one after another."""
-    n = system.dim
-    x, h, k = step[:n], step[n], step[n + 1 :].reshape(-1, n)
-    return method.error(system, x, jnp.zeros_like(x), h, k)
 
 
 def has_estimate(method) -> bool:

@@ -9,11 +9,29 @@ from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.rules import RULES
 from ..engines.stepping import State
+from ..results.looking import field_at
 from ..results.status import Stats, Status
+from ..systems import System
 from .adaptive import Adaptive
 
 SHORTER = (2.0, 8.0, 64.0, 1024.0, 16384.0)
 """Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
+
+UNBOUNDED = float(np.finfo(float).max) ** 0.25
+"""Size of a state beyond which a function of the fourth power is no number any more."""
+
+RUSHING = 1e-6
+"""Share of the time since the start in which a state doubles at its speed, below which it goes to infinity in finite
+time."""
+
+SOON, AHEAD, FASTER, TOGETHER = 8.0, 1e6, 10.0, 16
+"""Where a step has failed, in how many times its length shorter ones have to find what growth, at a rate that grows by
+how much, to say the same; how many of them are taken at once."""
+
+GROWN = 10.0
+"""Growth since the start from which anything is said."""
+
+NO_STEP = "No step helps there: does the energy have a lower bound, and do the forces that drive the system end?"
 
 
 def stats_of(state: State) -> Stats:
@@ -31,9 +49,13 @@ def stats_of(state: State) -> Stats:
     )
 
 
-def given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
+def given_up(system: System, x0, outcome, step: Adaptive, span: tuple[float, float], now: float) -> Status:
     """How adaptive steps ended before the end, where none of them failed for good."""
-    steps, residual = int(outcome.state.step), float(outcome.state.residual)
+    (start, end), steps, residual = span, int(outcome.state.step), float(outcome.state.residual)
+    x = np.asarray(outcome.state.x)
+    if outcome.limit != "memory" and (text := runaway(x, x0, field_at(system, x[None])[0], now - start, now)):
+        code = Code.STEP_LIMIT if outcome.limit else Code.STEP_UNDERFLOW
+        return Status(code, f"after {steps} steps {text}", steps, now, residual)
     if outcome.limit == "steps":
         text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
         text += "Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer"
@@ -51,6 +73,57 @@ def given_up(outcome, step: Adaptive, end: float, now: float) -> Status:
     return Status(Code.STEP_UNDERFLOW, text, steps, now, residual)
 
 
+def runaway(x: np.ndarray, x0: np.ndarray, speed: np.ndarray, elapsed: float, now: float) -> str:
+    """What is said of a state that grows without bound: that it does, its size and the time; nothing of others."""
+    size = np.abs(x).max()
+    if size > UNBOUNDED or (size > GROWN * np.abs(x0).max() and _doubles(x, speed, RUSHING * elapsed)):
+        return f"the state grows without bound: |x| = {size:.3g} at t = {now:g}. {NO_STEP}"
+    return ""
+
+
+def _doubles(x: np.ndarray, speed: np.ndarray, time: float) -> bool:
+    """Whether a state goes outwards so fast that it doubles in a time."""
+    size = np.abs(x).max()
+    with np.errstate(all="ignore"):
+        return bool(np.abs(speed).max() * time > size > 0.0 and np.dot(x / size, speed) > 0.0)
+
+
+def _chased(engine: Chosen, state, now: float, h: float) -> str:
+    """What is said of a state that a step of size h failed from, where shorter ones see it grow without bound."""
+    x, t, part = np.asarray(state.x), 0.0, h / 8.0
+    size, speed = np.abs(x).max(), field_at(engine.system, x[None])[0]
+    if not _doubles(x, speed, SOON * h):
+        return ""
+    while t < SOON * h and part > h / 8.0**8 and now + part > now:
+        before = int(state.step)
+        state = engine.advance(state._replace(status=jnp.zeros_like(jnp.asarray(state.status))), part, 1, TOGETHER)[0]
+        t += (int(state.step) - before) * part
+        y = np.asarray(state.x)
+        later = np.abs(y).max()
+        if later > AHEAD * size:
+            rate = np.abs(field_at(engine.system, y[None])).max() / later
+            if not rate > FASTER * np.abs(speed).max() / size:  # as in leaving a state of rest, which ends
+                return ""
+            text = (
+                f"the state grows without bound: |x| = {size:.3g} at t = {now:g}, and shorter steps find {later:.3g} "
+            )
+            return f"{text}before t = {now + SOON * h:g}. {NO_STEP}"
+        if int(state.status) != Code.COMPLETED:
+            part /= 8.0
+    return ""
+
+
+def about_many(x: np.ndarray, x0: np.ndarray, speed: np.ndarray, elapsed: float, now: float, h: float) -> str:
+    """The same of a trajectory of an ensemble, from which no shorter steps are taken; h is NaN of adaptive ones."""
+    if text := runaway(x, x0, speed, elapsed if np.isnan(h) else 0.0, now):
+        return text
+    first, size = np.abs(x0).max(), np.abs(x).max()
+    if _doubles(x, speed, SOON * h) and size > GROWN * first:
+        text = f"|x| has grown from {first:.3g} to {size:.3g} at t = {now:g}, and doubles in a few steps"
+        return f"{text}: if it grows without bound, no step helps; otherwise try a smaller one"
+    return ""
+
+
 def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool) -> Status:
     """How fixed steps of size h ended, or a step that could not be taken."""
     code, step, residual = int(state.status), int(state.step), float(state.residual)
@@ -59,6 +132,9 @@ def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool) ->
     if code == Code.COMPLETED:
         return Status(Code.COMPLETED, f"reached t = {now:g} in {step} steps", step, now, residual)
     where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
+    x = np.asarray(state.x)
+    if text := runaway(x, x, np.zeros_like(x), 0.0, now) or _chased(engine, state, now, h):
+        return Status(Code(code), f"{where}, could not be taken: {text}", step, now, residual)
     if code == Code.NOT_CONVERGED and engine.method.explicit:
         message = (
             f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..engines.choice import Chosen
-from ..results.evidence import MEASURED, Witness, spread
+from ..engines.codes import Code
+from ..results.evidence import Replay, Witness
 from ..results.solution import Solution
 from ..systems import System
 from ..tracing.interpret import at_points
@@ -22,7 +23,7 @@ from .preparation import prepared
 
 
 def presented(
-    system: System, method, x: np.ndarray, entropy: np.ndarray | None, steps: np.ndarray, again, **fields
+    system: System, method, x: np.ndarray, entropy: np.ndarray | None, steps: np.ndarray, again: Replay, **fields
 ) -> Solution:
     """The solution that a user sees of the states x, shape (times, n), of a run.
 
@@ -30,20 +31,18 @@ def presented(
     ----------
     steps : array, shape (times - 1,)
         Sizes of steps that the run took from the states.
-    again : function of (x, h) to the state of the engine after one step
+    again : Replay
     **fields
         The others of :class:`Solution`.
     """
     invariants, laws = prepared(system, method)
     functions = {name: f for name, (f, _) in invariants.items()}
-    some = spread(len(x), MEASURED)
-    at = np.asarray(fields["t"])[some]
     found = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
         casimirs={name: at_points(_value, function, x) for name, function in {**functions, **system.ledger}.items()},
         laws=laws,
-        witness=Witness(system, method, functions, x[some], at, steps[some[:-1]], again),
+        witness=Witness(system, method, functions, x, np.asarray(fields["t"]), steps, again),
         **fields,
     )
     return system.presented(found)
@@ -55,12 +54,21 @@ def _value(function, x):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Again:
-    """One step from any state, by the program that a run has compiled."""
+    """Steps from any state, by the program that a run has compiled: a :class:`Replay`."""
 
     engine: Chosen
 
-    def __call__(self, x: np.ndarray, h: float):
-        return self.engine.step(self.engine.begin(jnp.asarray(x)), h)
+    def __call__(self, x: np.ndarray, h: float, steps: int = 1):
+        return self.engine.advance(self.engine.begin(jnp.asarray(x)), h, 1, steps)[0]
+
+    def path(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
+        state, found = self.engine.begin(jnp.asarray(x)), [np.empty((0, len(x)))]
+        while steps > 0 and int(state.status) == Code.COMPLETED:
+            saves = min(steps, self.engine.portion)
+            state, (states, _, _, reached) = self.engine.advance(state, h, saves, 1)
+            found.append(np.asarray(states)[:saves][np.asarray(reached)[:saves].astype(bool)])
+            steps -= saves
+        return np.concatenate(found)
 
 
 def provenance_of(

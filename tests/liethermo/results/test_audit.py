@@ -6,11 +6,13 @@ import pickle
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from typer.testing import CliRunner
 
 import liethermo as lt
 import manifolds as mf
 from liethermo.cli import app
+from liethermo.results import looking
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -146,6 +148,95 @@ def test_steps_that_do_not_resolve_the_motion(tmp_path):
     result = CliRunner().invoke(app, ["audit", str(solution.save(tmp_path / "run.nc"))])
     assert (result.exit_code, "DO NOT RESOLVE" in result.output) == (0, True)
     assert lt.ensemble(BODY, [X0, X0], (0.0, 300.0), 300.0).audit().resolved is False
+
+
+KEPLER = lt.Function(lambda x: 0.5 * (x[2] ** 2 + x[3] ** 2) - 1.0 / jnp.hypot(x[0], x[1]))
+"""About a centre of mass one; a circle of radius one takes 2 pi."""
+
+
+def from_afar(e):
+    """The farthest point of an ellipse with a half axis of one."""
+    return [-(1.0 + e), 0.0, 0.0, -np.sqrt((1.0 - e) / (1.0 + e))]
+
+
+def on_the_ellipse(e, t):
+    """The places at times after the farthest point, by Kepler's equation, shape (times, 2)."""
+    mean = np.asarray(t) + np.pi
+    u = np.array([scipy.optimize.brentq(lambda u, m=m: u - e * np.sin(u) - m, m - 1.0, m + 1.0) for m in mean])
+    return np.stack([np.cos(u) - e, np.sqrt(1.0 - e * e) * np.sin(u)], axis=1)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    ("method", "e", "number", "every", "resolved"),
+    [
+        (lt.MetriplecticGauss(2), 0.99, 101, 1, False),
+        (lt.MetriplecticGauss(2), 0.99, 203, 1, False),
+        (lt.MetriplecticGauss(2), 0.99, 203, 50, False),
+        (lt.MetriplecticRungeKutta(6), 0.95, 203, 1, False),
+        (lt.MetriplecticRungeKutta(6), 0.98, 901, 1, False),
+        (lt.MetriplecticGauss(2), 0.9, 451, 1, True),
+        (lt.MetriplecticGauss(2), 0.9, 451, 50, True),
+        (lt.MetriplecticRungeKutta(6), 0.95, 901, 1, True),
+        (lt.MetriplecticMidpoint(), 0.9, 451, 1, False),
+    ],
+)
+def test_the_audit_finds_the_steps_past_the_centre(method, e, number, every, resolved):
+    """Few steps of many pass the centre, and long ones jump over all of the passage, after which nothing is right."""
+    system = lt.MetriplecticSystem(mf.Canonical(2), KEPLER)
+    solution = lt.integrate(system, from_afar(e), (0.0, 2 * np.pi), 2 * np.pi / number, method, save_every=every)
+    error = np.abs(solution.x[:, :2] - on_the_ellipse(e, solution.t)).max()
+    audit = solution.audit()
+    assert (error < 0.02) == resolved == audit.resolved, f"{error}\n{audit}"
+    assert audit.passed
+    assert solution.evidence.looked == solution.stats.steps
+    assert audit.verdict.endswith("resolve the motion" if resolved else "THE STEPS DO NOT RESOLVE THE MOTION")
+    assert solution.evidence.error_time == pytest.approx(np.pi, abs=0.2)
+
+
+@pytest.mark.parametrize("every", [1, 6])
+def test_the_audit_finds_a_step_through_a_barrier(every):
+    """It is as thin as a twentieth of the step, and twice as high as would stop the particle."""
+    barrier = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.exp(-((x[0] / 0.01) ** 2)))
+    solution = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 0.4, lt.MetriplecticMidpoint(), save_every=every)
+    assert solution.x[-1] == pytest.approx([1.35, 1.0])  # where it would be without a barrier
+    assert solution.audit().resolved is False
+    turned = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 1e-3, lt.MetriplecticGauss(3), save_every=every)
+    assert turned.x[-1] == pytest.approx([-1.36, -1.0], abs=0.02)
+    assert turned.audit().resolved
+
+
+@pytest.mark.parametrize("every", [1, 40])
+def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, every):
+    """They are those where the motion is fastest."""
+    monkeypatch.setattr(looking, "LOOKED_NUMBERS", 3_000)
+    system, orbit = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), 2 * np.pi
+    few = lt.integrate(
+        system, from_afar(0.9), (0.0, 4 * orbit), orbit / 451, lt.MetriplecticMidpoint(), save_every=every
+    )
+    assert few.evidence.looked < few.stats.steps
+    assert few.audit().resolved is False
+    many = lt.integrate(system, from_afar(0.9), (0.0, orbit), orbit / 4001, lt.MetriplecticGauss(2), save_every=every)
+    audit, looked = many.audit(), many.evidence.looked
+    assert audit.resolved
+    assert 8 <= looked < 4001
+    assert audit.verdict == f"the laws hold, and the steps resolve the motion (looked at: {looked:,} steps of 4,001)"
+    assert abs(many.evidence.error_time - np.pi) < 0.3
+
+
+def test_an_ensemble_is_followed_past_the_centre():
+    """Its first steps are all it has kept, and they tell nothing."""
+    system, x0s = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), [from_afar(0.5), from_afar(0.9), from_afar(0.1)]
+    found = {
+        number: lt.ensemble(system, x0s, (0.0, 2 * np.pi), 2 * np.pi / number, lt.MetriplecticGauss(2))
+        for number in (101, 901)
+    }
+    assert not found[101].ok[1] or found[101].audit().resolved is False
+    assert found[101].evidence.error_time == pytest.approx(np.pi, abs=0.3)
+    assert found[901].audit().resolved
+    assert found[901].audit().coverage == ""
+    alike = lt.ensemble(system, np.tile(x0s[0], (40, 1)), (0.0, 2 * np.pi), 2 * np.pi / 101, lt.MetriplecticGauss(2))
+    assert alike.audit().verdict.endswith("(looked at: 3,232 steps of 4,040)")
 
 
 def test_the_estimate_is_of_the_order_of_the_method():
