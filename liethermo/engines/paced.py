@@ -9,14 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..functions.rounding import rounding
 from ..integrators import OneStepMethod
 from ..systems import System
+from ..tracing.interpret import at_points
 from ..tracing.programs import program
+from . import searching
 from .codes import Code
 from .compiled.form import Form
 from .growth import FEW
 from .pacing import (
     ARRIVED,
+    CAUGHT,
     FINISHED,
     LOOKING,
     TOLD,
@@ -31,8 +35,8 @@ from .pacing import (
     rate_of,
     reach,
 )
-from .rules import RULES
-from .stepping import State, take_step
+from .rules import EPS, RULES
+from .stepping import State
 
 
 class Paces(Protocol):
@@ -160,12 +164,14 @@ def _follow_all(form, parameters, axes, method, pacing, paces, most):
     return jax.vmap(one, in_axes=(axes, 0))(parameters, paces)
 
 
-@program
-def step_all(form, parameters, axes, method, state, h):
-    def one(p, state, h):
-        return take_step(form.rebuild(p), method, state, h)
+ZERO = 2.0**10
+"""Roundings that a function may be off zero at an event."""
 
-    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, h)
+
+def _rounding(model: tuple[System, Any], x) -> jax.Array:
+    """The size at which what is watched is rounded at a state, which is rounded itself."""
+    system, watched = model
+    return rounding(lambda y: watched(system, y), x, jnp.maximum(jnp.abs(x), system.sizes(x)))
 
 
 # -- from pause to pause ----------------------------------------------------------------------------------------------
@@ -182,14 +188,66 @@ class Guide:
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
     member : function from a place to the system of that trajectory
+
+    Attributes
+    ----------
+    jumps : list of float
+        When what is watched has changed its sign without being zero.
     """
 
     def __init__(self, paces: Paces, pacing: Pacing, method: OneStepMethod, stops: np.ndarray, member: Callable):
         self.paces, self.pacing, self.method, self.stops, self.member = paces, pacing, method, stops, member
+        self.jumps: list[float] = []
 
     def paused(self, why: int) -> np.ndarray:
         """The places of those that pause for a reason."""
         return np.flatnonzero(self.paces.read("status") == why)
+
+    def verify(self) -> None:
+        """Those where what is watched changes its sign: an event is where it is zero, to rounding.
+
+        Others go on past the jump, or the pole, as if it were a stop. Where it is not known what the function is
+        between the two signs, since it is not a number, neither is whether the event happens: the run ends.
+        What is watched for a fall alone may jump: it has fallen.
+        """
+        paces, there = self.paces, self.paused(CAUGHT)
+        if not there.size:
+            return
+        value, before = paces.read("search", there)[:, searching.VALUE], paces.read("value", there)
+        zero = np.isfinite(value) if self.pacing.falling else self._vanishes(there, value, before)
+        paces.write("status", there[zero], Code.EVENT)
+        unknown = ~zero & ~np.isfinite(before)
+        paces.write("status", there[unknown], Code.NON_FINITE)
+        past = ~zero & ~unknown
+        there, t = there[past], paces.read("t", there[past])
+        if there.size:
+            self.jumps += t.tolist()
+            paces.write("value", there, -before[past])
+            paces.write("base", there, t)
+            paces.write("since", there, paces.read("step", there))
+            paces.write("status", there, np.where(t >= paces.read("stop", there), ARRIVED, Code.COMPLETED))
+
+    def _vanishes(self, there: np.ndarray, value: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Whether what is watched is zero, to rounding, where its value is this and was that when the step began.
+
+        It is beside a value that much larger. Otherwise its rounding is looked at, but not beside a pole, where it is
+        larger than it was and rounded by all that it is.
+        """
+        size, before = np.abs(value), np.abs(before)
+        zero = (size == 0.0) | ((size <= ZERO * EPS * before) & np.isfinite(before))
+        for places in self._alike(there[~zero & np.isfinite(size) & (size <= ZERO * before)]):
+            own, model = np.isin(there, places), (self.member(int(places[0])), self.pacing.watched)
+            rounded = at_points(_rounding, model, self.paces.read("x", places))
+            zero[own] = size[own] <= ZERO * EPS * np.where(np.isnan(rounded), np.inf, rounded)
+        return zero
+
+    def _alike(self, places: np.ndarray) -> list[np.ndarray]:
+        """The places of trajectories of the same system, together."""
+        found: dict[int, list[int]] = {}
+        kept = [self.member(int(i)) for i in places]  # held, so that no identity is used twice
+        for i, system in zip(places, kept, strict=True):
+            found.setdefault(id(system), []).append(int(i))
+        return [np.array(group) for group in found.values()]
 
     def resume(self) -> None:
         """Those at a stop are done or go on to the next, and what grows near a state is looked at."""

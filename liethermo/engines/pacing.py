@@ -2,8 +2,9 @@
 
 A run that looks at every step carries a :class:`Pace`. One attempt takes a step, judges it by its estimated error, and
 chooses the next. Where something is wanted that no engine does by itself, the run pauses: at a time where a state is
-kept, and where what grows near the state has to be looked at. A step in which an event happens is tried again in
-shorter and shorter parts, until one ends there.
+kept, where what grows near the state has to be looked at, and where an event may be. A step in which what is watched
+changes its sign is tried again in shorter and shorter parts, until one ends where it does: at a zero, or at a jump,
+which is none (:meth:`.paced.Guide.verify`).
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ CHANGED = 0.05
 
 ARRIVED, LOOKING, CAUGHT, FINISHED = 20, 21, 22, 23
 """Why a run pauses, beside the :class:`Code` of how it ended: it is where steps had to end; what grows near its state
-is to be looked at; it is at an event; it is at its end."""
+is to be looked at; it is where what is watched changes its sign; it is at its end."""
 
 
 TOLD = ("x", "energy", "entropy", "step", "t", "taken")
@@ -115,7 +116,7 @@ class Pace(NamedTuple):
     tried: jax.Array
     rejected: jax.Array
     cause: jax.Array  # status of the last one tried
-    value: jax.Array  # of what is watched
+    value: jax.Array  # of what is watched; infinite, with the last sign that is known, where it is not a number
     speed: jax.Array  # the largest at which the state has changed, relative to its size
     growth: jax.Array  # rate of what grows fastest, when it was looked at last,
     seen: jax.Array  # and how the motion stretched what lay near
@@ -125,15 +126,16 @@ class Pace(NamedTuple):
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
     state, zero = first_state(system, method, x), jnp.zeros(())
-    size = jnp.max(jnp.abs(x))
+    own, at = method.judged(system, x)
+    size = jnp.max(jnp.abs(at))
     unit = jnp.where(size > 0.0, size, 1.0)
-    speed = jnp.max(jnp.abs(system.vector_field(x))) / unit
+    speed = jnp.max(jnp.abs(own.vector_field(at))) / unit
     share = jnp.minimum(pacing.allowed(size) / unit, 1.0)
     # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
     found = 0.5 * share ** (1.0 / method.order) / jnp.where(speed > 0.0, speed, 1.0)
     found = jnp.where((speed > 0.0) & (size > 0.0), jnp.minimum(length, found), 1e-3 * length)
     wish = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
-    now = stretch(*method.judged(system, x)) if pacing.adaptive else jnp.zeros((1, 1))
+    now = stretch(own, at) if pacing.adaptive else jnp.zeros((1, 1))
     pace = Pace(
         state=state,
         t=zero + t,
@@ -201,8 +203,9 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     good, wish, code = solved, pace.wish, new.status
     speed, fair = pace.speed, pace.fair
     if pacing.adaptive:
-        size = jnp.maximum(jnp.max(jnp.abs(old.x)), jnp.max(jnp.abs(new.x)))
-        gone = jnp.max(jnp.abs(new.x - old.x)) / jnp.where(size > 0.0, size, 1.0)
+        here, there = (method.judged(system, x)[1] for x in (old.x, new.x))
+        size = jnp.maximum(jnp.max(jnp.abs(here)), jnp.max(jnp.abs(there)))
+        gone = jnp.max(jnp.abs(there - here)) / jnp.where(size > 0.0, size, 1.0)
         speed = jnp.maximum(speed, jnp.where(solved, gone / h, 0.0))
         part = h * speed  # of the time in which the state, at its fastest, changes by its size
         allowed = jnp.maximum(pacing.allowed(size) * jnp.minimum(part, 1.0), ROUNDED * size + RULES.vanished)
@@ -248,7 +251,7 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         tried=tried,
         rejected=pace.rejected + rejected,
         cause=cause,
-        value=jnp.where(jnp.isnan(value), pace.value, kept(value, pace.value)),  # the last sign that is known
+        value=kept(value, pace.value),
         speed=kept(speed, pace.speed),
         growth=pace.growth,
         seen=pace.seen,
@@ -284,33 +287,39 @@ def sighted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h
 
     A step in which it happens begins a search among steps from the same state, so that the event is as accurate as the
     method, and the laws hold there. Where it happens and is undone within a step, as the polynomial of the step tells,
-    a shorter one is tried first; and where a part of a step fails of which the whole did not.
+    a shorter one is tried first; and where a part of a step fails of which the whole did not. A step may end where what
+    is watched is not a number. The search in one that begins there takes it for what it was, so it ends where it is a
+    number again. What the value is where a search ends is left in its place: see :func:`.searching.located`.
     """
     value, search = pacing.watch(system, new.x), searching.Search(*pace.search)
-    looking, solved = search.whole > 0.0, (new.status == Code.COMPLETED) & jnp.isfinite(value)
+    seen = jnp.where(jnp.isnan(value) & jnp.isinf(pace.value), pace.value, value)
+    looking, solved = search.whole > 0.0, (new.status == Code.COMPLETED) & ~jnp.isnan(seen)
     begins = sight.good & changes(pacing, pace.value, value) & ~looking
     cut, first = jnp.zeros((), dtype=bool), jnp.ones(())
     if pacing.adaptive:
         first, undone = first_change(system, method, pacing, pace, h * new.k, value)
         cut = sight.good & undone & ~looking
         begins = begins & ~cut
-    narrower, found = searching.narrowed(search, value)
+    narrower, found = searching.narrowed(search, seen)
     at_root = looking & solved & found
-    at_start = looking & solved & ~found & (narrower.share * search.whole <= pacing.shortest)
+    at_start = looking & solved & ~found & (narrower.share <= 4.0 * EPS)
+    later = sight.reached > pace.t
     lost, ends = looking & ~solved, at_root | at_start
     wish = jnp.where(cut, first * h, jnp.where(looking | begins, pace.wish, sight.wish))
     code = jnp.where(ends, CAUGHT, jnp.where(looking, Code.COMPLETED, sight.code))
     if pacing.adaptive:
         wish = jnp.where(lost, UNSOLVED * search.whole, wish)
-        code = jnp.where(lost & (wish < pacing.shortest), Code.STEP_UNDERFLOW, code)
+        short = jnp.where(new.status == Code.COMPLETED, Code.NON_FINITE, Code.STEP_UNDERFLOW)
+        code = jnp.where(lost & (wish < pacing.shortest), short, code)
     else:
         code = jnp.where(lost, jnp.where(new.status == Code.COMPLETED, Code.NON_FINITE, new.status), code)
     begun = jnp.stack(searching.begun(h, pace.value, value))
-    goes_on = jnp.where(looking & ~ends & ~lost, jnp.stack(narrower), searching.NONE)
+    there = searching.located(jnp.where(at_start, pace.value, jnp.where(later, seen, 0.0)))
+    goes_on = jnp.where(looking & ~lost, jnp.where(ends, jnp.stack(there), jnp.stack(narrower)), searching.NONE)
     return Sight(
-        good=jnp.where(looking, at_root & (h > pacing.shortest), sight.good & ~cut & ~begins),
+        good=jnp.where(looking, at_root & later, sight.good & ~cut & ~begins),
         ends=ends,
-        value=value,
+        value=jnp.where(jnp.isnan(value), jnp.inf * pace.value, value),
         reached=jnp.where(at_start, pace.t + narrower.share * search.whole, sight.reached),
         wish=wish,
         code=code,
@@ -326,7 +335,10 @@ def changes(pacing: Pacing, before, after) -> jax.Array:
 
 
 def first_change(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, d, end):
-    """The first share of a step, among the method's looks, with another sign; and whether a later one undoes that."""
+    """The first share of a step, among the method's looks, with another sign; and whether a later one undoes that.
+
+    An end at which what is watched is not a number does so too.
+    """
 
     def value(weights) -> jax.Array:
         return pacing.watch(system, method.along(system, pace.state.x, weights @ d))
@@ -338,7 +350,7 @@ def first_change(system: System, method: OneStepMethod, pacing: Pacing, pace: Pa
         undone = undone | (changed & (pace.value * there > 0.0))
         share = jnp.where(other & ~changed, theta, share)
         changed = changed | other
-    return share, undone
+    return share, undone | (changed & jnp.isnan(end))
 
 
 # -- the size of the next step ----------------------------------------------------------------------------------------

@@ -87,7 +87,7 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         y1, *state = one_step(system, method, (y0, low, k, before), h)
         solved = jnp.isfinite(jnp.sum(y1))
         slopes = state[1]
-        error = method.error(system, y0, low, h, slopes) if method.has_estimate else jnp.zeros(())
+        error = method.error(system, y0, low, jnp.abs(h), slopes) if method.has_estimate else jnp.zeros(())
         estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(solved, error, jnp.inf)))
         field = system.vector_field
         dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,13 +14,14 @@ from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.integrate import integrate
+from ..runs.watch import Watch
 from ..systems import System
 
 STATUSES = {"completed": 0, "event": 1}
 """SciPy's numbers for how a run ended; -1 for every failure."""
 
-XTOL, RTOL = 1e-14, 8.9e-16
-"""How closely the zeros of event functions are located in the dense output."""
+UNUSED = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
+"""Options of SciPy's solvers that have no place here: the methods take what they need from the system."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,9 @@ class OdeResult:
     y : ndarray, shape (n, times)
         States in columns, as SciPy has them.
     sol : function from times, shape (m,), to states, shape (n, m); or None
-        Where ``dense_output`` was asked for.
+        Where ``dense_output`` was asked for: a step of the method to each time, so that the laws hold there.
     t_events, y_events : list of ndarray, or None
-        For each event function the times and the states, shape (k, n), of its zeros.
+        For each event function the times and the states, shape (k, n), of its zeros: ends of steps too.
     nfev : int
         Evaluations of the vector field, by the stages and iterations of the steps.
     njev, nlu : int
@@ -69,11 +71,14 @@ def solve_ivp(
     t_eval=None,
     dense_output: bool = False,
     events: Callable | Sequence[Callable] | None = None,
+    vectorized: bool = False,
+    args: tuple | None = None,
     *,
     rtol: float = 1e-3,
     atol: float = 1e-6,
     first_step: float | None = None,
     max_step: float | None = None,
+    **options,
 ) -> OdeResult:
     """Integrate a system as SciPy's ``solve_ivp`` integrates a function, with the laws exact.
 
@@ -89,12 +94,18 @@ def solve_ivp(
         Keep the states there, and no others. Steps end there, so the laws hold there.
     dense_output : bool
         Give ``sol``, the state at any time.
-    events : function of (t, y), or several, optional
-        Their zeros are located. The attributes ``terminal`` (True, or the number of zeros after which to stop) and
-        ``direction`` mean what they mean in SciPy.
+    events : function of (t, y, *args), or several, optional
+        Their zeros are located, all of them, by steps that end there. The attributes ``terminal`` (True, or the number
+        of zeros after which to stop) and ``direction`` mean what they mean in SciPy. A change of sign counts, as in
+        SciPy, even where the function jumps; one across states where it is not a number does not.
+    vectorized : bool
+        Of no account: a system takes states of any shape.
+    args : tuple, optional
+        Passed to the events. The system has its parameters in itself.
     rtol, atol : float
         SciPy's defaults. What they mean: :class:`.Adaptive`.
     first_step, max_step : float, optional
+        ``max_step`` may be infinite.
 
     Returns
     -------
@@ -105,90 +116,86 @@ def solve_ivp(
     InputError
         If an argument cannot be used. A step that fails does not raise: ``success`` is False, as in SciPy.
     """
+    del vectorized
     if not isinstance(fun, System):
         raise InputError(
             f"the first argument must be a system such as lt.LiePoissonSystem, not {type(fun).__name__}: "
             "the laws are those of its energy and entropy"
         )
+    for name in options:
+        why = "the methods take it from the system" if name in UNUSED else "solve_ivp has no such option"
+        raise InputError(f"leave out {name}: {why}")
     functions = [] if events is None else [events] if callable(events) else list(events)
+    if args is not None and not functions:
+        raise InputError("args are passed to the events, and there are none: the system has its parameters in itself")
+    start, end = _span(t_span)
+    wanted = None if t_eval is None else _times(t_eval, start, end)
+    watch = Watch(functions, _tuple(args)) if functions else None
     method = MetriplecticRungeKutta(order=8) if method is None else method
-    step = Adaptive(rtol, atol, first_step, max_step)
-    looked = dense_output or bool(functions)
-
-    def run(end: float) -> Solution:
-        wanted = None if t_eval is None else [t for t in _increasing(t_eval) if t_span[0] < t <= end]
-        return integrate(
-            fun, y0, (t_span[0], end), step, method, save_at=wanted, dense=looked, on_failure="return", progress=False
-        )
-
-    solution = run(t_span[1])
-    found = _zeros(functions, solution)
-    stop = _stop(functions, found, solution)
-    if stop is not None and stop < solution.status.time:
-        solution = run(stop)
-        found = [times[times <= stop] for times in found]
-    keep = np.ones(len(solution.t), bool) if t_eval is None else np.isin(solution.t, np.asarray(t_eval))
+    solution = integrate(
+        fun,
+        y0,
+        (start, end),
+        Adaptive(rtol, atol, first_step, None if max_step == math.inf else max_step),
+        method,
+        save_at=None if wanted is None else [*wanted, end],
+        until=watch,
+        dense=dense_output,
+        on_failure="return",
+        progress=False,
+    )
+    keep = np.ones(len(solution.t), bool) if wanted is None else np.isin(solution.t, wanted)
     stats, sol = solution.stats, None
     if dense_output:
 
         def sol(t):
             return np.moveaxis(solution(t), -1, 0)
 
-    status = 1 if stop is not None else STATUSES.get(str(solution.status.code), -1)
+    status = STATUSES.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
     return OdeResult(
         t=solution.t[keep],
         y=solution.x[keep].T,
         sol=sol,
-        t_events=found if functions else None,
-        y_events=[solution(times) if len(times) else np.empty((0, fun.dim)) for times in found] if functions else None,
+        t_events=None if watch is None else [np.array(times) for times in watch.times],
+        y_events=None if watch is None else [np.array(y).reshape(len(y), *solution.x.shape[1:]) for y in watch.states],
         nfev=iterations * method.evaluations,
         njev=stats.newton_iterations,
         nlu=stats.newton_iterations,
         status=status,
-        message="A termination event occurred." if stop is not None else solution.status.message,
+        message="A termination event occurred." if status == 1 else solution.status.message,
         success=status >= 0,
         solution=solution,
     )
 
 
-def _increasing(times) -> np.ndarray:
-    times = np.asarray(times, dtype=np.float64)
+def _span(t_span) -> tuple[float, float]:
+    try:
+        start, end = map(float, t_span)
+    except (TypeError, ValueError):
+        raise InputError(f"t_span is two numbers (start, end), not {t_span!r}") from None
+    if end < start:
+        raise InputError(
+            f"t_span = ({start:g}, {end:g}) runs backwards, and time runs forwards here, since entropy grows: "
+            f"integrate over ({end:g}, {start:g})"
+        )
+    return start, end
+
+
+def _times(t_eval, start: float, end: float) -> np.ndarray:
+    times = np.asarray(t_eval, dtype=np.float64)
     if times.ndim != 1 or np.any(np.diff(times) <= 0.0):
         raise InputError("t_eval must be a list of increasing times")
+    outside = times[~((times >= start) & (times <= end))]
+    if outside.size:
+        raise InputError(f"t_eval has the time {outside[0]:g}, which is outside of t_span = ({start:g}, {end:g})")
     return times
 
 
-def _zeros(functions: list[Callable], solution: Solution) -> list[np.ndarray]:
-    """The times at which each function vanishes in the direction that it asks for, located between steps."""
-    from scipy.optimize import brentq
-
-    if not functions:
-        return []
-    assert solution.dense is not None
-    nodes = np.append(solution.dense.start, solution.dense.start[-1] + solution.dense.h[-1])
-    found = []
-    for function in functions:
-        values = np.array([float(function(t, solution(t))) for t in nodes])
-        direction = getattr(function, "direction", 0)
-        up, down = (values[:-1] <= 0) & (values[1:] > 0), (values[:-1] >= 0) & (values[1:] < 0)
-        crossed = (up & (direction >= 0)) | (down & (direction <= 0))
-        found.append(
-            np.array(
-                [
-                    brentq(lambda t, f=function: float(f(t, solution(t))), nodes[i], nodes[i + 1], xtol=XTOL, rtol=RTOL)
-                    for i in np.flatnonzero(crossed)
-                ]
-            )
-        )
-    return found
-
-
-def _stop(functions: list[Callable], found: list[np.ndarray], solution: Solution) -> float | None:
-    """When the first terminal event ends the run."""
-    stops = []
-    for function, times in zip(functions, found, strict=True):
-        count = int(getattr(function, "terminal", 0) or 0)
-        if 0 < count <= len(times):
-            stops.append(float(times[count - 1]))
-    return min(stops, default=None)
+def _tuple(args) -> tuple:
+    if args is None:
+        return ()
+    try:
+        return (*args,)
+    except TypeError:
+        raise InputError(f"args is a tuple, even of one: write args=({args!r},)") from None

@@ -62,6 +62,13 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 """What the scalar operations of a traced program are in SymPy."""
 
 
+SPECIAL: dict[str, Callable[..., Any]] = {
+    **{name: getattr(jax.scipy.special, name) for name in "erf erfc gamma polygamma".split()},
+    "loggamma": jax.scipy.special.gammaln,
+}
+"""Functions of JAX that SymPy's printer would take from elsewhere, where they are none of traced arrays."""
+
+
 @dataclass(frozen=True)
 class Expressions:
     """A system in symbols.
@@ -136,14 +143,30 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
     Raises
     ------
     InputError
-        If the expression has other symbols.
+        If the expression has other symbols, or a function without a counterpart in JAX.
     """
-    expression = sympy.sympify(expression)
+    expression, variables = sympy.sympify(expression), tuple(variables)
     if others := expression.free_symbols - set(variables):
         raise InputError(f"{', '.join(sorted(map(str, others)))} in {expression} is no component of the state")
     if expression.is_polynomial(*variables):
         return mf.sympy.polynomial(expression, variables)
-    compiled = sympy.lambdify(tuple(variables), expression, modules="jax")
+    found = _in_jax(expression, variables)
+    if found is None:
+        parts = sympy.postorder_traversal(expression)
+        unknown = next(part for part in parts if part.args and _in_jax(part, variables) is None)
+        raise InputError(
+            f"{unknown.func.__name__} in {unknown} has no counterpart in JAX: write the function with jax.numpy"
+        )
+    return found
+
+
+def _in_jax(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
+    """A function of one JAX array; None where a name of the expression is none of JAX."""
+    try:
+        compiled = sympy.lambdify(variables, expression, modules=[SPECIAL, "jax"])
+        jax.eval_shape(lambda x: compiled(*x), jax.ShapeDtypeStruct((len(variables),), jnp.float64))
+    except (NameError, AttributeError, NotImplementedError, TypeError):
+        return None
     return lambda x: compiled(*x)
 
 

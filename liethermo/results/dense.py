@@ -3,50 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import InputError
 
 
+def _as_it_is(x: np.ndarray) -> np.ndarray:
+    return x
+
+
 @dataclass(frozen=True)
 class Dense:
-    """``x(t)`` anywhere: to O(h^(s+1)) by the polynomial of collocation with s stages, to O(h^4) by Runge-Kutta steps.
+    """``x(t)`` anywhere: where a step of the method ends that begins at the last state before t.
 
-    That is less than the order of the states at the ends of steps; Taylor steps have theirs between too. The laws are
-    exact at the ends alone.
+    So states between have the order of the method and its laws: the energy and the invariants are those of the state
+    that the step begins at, and the entropy is no less.
 
     Attributes
     ----------
-    start, h : ndarray, shape (steps,)
-    x : ndarray, shape (steps, n)
-        States at the starts.
-    k : ndarray, shape (steps, s, n)
-        Slopes at the stages.
-    weights : function
-        From shares of a step to weights of the slopes: :meth:`liethermo.integrators.OneStepMethod.weights`.
-    along : function or None
-        On a manifold, from states and displacements, shapes (m, n), to states.
+    t : ndarray, shape (steps + 1,)
+        When the steps of the run begin, and when the last one ends.
+    x : ndarray, shape (steps + 1, n)
+        The states then.
+    ends : function from states, shape (m, n), and sizes of steps, shape (m,), to states
+        NaN where a step cannot be taken.
+    seen : function from states, shape (m, n), to states
+        What a user sees of them.
     """
 
-    start: np.ndarray
-    h: np.ndarray
+    t: np.ndarray
     x: np.ndarray
-    k: np.ndarray
-    weights: Callable[..., np.ndarray]
-    along: Callable | None = None
+    ends: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    seen: Callable[[np.ndarray], np.ndarray] = _as_it_is
 
     def __call__(self, t) -> np.ndarray:
         t = np.asarray(t, dtype=np.float64)
-        first, last = self.start[0], self.start[-1] + self.h[-1]
+        first, last = self.t[0], self.t[-1]
         slack = 1e-12 * (last - first)
         if not np.all((t >= first - slack) & (t <= last + slack)):
             raise InputError(f"the solution is known from t = {first:g} to {last:g}, not at {t}")
-        i = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
-        weights = self.weights((t - self.start[i]) / self.h[i])
-        x, v = self.x[i], self.h[i][..., None] * np.einsum("...s,...sn->...n", weights, self.k[i])
-        if self.along is None:
-            return x + v
-        n = x.shape[-1]
-        return np.asarray(self.along(x.reshape(-1, n), v.reshape(-1, n))).reshape(*x.shape[:-1], -1)
+        times = np.clip(t.ravel(), first, last)
+        i = np.searchsorted(self.t, times, side="right") - 1
+        h, found = times - self.t[i], self.x[i]
+        between = np.flatnonzero(h > 0.0)
+        if between.size:
+            found[between] = self.ends(found[between], h[between])
+        found = self.seen(found)
+        return found.reshape(*t.shape, found.shape[-1])
+
+    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Dense:
+        """The same, of which a user sees what a function makes of it."""
+        before = self.seen
+        return replace(self, seen=lambda x: np.asarray(change(before(x))))

@@ -26,8 +26,7 @@ class Adaptive:
     one all of it. So the error of a run is proportional to the tolerance, with every method.
 
     Steps are short enough, too, for what grows near the state to grow at its rate, to a few thousandths, however small
-    it is yet: a body spinning about its middle axis falls when it has to. The laws hold at every step, whatever its
-    size.
+    it is yet: a body spinning about its middle axis falls when it has to. The laws hold at every step.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,10 @@ from ..tracing.traced import settled
 class Relaxed:
     """The event that the entropy production falls below ``tol`` (per unit of time), for ``integrate(until=...)``.
 
-    A state whose production is below it from the start, such as one near an unstable equilibrium, has to rise above it
+    Some systems produce no entropy, but their energy falls, as under a :class:`liethermo.DoubleBracket`. There the rate
+    at which the dissipation lowers the energy takes the place of the production.
+
+    A state whose rate is below ``tol`` from the start, such as one near an unstable equilibrium, has to rise above it
     first.
     """
 
@@ -29,7 +32,7 @@ class Relaxed:
 
     def __post_init__(self):
         if not (math.isfinite(self.tol) and self.tol > 0.0):
-            raise InputError(f"the entropy production to stop at must be positive and finite, not {self.tol!r}")
+            raise InputError(f"the rate to stop at must be positive and finite, not {self.tol!r}")
 
 
 class Event:
@@ -50,11 +53,16 @@ class Event:
 
     def __init__(self, until: Relaxed | Callable, system: System):
         self.falling = isinstance(until, Relaxed)
-        self.name = f"entropy production below {until.tol:g}" if isinstance(until, Relaxed) else "the event function"
+        self.name = "the event function"
         if isinstance(until, Relaxed):
-            if system.entropy_law != "nondecreasing":
-                raise InputError("Relaxed(tol) watches the entropy production, and this system produces no entropy")
-            self.function: Any = Excess(jnp.asarray(until.tol))
+            rate = _watched_rate(system)
+            if rate is None:
+                raise InputError(
+                    "Relaxed(tol) watches the entropy production or the fall of the energy, and this system produces "
+                    "no entropy and keeps its energy, or promises nothing: give a function of the state as until"
+                )
+            self.name = f"{rate.name} below {until.tol:g}"
+            self.function: Any = rate(jnp.asarray(until.tol))
         elif callable(until):
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
@@ -70,9 +78,20 @@ class Excess(Module):
     """The entropy production above one."""
 
     tol: jax.Array
+    name: ClassVar[str] = "entropy production"
 
     def __call__(self, system: System, x):
         return system.entropy_production(x) - self.tol
+
+
+class ExcessFall(Module):
+    """The rate at which the dissipation lowers the energy, above one."""
+
+    tol: jax.Array
+    name: ClassVar[str] = "fall of the energy"
+
+    def __call__(self, system: System, x):
+        return system.energy_fall(x) - self.tol
 
 
 class OfPoints(Module):
@@ -82,3 +101,10 @@ class OfPoints(Module):
 
     def __call__(self, system: System, x):
         return self.function(system.seen(x))
+
+
+def _watched_rate(system: System) -> type[Excess] | type[ExcessFall] | None:
+    """What vanishes as a system relaxes, by its laws."""
+    if system.entropy_law == "nondecreasing":
+        return Excess
+    return ExcessFall if system.energy_law == "nonincreasing" else None

@@ -11,7 +11,7 @@ from ..engines.codes import Code
 from ..engines.compiled.form import numbers_of
 from ..engines.compiled.paced import LanePaces, paced_stepper_of
 from ..engines.paced import Guide, ManyPaces, VmapPaces
-from ..engines.pacing import ARRIVED, CAUGHT, FINISHED, LOOKING, Pacing
+from ..engines.pacing import ARRIVED, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
 from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads, in_whole_vectors
@@ -22,7 +22,7 @@ ATTEMPTS = (16, 2048)
 """Attempts in a call of an engine, at least and at most: those that pause wait for the others' to be made."""
 
 WORK = 2**15
-"""Attempts in a call, of all trajectories together, between these: a few milliseconds."""
+"""Attempts in a call, of all trajectories together, between these."""
 
 
 class Many:
@@ -95,21 +95,19 @@ class Many:
         try:
             while followed.any() and not stopped():
                 paces.follow(int(np.clip(WORK // len(places), *ATTEMPTS)))
+                guide.verify()
                 there = guide.paused(ARRIVED)
                 if there.size:
                     columns = [paces.read("x", there), *(paces.read(n, there)[:, None] for n in ("energy", "entropy"))]
                     record.keep_at(places[there], paces.read("t", there), np.hstack(columns))
-                caught = np.setdiff1d(guide.paused(CAUGHT), np.flatnonzero(~followed))
-                if caught.size:
-                    finish(caught, np.full(caught.size, Code.EVENT), fields_of(caught), paces.read("t", caught))
                 guide.resume()
                 status = paces.read("status")
-                ended = np.flatnonzero(followed & ~np.isin(status, (Code.COMPLETED, ARRIVED, CAUGHT, LOOKING)))
+                ended = np.flatnonzero(followed & ~np.isin(status, (Code.COMPLETED, ARRIVED, LOOKING)))
                 if ended.size:
                     codes = np.where(status[ended] == FINISHED, Code.COMPLETED, status[ended])
                     finish(ended, codes, fields_of(ended), paces.read("t", ended))
-                followed[ended] = followed[caught] = False
-                self.tally.add(np.unique(places[np.append(ended, caught)]).size)
+                followed[ended] = False
+                self.tally.add(np.unique(places[ended]).size)
                 if only is not None and 2 * followed.sum() <= len(places) and followed.any():
                     left = np.flatnonzero(followed)
                     only(left)

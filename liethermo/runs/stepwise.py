@@ -1,13 +1,13 @@
 """Runs that look at every step: adaptive steps, events, outputs at given times, dense output.
 
 The step itself is an engine's; what is here decides on its size and on where to stop. Nothing here touches the laws:
-they hold for every step size.
+they hold in every step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +15,13 @@ import numpy as np
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.paced import Guide
-from ..engines.pacing import CAUGHT, FINISHED, TOLD
+from ..engines.pacing import FINISHED, TOLD
 from ..engines.stepping import State
 from ..errors import InputError
 from .adaptive import Adaptive, pacing_of
 from .events import Event
 from .timetable import Timetable
+from .watch import Watch
 
 TOGETHER = 64
 """Attempts between looks at an adaptive run."""
@@ -38,6 +39,7 @@ class Outcome:
     event_time: float | None = None
     underflow: float | None = None
     interrupted: bool = False
+    jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
     limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
 
 
@@ -79,7 +81,7 @@ def run(
     event: Event | None,
     keep: Keep,
     most_kept: float = MOST_KEPT,
-    singly: bool = True,
+    watch: Watch | None = None,
 ) -> Outcome:
     """Step from the start of the span to its end, an event, a failure or Ctrl-C.
 
@@ -90,16 +92,16 @@ def run(
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
     keep : function of Steps
-        Told of every step taken.
+        Told of every step taken, of many adaptive ones together.
     most_kept : float
         Adaptive steps after which there is no room for more.
-    singly : bool
-        Whether it is told of each step by itself; of many adaptive ones together otherwise.
+    watch : Watch, optional
+        Looks at each step, and may end the run in it.
     """
     outcome, stops = Outcome(state), stops[stops > span[0]]
     try:
-        if isinstance(step, Adaptive) or event is not None:
-            _paced(engine, outcome, span, step, stops, event, keep, most_kept, 1 if singly else TOGETHER)
+        if isinstance(step, Adaptive) or event is not None or watch is not None:
+            _paced(engine, outcome, span, step, stops, event, keep, most_kept, watch)
         else:
             _fixed(engine, outcome, span, step, stops, keep)
     except KeyboardInterrupt:
@@ -107,20 +109,22 @@ def run(
     return outcome
 
 
-def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, together: int) -> None:
+def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, watch: Watch | None) -> None:
     """Adaptive steps or events, by the paces that ensembles have too, so many attempts together."""
     length = span[1] - span[0]
     pacing = pacing_of(step, engine.method, length, event)
     paces = engine.paces(pacing, np.asarray(outcome.state.x), span[0], float(stops[0]), length)
     guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
+    outcome.jumps = guide.jumps
 
     def told(name: str) -> float:
         return float(paces.read(name)[0])
 
     while True:
+        guide.verify()
         guide.resume()
         code, t = int(told("status")), told("t")
-        if code == CAUGHT:
+        if code == Code.EVENT:
             outcome.event_time = t
         if code != Code.COMPLETED:
             break
@@ -128,19 +132,25 @@ def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, 
             outcome.limit = "memory"
             return
         before = outcome.state
-        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
+        rows = paces.attempts(int(min(1 if watch else TOGETHER, max(1.0, most_kept - int(before.step)))))
         outcome.rejected = int(told("rejected"))
         after: Any = paces.state()
         outcome.state = after._replace(status=np.int64(0))
         if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
             x, energy, entropy, number, ends, h = (rows[name][taken] for name in TOLD)
+            if watch and (caught := watch.of_step(engine, t, h[0], ends[0], before, outcome.state)):
+                outcome.event_time, part, at = caught
+                outcome.state = before if at is None else at
+                if at is not None:
+                    keep(_single(t, outcome.event_time, part, before, at))
+                return
             keep(Steps(np.append(t, ends), h, x, energy, entropy, number, before, outcome.state))
     if code == Code.STEP_LIMIT:
         outcome.limit = "steps"
     elif code == Code.STEP_UNDERFLOW:
         outcome.underflow = told("wish")
         outcome.state = outcome.state._replace(status=np.int64(told("cause")), residual=told("residual"))
-    elif code not in (CAUGHT, FINISHED):
+    elif code not in (Code.EVENT, FINISHED):
         outcome.state = outcome.state._replace(status=np.int64(code), residual=told("residual"))
         outcome.limit = "sight" if told("cause") == Code.COMPLETED else ""
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 
@@ -43,6 +44,43 @@ def test_adaptive_steps_and_diffrax_own_solvers_agree():
     ends = [np.asarray(run.ys)[np.isfinite(np.asarray(run.ts))][-1] for run in (ours, theirs)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-6
     assert int(ours.stats["num_accepted_steps"]) > 3
+
+
+@pytest.mark.sampled("MetriplecticGauss(stages=2)", "MetriplecticRungeKutta(order=6)")
+@pytest.mark.parametrize("method", list(lt.registered_methods()), ids=str)
+def test_time_runs_backwards(method):
+    """To the order of the method, against SciPy; the energy stays, and the entropy falls by what it has risen."""
+    system, solver, T = body(), lt.diffrax.Solver(method), 1.0
+    exact = solve_ivp(lambda t, x: -np.asarray(system.vector_field(x)), (0.0, T), X0, "DOP853", rtol=1e-13, atol=1e-15)
+    few = 8 if method.order < 4 else 3
+    ends = []
+    for n in (few, 2 * few):
+        run = diffrax.diffeqsolve(lt.diffrax.Term(system), solver, 0.0, -T, -T / n, X0, throw=False)
+        assert run.result == diffrax.RESULTS.successful
+        ends.append(run.ys[-1])
+    first, second = (float(np.abs(x - exact.y[:, -1]).max()) for x in ends)
+    assert second < 1e-12 or np.log2(first / second) > method.order - 0.4, (first, second)
+    assert float(system.energy(ends[1])) == pytest.approx(float(system.energy(X0)), rel=1e-14)
+    assert float(system.entropy(ends[1])) < float(system.entropy(X0)) - 1e-3
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6)], ids=str)
+def test_adaptive_steps_backwards_are_as_many_as_forwards(method):
+    """Of a motion that can be reversed: an error is a size, whichever way time runs."""
+    system = lt.models.free_rigid_body((3.0, 2.0, 1.0))
+    controller = diffrax.PIDController(rtol=1e-8, atol=1e-10)
+
+    def run(x, start, end):
+        return diffrax.diffeqsolve(
+            lt.diffrax.Term(system), lt.diffrax.Solver(method), start, end, 0.1 * (end - start), x,
+            stepsize_controller=controller,
+        )  # fmt: skip
+
+    there = run(X0, 0.0, 2.0)
+    back = run(there.ys[-1], 2.0, 0.0)
+    assert np.abs(back.ys[-1] - X0).max() < 1e-6
+    steps = [int(part.stats["num_steps"]) for part in (there, back)]
+    assert abs(steps[1] - steps[0]) <= 0.2 * steps[0] + 2, steps
 
 
 @pytest.mark.slow

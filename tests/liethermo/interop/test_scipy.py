@@ -34,7 +34,11 @@ def test_it_agrees_with_scipy_and_keeps_the_laws():
 
 
 def crossing(t, y):
-    return y[0] - y[1]
+    return y[0] - y[1] + 0.1 * np.sin(t)
+
+
+def turning(t, y):
+    return np.sin(3.0 * t) + y[2] - 1.0
 
 
 def _event(function, **attributes):
@@ -43,32 +47,94 @@ def _event(function, **attributes):
     return copy
 
 
+def both(events, span=SPAN, rtol=1e-10, **settings):
+    """SciPy's answer and ours."""
+    settings = {"events": events, "rtol": rtol, "atol": rtol, **settings}
+    return solve_ivp(field, span, X0, "DOP853", **settings), lt.scipy.solve_ivp(BODY, span, X0, **settings)
+
+
+def same_events(theirs, ours, tolerance=1e-8):
+    assert ours.status == theirs.status
+    assert [len(times) for times in ours.t_events] == [len(times) for times in theirs.t_events]
+    for name in ("t_events", "y_events"):
+        for one, other in zip(getattr(ours, name), getattr(theirs, name), strict=True):
+            assert np.abs(one - other.reshape(one.shape)).max(initial=0.0) < tolerance
+
+
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 def test_events_are_those_of_scipy(direction):
-    watched = _event(crossing, direction=direction)
-    settings = {"rtol": 1e-10, "atol": 1e-12, "dense_output": True}
-    theirs = solve_ivp(field, SPAN, X0, "DOP853", events=[watched], **settings)
-    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=[watched], **settings)
-    assert ours.t_events is not None
-    assert ours.y_events is not None
-    assert ours.sol is not None
-    assert ours.t_events[0].shape == theirs.t_events[0].shape
-    assert np.allclose(ours.t_events[0], theirs.t_events[0], atol=1e-5)
-    assert ours.y_events[0].shape[-1] == 3
+    watched = [_event(f, direction=direction) for f in (crossing, turning)]
+    theirs, ours = both(watched, dense_output=True)
+    same_events(theirs, ours)
+    assert len(ours.t_events[0]) + len(ours.t_events[1]) > 2
     assert ours.sol([1.0, 2.0]).shape == theirs.sol([1.0, 2.0]).shape == (3, 2)
     assert ours.sol(1.0).shape == (3,)
+    assert np.abs(ours.sol(TIMES) - theirs.sol(TIMES)).max() < 1e-8
 
 
-def test_a_terminal_event_ends_the_run_and_the_laws_hold_there():
-    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=_event(crossing, terminal=True), rtol=1e-9, atol=1e-12)
+TIMES = np.linspace(*SPAN, 50)
+
+
+@pytest.mark.parametrize("method", [None, lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)], ids=str)
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_events_are_zeros_and_as_accurate_as_asked_and_the_laws_hold_there(rtol, method):
+    exact = solve_ivp(field, SPAN, X0, "DOP853", events=crossing, rtol=3e-14, atol=1e-16).t_events[0]
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, method, events=crossing, rtol=rtol, atol=rtol, dense_output=True)
+    assert np.abs(ours.t_events[0] - exact).max() < 30.0 * rtol
+    assert max(abs(crossing(t, y)) for t, y in zip(ours.t_events[0], ours.y_events[0], strict=True)) < 2e-15
+    states = np.concatenate([ours.y_events[0], ours.sol(TIMES).T])
+    energies = [float(BODY.energy.value(y)) for y in states]
+    assert np.ptp([*energies, ours.solution.energy[0]]) < 2e-15
+
+
+def test_several_zeros_in_a_step_are_found():
+    """Steps are up to half a radian long at this tolerance, and more than two zeros may be in one."""
+    theirs, ours = both(lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, max_step=0.05)
+    long = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, atol=1e-6)
+    same_events(theirs, ours, 1e-5)
+    assert len(long.t) < len(theirs.t_events[0]) / 2
+    assert np.abs(long.t_events[0] - theirs.t_events[0]).max() < 1e-4
+
+
+@pytest.mark.parametrize("terminal", [True, 2, 3])
+def test_terminal_events_end_the_run_at_their_zeros(terminal):
+    """Others are kept up to there; the last state is the event's."""
+    turned = lambda t, y: turning(t, y) - 0.01  # noqa: E731
+    theirs, ours = both([_event(turned, terminal=terminal), crossing], dense_output=True)
+    same_events(theirs, ours)
     assert (ours.status, ours.success, ours.message) == (1, True, "A termination event occurred.")
-    assert ours.t_events is not None
-    assert ours.t[-1] == pytest.approx(ours.t_events[0][0])
-    assert abs(crossing(ours.t[-1], ours.y[:, -1])) < 1e-5
-    assert ours.solution.audit().energy_drift < 1e-14
-    second = lt.scipy.solve_ivp(BODY, SPAN, X0, events=_event(crossing, terminal=2), rtol=1e-9, atol=1e-12)
-    assert second.t_events is not None
-    assert len(second.t_events[0]) == 2
+    assert len(ours.t_events[0]) == int(terminal)
+    assert ours.t[-1] == ours.t_events[0][-1]
+    assert np.array_equal(ours.y[:, -1], ours.y_events[0][-1])
+    assert abs(turned(ours.t[-1], ours.y[:, -1])) < 2e-15
+    assert ours.solution.audit().passed
+    assert np.array_equal(ours.sol(ours.t[-1]), ours.y[:, -1])
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_events_at_both_ends(terminal):
+    """Exactly at the end, and at the start, as SciPy has them; an end of a step is passed once."""
+    for time in (SPAN[1], SPAN[0]):
+        theirs, ours = both(_event(lambda t, y, time=time: t - time, terminal=terminal))
+        same_events(theirs, ours)
+        assert ours.t_events[0].tolist() == [time]
+        assert ours.t[-1] == (time if terminal else SPAN[1])
+    kept = lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[1.0, 3.0], events=lambda t, y: t - 3.0)
+    assert kept.t_events[0].tolist() == [3.0]
+
+
+def test_a_function_that_is_not_a_number_has_no_zero_there():
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < 0.5 else t - 3.0)
+    assert ours.t_events[0].size == 0
+
+
+def test_arguments_of_scipy():
+    """Its limit of steps is infinite by default; what it passes to functions goes to the events."""
+    level = lambda t, y, c: crossing(t, y) - c  # noqa: E731
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=level, args=(0.01,), vectorized=True, max_step=np.inf)
+    assert crossing(ours.t_events[0][0], ours.y_events[0][0]) == pytest.approx(0.01, abs=1e-15)
+    assert lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[0.0]).t.tolist() == [0.0]
+    assert lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[]).t.size == 0
 
 
 def test_a_failure_is_told_as_scipy_tells_it():
@@ -79,8 +145,23 @@ def test_a_failure_is_told_as_scipy_tells_it():
     assert result.message
 
 
-def test_bad_input_is_refused():
-    with pytest.raises(lt.InputError, match="must be a system"):
-        lt.scipy.solve_ivp(field, SPAN, X0)
-    with pytest.raises(lt.InputError, match="increasing"):
-        lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[2.0, 1.0])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"fun": field}, "must be a system"),
+        ({"t_eval": [2.0, 1.0]}, "increasing"),
+        ({"t_eval": [1.0, 9.0]}, r"has the time 9, which is outside of t_span = \(0, 8\)"),
+        ({"t_eval": [-1.0, 1.0]}, "has the time -1"),
+        ({"t_span": (8.0, 0.0)}, "runs backwards, and time runs forwards here, since entropy grows"),
+        ({"t_span": 3.0}, "two numbers"),
+        ({"args": (1.0,)}, "args are passed to the events, and there are none"),
+        ({"args": 1.0, "events": crossing}, r"write args=\(1.0,\)"),
+        ({"events": _event(crossing, terminal=-1)}, "terminal is True or how many"),
+        ({"jac": None}, "leave out jac: the methods take it from the system"),
+        ({"rtoll": 1e-6}, "leave out rtoll: solve_ivp has no such option"),
+        ({"max_step": -1.0}, "largest step"),
+    ],
+)
+def test_bad_input_is_refused(given, message):
+    with pytest.raises(lt.InputError, match=message):
+        lt.scipy.solve_ivp(**({"fun": BODY, "t_span": SPAN, "y0": X0} | given))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -52,6 +54,28 @@ def test_an_energy_from_sympy_runs():
         assert lt.integrate(system, [0.1, 0.2, 1.0], (0.0, 2.0), 0.1).audit().passed
     with pytest.raises(lt.InputError, match="k in"):
         lt.sympy.function(sympy.Symbol("k") * a, x)
+
+
+@pytest.mark.parametrize(
+    ("expression", "name"),
+    [
+        (lambda x, y: sympy.LambertW(x) + y, "LambertW"),
+        (lambda x, y: y * sympy.Function("f")(x), "f"),
+        (lambda x, y: sympy.exp(sympy.fresnels(x)) + y, "fresnels"),
+        (lambda x, y: sympy.Integral(sympy.exp(-(y**2)), (y, 0, x)), "Integral"),
+    ],
+)
+def test_a_function_that_jax_lacks_is_named(expression, name):
+    x, y = sympy.symbols("x y")
+    with pytest.raises(lt.InputError, match=f"^{name} in .* has no counterpart in JAX"):
+        lt.sympy.function(expression(x, y), (x, y))
+
+
+def test_special_functions_are_those_of_jax():
+    x, y = sympy.symbols("x y")
+    f = lt.sympy.function(sympy.erf(x) + sympy.gamma(y) + sympy.loggamma(y), (x, y))
+    expected = math.erf(0.3) + math.gamma(1.7) + math.lgamma(1.7)
+    assert float(jax.jit(f)(jnp.array([0.3, 1.7]))) == pytest.approx(expected, rel=1e-14)
 
 
 def test_a_problem_written_down_is_the_problem(tmp_path):

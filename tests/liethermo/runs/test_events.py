@@ -63,25 +63,95 @@ def test_a_body_that_relaxes_for_a_moment_is_relaxed(method):
     assert late.any(), "steps of given size are looked at where they end, and miss some"
 
 
+# -- an event is a zero, or there is none -----------------------------------------------------------------------------
+
+ENGINES = ["compiled", pytest.param("array", marks=pytest.mark.slow)]
+HALF = np.arccos(0.5)
+
+
+def hole(w):
+    """Zero in the middle of where it is not a number; -w where it is one again."""
+    return lambda x: jnp.where(jnp.abs(x[0] - 0.5) < w, jnp.nan, x[0] - 0.5)
+
+
+def watched(until, step, engine="compiled", order=8):
+    """Alone, and as an ensemble tells it."""
+    given = (0.0, 3.0), step, lt.MetriplecticRungeKutta(order)
+    found = lt.integrate(OSCILLATOR, [1.0, 0.0], *given, until=until, engine=engine, on_failure="return")
+    many = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [1.0, 0.0]], *given, until=until, engine=engine)
+    assert [found.status.code] * 2 == [status.code for status in map(many.status_of, range(2))]
+    times = np.nan if found.event_time is None else found.event_time
+    assert many.event_time == pytest.approx([times] * 2, abs=1e-13, nan_ok=True)
+    return found
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("step", [lt.Adaptive(1e-8), 0.1])
+@pytest.mark.parametrize("order", [4, 6, 8])
+def test_the_edge_of_a_hole_is_no_event(order, engine, step):
+    """Whether it is zero in the hole is not known, and the run says so: for holes of every size, on any processor."""
+    for w in (1e-3, 0.01, 0.02, 0.05, 0.1, 0.3):
+        found = watched(hole(w), step, engine, order)
+        assert (found.status.code, found.event_time) == ("non_finite", None), w
+        assert "the event function is not a number" in found.status.message
+        assert found.t[-1] == pytest.approx(HALF, abs=0.11 + 2 * w)
+
+
+JUMPS = {
+    "a step": lambda x: jnp.where(x[0] > 0.5, 1.0, -1.0),
+    "hardly a step down": lambda x: jnp.where(2.0 * x[0] > 1.0, 1.0, -1e-6),
+    "a pole": lambda x: 1.0 / (x[0] - 0.5),
+    "a pole in other units": lambda x: 1e-20 / (x[0] - 0.5),
+    "an angle": lambda x: jnp.arctan2(x[0] - 0.5, x[1]),
+}
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
-@pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
-def test_a_part_of_a_step_that_fails_is_not_passed_over(engine, step):
-    """The event is where the function is not a number: adaptive steps become shorter in vain, given ones say so."""
-    until = lambda x: jnp.where(jnp.abs(x[0] - 0.5) < 0.02, jnp.nan, x[0] - 0.5)  # noqa: E731
-    found = lt.integrate(
-        OSCILLATOR,
-        [1.0, 0.0],
-        (0.0, 4.0),
-        step,
-        lt.MetriplecticRungeKutta(8),
-        until=until,
-        engine=engine,
-        on_failure="return",
-    )
-    assert found.event_time is None
-    assert found.status.code == ("non_finite" if step == 0.1 else "step_underflow")
-    assert ("the event function is not a number" in found.status.message) == (step == 0.1)
-    assert found.t[-1] == pytest.approx(np.arccos(0.5), abs=0.11)
+def test_a_jump_is_no_event_and_the_run_goes_on(name, engine, step):
+    found = watched(JUMPS[name], step, engine)
+    assert (found.status.code, found.event_time, found.t[-1]) == ("completed", None, 3.0)
+    assert "changed its sign 1 times without being zero, first at t = 1.0472" in found.status.message
+    assert found.audit().passed
+    assert found.x[-1] == pytest.approx([np.cos(3.0), -np.sin(3.0)], abs=1e-6)
+
+
+ZEROS = {
+    "after a pole": (lambda x: jnp.tan(3.0 * (x[0] - 0.5) + jnp.pi / 2), np.arccos(0.5 - np.pi / 6)),
+    "of infinite slope": (lambda x: jnp.cbrt(x[0] - 0.5), HALF),
+    "of no slope": (lambda x: (x[0] - 0.5) ** 3, HALF),
+    "among large terms": (lambda x: (x[0] + 1e6) - (1e6 + 0.3), np.arccos(0.3)),
+    "of a small function": (lambda x: 1e-20 * (x[0] - 0.5), HALF),
+    "of a large function": (lambda x: 1e20 * (x[0] - 0.5), HALF),
+    "after a hole": (lambda x: jnp.where(jnp.abs(x[0] - 0.7) < 0.05, jnp.nan, x[0] - 0.5), HALF),
+    "next to a jump": (lambda x: jnp.where(x[0] > 0.5, 1.0, x[0] - 0.49), np.arccos(0.49)),
+}
+
+
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", ZEROS)
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
+def test_a_zero_is_an_event_however_it_is_rounded(name, engine, step):
+    until, exact = ZEROS[name]
+    found = watched(until, step, engine)
+    assert found.event_time == pytest.approx(exact, abs=1e-6 if name != "of no slope" else 1e-4)
+    assert found.audit().passed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
+def test_jumps_and_zeros_of_a_body_with_an_attitude_in_any_unit(unit):
+    """The attitude has none: its rounding is not that of the momenta."""
+    inertia = np.array([3.0, 2.0, 1.0]) * unit
+    body = lt.LiePoissonSystem(mf.so(3), lambda p: 0.5 * jnp.sum(p * p / inertia), group=mf.SO(3))
+    given = body, np.array([0.1, 0.9, 0.3]) * unit, (0.0, 6.0), lt.Adaptive(1e-8), lt.MetriplecticRungeKutta(8)
+    jump = lt.integrate(*given, until=lambda x: jnp.where(x[0] > 0.3 * unit, unit, -1e-3 * unit))
+    zero = lt.integrate(*given, until=lambda x: x[0] - 0.3 * unit)
+    assert (jump.event_time, zero.event_time) == (None, pytest.approx(1.44063018, abs=1e-7))
 
 
 @pytest.mark.parametrize(
@@ -107,3 +177,52 @@ def test_an_event_that_comes_and_goes_within_a_step_is_seen(method):
     assert abs(found.x[-1, 1] - level) < 1e-13
     many = lt.ensemble(body, np.tile(x0, (3, 1)), *arguments, until=lambda x: x[1] - level)
     assert np.abs(many.event_time - found.event_time).max() < 1e-12
+
+
+@pytest.mark.sampled("adaptive-compiled-gauss", "fixed-compiled-rk8")
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), METHODS[1]], ids=["gauss", "rk8"])
+@pytest.mark.parametrize("engine", ["compiled", "array"])
+@pytest.mark.parametrize("step", [pytest.param(0.1, id="fixed"), pytest.param(lt.Adaptive(1e-9), id="adaptive")])
+def test_a_body_whose_energy_falls_is_relaxed_where_it_falls_no_more(step, engine, method):
+    """To rounding, in runs and ensembles, in any unit; the fall is that of the formula ``rate |mu x xi|^2``."""
+    inertia, rate, tol, start = np.array([3.2, 3.0, 1.0]), 0.2, 1e-7, np.array([[1.0, 0.3, 0.5], [0.2, 0.3, 0.9]])
+
+    def fall(mu, scale=1.0):
+        return rate / scale * np.sum(np.cross(mu, mu / (scale * inertia)) ** 2, axis=-1)
+
+    times = []
+    for scale in (1.0, 1e20):
+        H = lt.Quadratic(1.0 / (scale * inertia))
+        body = lt.LiePoissonSystem(mf.so(3), H, dissipation=lt.DoubleBracket(rate / scale))
+        until = lt.Relaxed(scale * tol)
+        run = lt.integrate(body, scale * start[0], (0.0, 1e3), step, method, until=until, engine=engine)
+        assert run.status.code == "event"
+        assert "fall of the energy below" in run.status.message
+        assert abs(fall(run.x[-1], scale) / (scale * tol) - 1.0) < 1e-9
+        many = lt.ensemble(body, scale * start, (0.0, 1e3), step, method, until=until, engine=engine)
+        assert np.abs(fall(many.x, scale) / (scale * tol) - 1.0).max() < 1e-9
+        assert abs(many.event_time[0] - run.event_time) < 1e-9
+        times.append(run.event_time)
+    assert abs(times[1] - times[0]) < 1e-6
+    assert np.allclose(body.energy_fall(scale * start), fall(scale * start, scale), rtol=1e-13)
+
+
+def rubbing(point):
+    return lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.3, 0.5, 1.0]), dissipation=lt.DoubleBracket(point["rate"]))
+
+
+def test_a_study_of_bodies_whose_energy_falls():
+    """The time is inverse to the rate, but for where the motion has turned the body."""
+    study = lt.Study(
+        rubbing, {"rate": [0.1, 0.2]}, x0=[1.0, 0.3, 0.5], t_span=(0.0, 1e3), step=0.1, method=METHODS[1],
+        measure={"relaxed": lt.Relaxed(1e-6)},
+    )  # fmt: skip
+    study.run()
+    slow, fast = study.results.relaxed.values
+    assert 0.3 * slow < fast < 0.7 * slow < 700.0
+
+
+def test_what_does_not_relax_has_no_relaxed_state():
+    free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.3, 0.5, 1.0]))
+    with pytest.raises(lt.InputError, match="the entropy production or the fall of the energy"):
+        lt.integrate(free, [1.0, 0.3, 0.5], (0.0, 1.0), 0.1, until=lt.Relaxed(1e-8))

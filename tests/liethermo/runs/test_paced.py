@@ -245,16 +245,18 @@ def test_interrupted(monkeypatch):
     [
         ({"outputs": "trajectory"}, "give save_at"),
         (
-            {"system": lt.models.mass_spring_gas(), "x0s": np.full(3, 0.5), "method": lt.VariationalGauss(2)},
+            {"system": lt.models.mass_spring_gas, "x0s": np.full(3, 0.5), "method": lt.VariationalGauss(2)},
             "cannot be adaptive: what a variational scheme keeps",
         ),
         ({"until": 3.0}, "until must be"),
         ({"until": lambda x: x}, "one number"),
-        ({"system": lt.models.free_rigid_body(), "until": lt.Relaxed(1e-3)}, "produces no entropy"),
+        ({"system": lt.models.free_rigid_body, "until": lt.Relaxed(1e-3)}, "produces no entropy"),
         ({"save_at": [11.0]}, "outside"),
     ],
 )
 def test_bad_input(arguments, message):
+    if "system" in arguments:
+        arguments = arguments | {"system": arguments["system"]()}
     default = {"system": BODY, "x0s": states(2), "t_span": SPAN, "step": lt.Adaptive(1e-6)}
     with pytest.raises(lt.LiethermoError, match=message):
         lt.ensemble(**(default | arguments))

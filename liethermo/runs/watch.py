@@ -1,0 +1,169 @@
+"""Functions of time and state whose zeros are located along a run, in the conventions of SciPy's ``solve_ivp``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..engines.choice import Chosen
+from ..engines.codes import Code
+from ..engines.rules import EPS
+from ..engines.stepping import State
+from ..errors import InputError
+from ..integrators import OneStepMethod
+from ..systems import System
+from ..tracing.programs import program
+
+
+class Watch:
+    """Events for ``integrate(until=...)`` with adaptive steps: any number, counted, and only some of them an end.
+
+    A step in which a function changes its sign, at its ends or at the looks of the method between, is taken again in
+    parts until one ends at the zero: :attr:`states` are ends of steps, so that the laws hold there.
+
+    Parameters
+    ----------
+    functions : sequence of functions of (t, y, *args) to a number
+        Called with NumPy arrays, y of shape (n,). The attribute ``terminal``, True or a number, ends the run at this
+        zero; ``direction`` counts zeros alone at which the function rises, where it is positive, or falls.
+    args : tuple
+
+    Attributes
+    ----------
+    times, states : list of list
+        For each function when it has been zero, and the states then, as the user sees them.
+    """
+
+    name = "a terminal event"
+
+    def __init__(self, functions: Sequence[Callable], args: tuple = ()):
+        self.functions, self.args = list(functions), args
+        self.directions = [float(getattr(f, "direction", 0) or 0) for f in self.functions]
+        self.most = [_count(f) for f in self.functions]
+        self.times: list[list[float]] = [[] for _ in self.functions]
+        self.states: list[list[np.ndarray]] = [[] for _ in self.functions]
+        self._values: np.ndarray | None = None  # at the end of the last step
+
+    def of_step(
+        self, engine: Chosen, t: float, h: float, reached: float, before: State, after: State
+    ) -> tuple[float, float, State | None] | None:
+        """Note the zeros in a step; of the first that ends the run the time, the size of the step to it and its state.
+
+        No state where that is the start of the run.
+        """
+        step = _Step(engine, t, h, reached, before, after)
+        start, first = self._values, self._values is None
+        if start is None:
+            start = np.array([self._value(j, step, 0.0) for j in range(len(self.functions))])
+        self._values = np.array([self._value(j, step, 1.0) for j in range(len(self.functions))])
+        found: list[tuple[float, int]] = []
+        for j, (value, end) in enumerate(zip(start, self._values, strict=True)):
+            if first and value == 0.0 and self._counts(j, -end, end):
+                found.append((0.0, j))
+            found += [(share, j) for share in self._zeros(j, step, value, end)]
+        for share, j in sorted(found):
+            self.times[j].append(step.time(share))
+            self.states[j].append(step.seen(share))
+            if len(self.times[j]) == self.most[j]:
+                return step.time(share), share * h, None if share == 0.0 else step.state(share)
+        return None
+
+    def _value(self, j: int, step: _Step, share: float) -> float:
+        return float(self.functions[j](step.time(share), step.seen(share), *self.args))
+
+    def _counts(self, j: int, before: float, after: float) -> bool:
+        """Whether a change from one value to another is one of those that are asked for."""
+        direction = self.directions[j]
+        return (before < 0.0 <= after and direction >= 0.0) or (before > 0.0 >= after and direction <= 0.0)
+
+    def _zeros(self, j: int, step: _Step, start: float, end: float) -> list[float]:
+        """The shares of a step at which a function is zero: the looks tell where a part of the step is to be tried."""
+        from scipy.optimize import brentq
+
+        shares = [0.0, *step.looks, 1.0]
+        between = [
+            float(self.functions[j](step.time(share), y, *self.args))
+            for share, y in zip(step.looks, step.between, strict=True)
+        ]
+        values, known = [start, *between, end], {0, len(shares) - 1}
+        while True:
+            changes = [i for i in range(len(shares) - 1) if _changes(values[i], values[i + 1])]
+            unsure = {i + side for i in changes for side in (0, 1)} - known
+            if not unsure:
+                break
+            for i in unsure:
+                values[i] = self._value(j, step, shares[i])
+            known |= unsure
+        found = []
+        for i in changes:
+            if not self._counts(j, values[i], values[i + 1]):
+                continue
+            if values[i + 1] == 0.0:
+                found.append(shares[i + 1])
+                continue
+            root = brentq(
+                lambda share: self._value(j, step, share), shares[i], shares[i + 1], xtol=EPS**2, rtol=4.0 * EPS
+            )
+            if not np.isnan(self._value(j, step, root)):
+                found.append(root)
+        return found
+
+
+class _Step:
+    """A step of a run, and states on the way: ends of parts of it, which are steps too."""
+
+    def __init__(self, engine: Chosen, t: float, h: float, reached: float, before: State, after: State):
+        self.engine, self.t, self.h, self.reached = engine, t, h, reached
+        self._states = {0.0: before, 1.0: after}
+        self._seen: dict[float, np.ndarray] = {}
+        self.looks = [float(share) for share in engine.method.looks]
+        self._between: np.ndarray | None = None
+
+    def time(self, share: float) -> float:
+        return self.reached if share == 1.0 else self.t + share * self.h
+
+    def state(self, share: float) -> State:
+        if share not in self._states:
+            self._states[share] = self.engine.step(self._states[0.0], share * self.h)
+        return self._states[share]
+
+    def seen(self, share: float) -> np.ndarray:
+        """The state as the user sees it; NaN where the part of the step cannot be taken."""
+        if share not in self._seen:
+            state = self.state(share)
+            y = np.asarray(self.engine.system.seen(np.asarray(state.x)))
+            self._seen[share] = y if int(state.status) == Code.COMPLETED else np.full_like(y, np.nan)
+        return self._seen[share]
+
+    @property
+    def between(self) -> np.ndarray:
+        """About the states at the looks, by the polynomial of the step."""
+        if self._between is None:
+            method, after = self.engine.method, self._states[1.0]
+            v = self.h * (np.asarray(method.weights(np.array(self.looks))) @ np.asarray(after.k))
+            x = _along(self.engine.system, method, np.asarray(self._states[0.0].x), v)
+            self._between = np.asarray(self.engine.system.seen(np.asarray(x)))
+        return self._between
+
+
+def _changes(before: float, after: float) -> bool:
+    """Whether a zero is crossed, or arrived at."""
+    return before * after < 0.0 or (after == 0.0 and before != 0.0 and not np.isnan(before))
+
+
+def _count(function: Any) -> int | None:
+    """At which of its zeros a function ends the run."""
+    terminal = getattr(function, "terminal", None)
+    if terminal is None or terminal is False or terminal == 0:
+        return None
+    if int(terminal) != terminal or terminal < 0:
+        raise InputError(f"terminal is True or how many zeros end the run, not {terminal!r}")
+    return int(terminal)
+
+
+@program
+def _along(system: System, method: OneStepMethod, x, v):
+    return jax.vmap(lambda v: method.along(system, x, v))(v)
