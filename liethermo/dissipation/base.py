@@ -8,6 +8,8 @@ Remark 4.7 ask for, once for every class.
 
 from __future__ import annotations
 
+import functools
+import operator
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, TypeVar
@@ -18,6 +20,7 @@ import scipy
 
 from manifolds._module import Module
 
+from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.indices import union
 from .factor import Factor, beside
@@ -96,10 +99,20 @@ class Dissipation(Module):
         system : Geometry
         x : array, shape (n,)
         dH, dS : array, shape (n,)
-            Gradients of energy and entropy, continuous or discrete.
+            Gradients of energy and entropy, continuous or discrete. dS may be None of a system without an entropy.
         dL : tuple of array, shape (n,)
             Gradients of the functions in :attr:`preserve`, in their order.
         """
+
+    def velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
+        """sigma with force ``Pi(x) sigma``, shape (n,), where the dissipation says that it acts so; else None.
+
+        On a Lie algebra the force is ``ad*_sigma x``: friction inside a body, which carries the momentum along its
+        coadjoint orbit by a further velocity. An attitude that follows it too keeps the momentum in space. A force of
+        another form is a torque from outside. Whether it is None depends on the construction alone.
+        """
+        del system, x, dH, dS, dL
+        return None
 
     def factor(self, system: Geometry, x, dH, dL) -> Factor | None:
         """A matrix B with ``B B^T = K``, of the friction matrix K that the force is K dS with; None where it has none.
@@ -192,6 +205,28 @@ class Several(Dissipation):
         found = [part.factor(system, x, dH, own) for part, own in portions(self, dL)]
         given = [B for B in found if B is not None]
         return beside(given) if len(given) == len(found) else None
+
+
+def total(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
+    """What a system is given as its dissipation: one, none, or a list or tuple of those that act together.
+
+    Raises
+    ------
+    InputError
+        If the list is empty, or holds what is no dissipation.
+    """
+    if given is None or isinstance(given, Dissipation):
+        return given
+    if not isinstance(given, list | tuple):
+        raise InputError(
+            f"dissipation must be a Dissipation of this library, a list of them or None, not {type(given).__name__}"
+        )
+    if not given:
+        raise InputError("dissipation is an empty list: a system without dissipation is given None")
+    for i, part in enumerate(given):
+        if not isinstance(part, Dissipation):
+            raise InputError(f"dissipation[{i}] must be a Dissipation of this library, not {type(part).__name__}")
+    return functools.reduce(operator.add, given)
 
 
 def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:

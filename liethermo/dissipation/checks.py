@@ -55,6 +55,15 @@ def checked_rates(rates) -> jax.Array:
     return array
 
 
+def not_a_rate(form, dissipation: object, what: str) -> None:
+    """Raise where a number stands for a form: that of a multiple of the identity is another thing than a rate."""
+    if form is not None and not callable(form) and np.ndim(form) == 0:
+        raise InputError(
+            f"{type(dissipation).__name__} takes {what} first, a matrix, and {form} is a number: for a rate say "
+            f"rate={form}"
+        )
+
+
 def semidefinite(form, what: str) -> jax.Array:
     """A form as a symmetric positive semidefinite matrix (or a traced one)."""
     matrix = real_array(form)

@@ -17,7 +17,8 @@ class DoubleBracket(Dissipation):
 
     ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
     on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir
-    and is conserved.
+    and is conserved. On so(3) it moves the momentum of a body that is left to itself and has parts that rub: |mu| is
+    constant, and the kinetic energy falls. The heat is not followed.
 
     Parameters
     ----------
@@ -58,14 +59,24 @@ class DoubleBracket(Dissipation):
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
     def force(self, system, x, dH, dS, dL):
+        return self.rate * system.poisson.sharp(x, self._lowered(system, x, dH))
+
+    def velocity(self, system, x, dH, dS, dL):
+        return self.rate * self._lowered(system, x, dH)
+
+    def _lowered(self, system, x, dH) -> jax.Array:
+        """``(Pi dH)^♯``."""
         motion = system.poisson.sharp(x, dH)
-        lowered = system.lowered(x, motion) if self.metric is None else self.metric @ motion
-        return self.rate * system.poisson.sharp(x, lowered)
+        return system.lowered(x, motion) if self.metric is None else self.metric @ motion
 
     def factor(self, system, x, dH, dL):
         root = None if self.metric is None else root_of(self.metric)
 
-        def times(w):
-            return system.poisson.sharp(x, system.lowered(x, system.isotropic(x, w)) if root is None else root @ w)
+        def velocity(w):
+            return system.lowered(x, system.isotropic(x, w)) if root is None else root @ w
 
-        return Factor(system.isotropic_size if root is None else system.dim, times).scaled(self.rate)
+        def times(w):
+            return system.poisson.sharp(x, velocity(w))
+
+        size = system.isotropic_size if root is None else system.dim
+        return Factor(size, times, velocity=velocity).scaled(self.rate)

@@ -25,11 +25,14 @@ class Factor(NamedTuple):
         From w, shape (size,), to ``B w``, shape (n,); linear.
     solenoidal : bool
         Whether every column, at the gradients of the functions, is a field of divergence zero.
+    velocity : function or None
+        From w to sigma with ``B w = Pi(x) sigma``, where the construction is such: see :meth:`.Dissipation.velocity`.
     """
 
     size: int
     times: Callable[[jax.Array], jax.Array]
     solenoidal: bool = False
+    velocity: Callable[[jax.Array], jax.Array] | None = None
 
     def transposed(self, alpha) -> jax.Array:
         """``B^T alpha``, shape (size,)."""
@@ -38,7 +41,8 @@ class Factor(NamedTuple):
     def scaled(self, rate) -> Factor:
         """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
         root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)  # zero has a derivative too
-        return self._replace(times=lambda w: root * self.times(w))
+        velocity = None if (along := self.velocity) is None else lambda w: root * along(w)
+        return self._replace(times=lambda w: root * self.times(w), velocity=velocity)
 
 
 def root_of(form) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, form_at, semidefinite
+from .checks import check_matrix, checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
 
 
@@ -34,6 +34,7 @@ class Friction(Dissipation):
     rate: jax.Array
 
     def __init__(self, D=None, rate=1.0):
+        not_a_rate(D, self, "the friction D")
         if D is not None and not callable(D):
             D = semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D

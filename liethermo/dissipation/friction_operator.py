@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, form_at, semidefinite
+from .checks import check_matrix, checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
 
 KERNEL = "K grad H = 0, as given"
@@ -42,6 +42,7 @@ class FrictionOperator(Dissipation):
     project: bool = eqx.field(static=True)
 
     def __init__(self, K, rate=1.0, project: bool = False):
+        not_a_rate(K, self, "the operator K")
         self.K = K if callable(K) else semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
         self.project = bool(project)

@@ -121,7 +121,7 @@ class LandauLifshitz(Dissipation):
         if not self.baths:
             return scaled(rate, cross_planes(s, torque)), jnp.zeros(0)
         T = dH[3 * spins.count :]
-        share, size = self._of_sites(e / T), rate * self._of_sites(jnp.abs(T))
+        share, size = self._of_sites(e / T), rate * self._of_sites(_size(T))
         if dS is None:
             strength = size * share
             return scaled(strength, cross_planes(s, torque)), self._heat(strength, torque, torque) / T
@@ -133,7 +133,7 @@ class LandauLifshitz(Dissipation):
         spins = system.poisson
         s, rate, T = spins.spins(x), self.rate.reshape(-1), dH[3 * spins.count :]
         torque = cross_planes(s, spins.covectors(dH))
-        size = rate * self._of_sites(jnp.abs(T)) if self.baths else rate
+        size = rate * self._of_sites(_size(T)) if self.baths else rate
         root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
 
         def times(w):
@@ -153,3 +153,8 @@ class LandauLifshitz(Dissipation):
             return jax.ops.segment_sum(size * dotted(torque, pull), np.asarray(self.bath).ravel(), self.baths)
         whole = size[0] * summed(torque, pull) if size.size == 1 else jnp.sum(size * dotted(torque, pull))
         return jnp.zeros(self.baths).at[0].set(whole)
+
+
+def _size(T) -> jax.Array:
+    """``|T|``, with Taylor series: a temperature changes its sign at no state, and ``abs`` would not say so."""
+    return jnp.where(T < 0.0, -T, T)

@@ -17,7 +17,7 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from ..functions.checks import recognised
 from ..functions.energy import Energy, as_energy
 from .base import Dissipation
-from .checks import checked_rate, form_at, semidefinite
+from .checks import checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
 
 
@@ -53,6 +53,7 @@ class ProjectedMetric(Dissipation):
     rate: jax.Array
 
     def __init__(self, cometric=None, preserve=(), normalized=False, rate=1.0):
+        not_a_rate(cometric, self, "the cometric")
         self.cometric = cometric if cometric is None or callable(cometric) else semidefinite(cometric, "the cometric")
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
         self.functions = tuple(as_energy(L, "a preserved function") for L in functions)

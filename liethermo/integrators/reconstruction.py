@@ -11,7 +11,7 @@ from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
 from ..functions.gradients import compensated
-from ..systems import AttitudeSystem, TurningSystem
+from ..systems import SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
 from .base import OneStepMethod
 from .tableaus import gauss
 
@@ -19,15 +19,20 @@ RECONSTRUCTIONS = ("coadjoint", "cayley", "exp")
 
 
 class WithAttitude(OneStepMethod):
-    """A method for momenta, and beside it ``g' = g hat(xi)`` at its stages, xi_i its discrete gradients of the energy.
+    """A method for momenta, and after it ``g' = g hat(xi)``, xi_i the velocities that it moves with at its stages.
+
+    The equations of a step are those of the momentum alone, and their tolerances are measured by it. The attitude is
+    then found without any: so it does not depend on the units of the momentum. xi is the discrete gradient of the
+    energy, and what friction inside adds to it [:meth:`liethermo.Dissipation.velocity`].
 
     ``"cayley"`` is Gauss collocation on the matrices, ``G_i = g + h sum_j A_ij G_j hat(xi_j)``: with one stage
     ``g' = g cayley(h xi)``. It keeps what is quadratic in g: that g is orthogonal, unitary or symplectic.
 
     ``"coadjoint"`` is the same collocation on the matrices Ad(g), which ends at ``Ad(g) R``: ``g' = g
-    adjoint_cayley(x)`` with ``cay(ad x) = R``, and with one stage x = h xi. A free body's ``mu' = ad*_xi mu`` gives
-    ``mu' = R^T mu`` at every number of stages, for every step and every energy, as long as the method takes its slopes
-    from Pi alone. So the spatial momentum ``Ad_star(inverse(g), mu)`` is kept to rounding. That R is an adjoint action
+    adjoint_cayley(x)`` with ``cay(ad x) = R``, and with one stage x = h xi. Where no torque acts ``mu' = ad*_xi mu``
+    gives ``mu' = R^T mu`` at every number of stages, for every step and every energy, as long as the method takes its
+    slopes from Pi alone. So the spatial momentum ``Ad_star(inverse(g), mu)`` is kept to rounding: of a free body, and
+    of one with a :class:`liethermo.DoubleBracket`. That R is an adjoint action
     is a property of the group: it is for SO(2), SO(3), SO(4), SE(2), SE(3), SU(2), SL(2), Sp(1), GL(2) and
     Heisenberg(n), of which ``"cayley"`` is the same on SO(2), SO(3), SE(2) and Heisenberg(n). It is not for SU(n) and
     SL(n) with n > 2, Sp(n) with n > 1, SO(n) with n > 4, SE(n) with n > 3: there collocation takes mu off its coadjoint
@@ -38,6 +43,8 @@ class WithAttitude(OneStepMethod):
     order of the method.
 
     Explicit methods turn by ``"exp"``, whatever is asked for: their step is that of (mu, theta), ``g' = g exp(theta)``.
+    Where no torque acts they turn a little further, by no more than the error of the step, so that the momentum in
+    space is what it was: on coadjoint orbits of two dimensions, as those of SO(3), SU(2), SL(2) and SE(2) are.
 
     Momenta are those that the method gives without attitudes; the order is the same for all three.
 
@@ -74,7 +81,10 @@ class WithAttitude(OneStepMethod):
         return WithAttitude(self.method.driven_by(dW), self.kind)
 
     def keeps(self, system, name: str) -> bool:
-        return self.method.keeps(system.body, name)
+        if name != SPATIAL_MOMENTUM:
+            return self.method.keeps(system.body, name)
+        follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
+        return (self.explicit or follows) and self.method.transports(system.body)
 
     @property
     def explicit(self) -> bool:
@@ -83,69 +93,89 @@ class WithAttitude(OneStepMethod):
     def check(self, system) -> None:
         self.method.check(system.body)
 
+    # -- the momentum, which the equations of a step are about --------------------------------------------------------
+
+    def unknowns(self, system: AttitudeSystem) -> int:  # type: ignore[override]
+        return 2 * system.body.dim if self.explicit else self.method.unknowns(system.body)
+
+    def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
+        return self.method.judged(system.body, system.points(x))
+
     def slopes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        if self.explicit:
-            local = TurningSystem(system, self.order)
-            start, rest, own = local.around(x), local.around(low), local.lowered_rates(k)
-            return local.raised_rates(self.method.pulled(local).slopes(local, start, rest, h, own))
-        (mu, g), (mu_low, g_low), (rates, g_rates) = map(system.split, (x, low, k))
-        algebra, A = system.group.algebra, gauss(self.stages).A
-        momenta = self.method.slopes(system.body, mu, mu_low, h, rates)
-        xi = self.method.velocities(system.body, mu, mu_low, h, rates)
-        if self.kind == "coadjoint":
-            return system.join(momenta, algebra.hat(xi))
-        moved = h * jnp.einsum("ij,j...->i...", A, g_rates)
-        if self.kind == "cayley":
-            return system.join(momenta, (g + (g_low + moved)) @ algebra.hat(xi))
-        return system.join(momenta, algebra.hat(inverse_dexp(algebra, algebra.vee(moved), xi, self.order)))
+        """Those of the momentum; of an explicit method those of the angles beside it."""
+        if not self.explicit:
+            return self.method.slopes(system.body, system.points(x), system.points(low), h, k)
+        local = TurningSystem(system, self.order)
+        return self.method.pulled(local).slopes(local, local.around(x), local.around(low), h, k)
 
     def increment(self, h, k) -> jax.Array:
-        """The increment of the momentum and, unless by ``"cayley"``, of the attitude in the algebra."""
         return self.method.increment(h, k)
 
-    def move(self, system: AttitudeSystem, x, low, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
-        new, new_low = compensated(x, low + self.increment(h, k))
-        mu, g = system.split(new)
-        mu_low, g_low = system.split(new_low)
-        if self.kind == "cayley":
-            restored = system.group.restore_map(g)  # what rounding has added, far below what the state resolves
-            return new, system.join(mu_low, g_low + (restored - g))
-        if self.kind == "exp":
-            g = self._turned(system, x, self.increment(h, k))
-        else:
-            g = system.group.restore_map(system.split(x)[1] @ self._coadjoint(system, h, k))
-        return system.join(mu, g), system.join(mu_low, jnp.zeros_like(g))
-
-    def along(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
-        if self.kind == "cayley":
-            return x + v
-        return system.join(system.points(x + v), self._turned(system, x, v))
-
-    def _coadjoint(self, system: AttitudeSystem, h, k) -> jax.Array:
-        """The element of the group whose adjoint action is that of the step."""
-        group, xi = system.group, h * system.group.algebra.vee(system.split(k)[1])
-        assert group.adjoint_cayley_map is not None
-        return group.adjoint_cayley_map(group.algebra, xi[0] if self.stages == 1 else _collocated(group.algebra, xi))
-
-    @staticmethod
-    def _turned(system: AttitudeSystem, x, v) -> jax.Array:
-        """``g exp(omega)``, omega the part of v in the algebra."""
-        (_, g), (_, omega), algebra = system.split(x), system.split(v), system.group.algebra
-        return system.group.restore_map(g @ system.group.exp_map(algebra, algebra.vee(omega)))
-
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
-        if self.explicit:
-            local = TurningSystem(system, self.order)
-            return local.raised_rates(self.method.start(local, local.around(x)))
-        (mu, g), algebra = system.split(x), system.group.algebra
-        rates = self.method.start(system.body, mu)
-        turn = algebra.hat(system.body.energy.gradient(mu))
-        turn = g @ turn if self.kind == "cayley" else turn
-        return system.join(rates, jnp.broadcast_to(turn, (self.stages, *turn.shape)))
+        if not self.explicit:
+            return self.method.start(system.body, system.points(x))
+        local = TurningSystem(system, self.order)
+        return self.method.start(local, local.around(x))
 
     def missed(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        (mu, _), (mu_low, _), (rates, _) = map(system.split, (x, low, k))
-        return self.method.missed(system.body, mu, mu_low, h, rates)
+        return self.method.missed(system.body, system.points(x), system.points(low), h, system.points(k))
+
+    def error(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
+        return self.method.error(system.body, system.points(x), system.points(low), h, system.points(k))
+
+    # -- the attitude, which follows from it --------------------------------------------------------------------------
+
+    def move(self, system: AttitudeSystem, x, low, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
+        (mu, g), (mu_low, g_low) = system.split(x), system.split(low)
+        new, new_low = self.method.move(system.body, mu, mu_low, h, system.points(k))
+        if self.explicit:
+            group, theta = system.group, TurningSystem(system, self.order).angles(self.increment(h, k))
+            turn = group.exp_map(group.algebra, theta)
+            if system.body.torque_free and self.method.transports(system.body):
+                turn = _carrying(group, turn, mu, new)
+            return system.join(new, group.restore_map(g @ turn)), system.join(new_low, jnp.zeros_like(g))
+        xi = h * self.method.velocities(system.body, mu, mu_low, h, k)
+        if self.kind == "cayley":
+            gained = (g + g_low) @ _collocated(system.group.algebra.hat(xi))
+            turned, turned_low = compensated(g, g_low + gained)
+            restored = system.group.restore_map(turned)  # what rounding has added, far below what the state resolves
+            return system.join(new, turned), system.join(new_low, turned_low + (restored - turned))
+        if self.kind == "exp":
+            group, theta = system.group, self._angles(system.group.algebra, xi)
+            turned = group.restore_map(g @ group.exp_map(group.algebra, theta))
+        else:
+            turned = system.group.restore_map(g @ self._coadjoint(system.group, xi))
+        return system.join(new, turned), system.join(new_low, jnp.zeros_like(g))
+
+    def along(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
+        """With the momentum displaced: what is looked at on the way of a step are functions of that."""
+        mu, g = system.split(x)
+        return system.join(mu + system.points(v), g)
+
+    @staticmethod
+    def _coadjoint(group, xi) -> jax.Array:
+        """The element of the group whose adjoint action is that of the step; of angles h xi, shape (stages, dim).
+
+        Where the end of collocation is no adjoint action it is that of the nearest, to the order of the method.
+        """
+        algebra = group.algebra
+        if len(xi) == 1:
+            return group.adjoint_cayley_map(algebra, xi[0])
+        R = jnp.eye(algebra.dim) + _collocated(algebra.ad(xi))
+        x = from_adjoint_cayley(algebra, R) + central(algebra, gauss(len(xi)).b @ xi)
+        return group.adjoint_cayley_map(algebra, x)
+
+    def _angles(self, algebra, xi) -> jax.Array:
+        """Theta at the end of collocation in the algebra, shape (dim,).
+
+        A sweep of iteration gains a power of the step; so many are one more than its order needs.
+        """
+        tableau, k = gauss(len(xi)), xi
+        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
+            k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
+        return tableau.b @ k
+
+    # -- what is that of the method -----------------------------------------------------------------------------------
 
     def weights(self, theta):
         return self.method.weights(theta)
@@ -157,27 +187,46 @@ class WithAttitude(OneStepMethod):
     def has_estimate(self) -> bool:
         return self.method.has_estimate
 
-    def error(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        (mu, _), (mu_low, _), (rates, _) = map(system.split, (x, low, k))
-        return self.method.error(system.body, mu, mu_low, h, rates)
-
-    def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
-        return self.method.judged(system.body, system.split(x)[0])
-
     def __str__(self) -> str:
         return f"{self.method} with attitudes by {self.kind}"
 
 
-def _collocated(algebra, xi) -> jax.Array:
-    """The x with ``cay(ad x) = R``, R the end of Gauss collocation of ``Q' = Q ad(xi)`` on [0, 1] from I.
+def _collocated(X) -> jax.Array:
+    """``G - I``, G the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X at the stages, (s, m, m).
 
-    Solved for the transposes of the stages, ``Q_i^T = I + sum_j A_ij ad(xi_j)^T Q_j^T``. Where R is no adjoint action
-    x is the one of the nearest, to the order of the method.
+    Solved for the transposes of the stages, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
     """
-    (stages, dim), tableau = xi.shape, gauss(len(xi))
-    turned = algebra.ad(xi).swapaxes(-1, -2)
-    implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * dim, stages * dim)
-    start = jnp.tile(jnp.eye(dim), (stages, 1))
-    Q = solve_near_identity(jnp.eye(stages * dim) - implicit, start).reshape(stages, dim, dim)
-    R = jnp.eye(dim) + jnp.einsum("j,jab,jbc->ca", tableau.b, turned, Q)
-    return from_adjoint_cayley(algebra, R) + central(algebra, tableau.b @ xi)
+    (stages, m), tableau = X.shape[:2], gauss(len(X))
+    turned = X.swapaxes(-1, -2)
+    implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * m, stages * m)
+    start = jnp.tile(jnp.eye(m), (stages, 1))
+    G = solve_near_identity(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
+    return jnp.einsum("j,jab,jbc->ca", tableau.b, turned, G)
+
+
+TURNS, DAMPING = 3, 1e-8
+"""Newton steps of :func:`_carrying`, and what is added to the diagonal of a matrix that may be singular, relative to
+it. A step leaves the square of the misfit, or this share of it."""
+
+
+def _carrying(group, turn, mu, new) -> jax.Array:
+    """The element next to ``turn`` whose coadjoint action takes the momentum mu to the new one, on the same orbit.
+
+    By Newton's method: ``ad*_eta m = new - m`` for the least eta, m being what mu has become [Marquardt 1963].
+    """
+    algebra, size = group.algebra, jnp.max(jnp.abs(mu))
+    mu, new = (v / jnp.where(size > 0.0, size, 1.0) for v in (mu, new))
+
+    def nearer(made: int, turn) -> jax.Array:
+        m = group.Ad_star(turn, mu)
+        missed, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
+        square = moved @ moved.T
+        diagonal = jnp.diagonal(square)
+        damping = jnp.where(diagonal > 0.0, DAMPING * diagonal, 1.0)  # what does not move m does not turn either
+        eta = solve_near_identity(square + jnp.diag(damping), (moved @ missed)[:, None])[:, 0]
+        turn = turn @ group.exp_map(algebra, eta)
+        if made == TURNS:
+            return turn
+        return jax.lax.cond(jnp.max(jnp.abs(missed)) > DAMPING, lambda: nearer(made + 1, turn), lambda: turn)
+
+    return nearer(1, turn)

@@ -1,4 +1,4 @@
-"""The relaxed rigid body [BFM Example 3.2, §4.3, Fig. 1], and the free one."""
+"""The relaxed rigid body [Morrison 1986; BFM Example 3.2, §4.3, Fig. 1], and the free one."""
 
 from __future__ import annotations
 
@@ -28,10 +28,14 @@ class InertiaWarning(UserWarning):
 
 
 def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -> LiePoissonSystem:
-    """A rigid body whose internal friction keeps its energy and lets it settle on its axis of greatest inertia.
+    """Morrison's rigid body [1986]: a torque that does no work turns it to its axis of greatest inertia.
 
     ``Pi' = Pi × Omega + rate (|Omega|^2 Pi - (Omega . Pi) Omega)``, ``Omega_i = Pi_i / I_i``, with the energy
-    ``H = sum Pi_i^2 / (2 I_i)`` and the entropy ``S = |Pi|^2 / 2``. As t grows S tends to ``max(I) * H``.
+    ``H = sum Pi_i^2 / (2 I_i)`` and the entropy ``S = |Pi|^2 / 2``. The second term is the torque. It is normal to
+    Omega, so H is constant, and S grows: from almost every state it tends to ``max(I) * H``.
+
+    It is a model on so(3)*, of a body that is controlled from outside. A body left to itself, with friction between
+    its parts, keeps |Pi| and loses kinetic energy to heat: see :func:`body_with_wheels`.
 
     Parameters
     ----------

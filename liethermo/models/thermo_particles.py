@@ -71,7 +71,7 @@ def moving_thermo_particles(
 ) -> ComposedSystem:
     """The same bodies, moving freely: ``H = sum p_a^2 / (2 m_a) + c_a exp(S_a / c_a)`` [SML Example 3].
 
-    The motion is uniform and the heat flows as if at rest.
+    The motion is uniform and the heat flows as if at rest: momentum and kinetic energy are constant.
 
     Parameters
     ----------
@@ -81,7 +81,13 @@ def moving_thermo_particles(
     dimension : int
         Of the space; the state is (q_1, p_1, S_1, q_2, …) with q_a and p_a of that many components.
     """
-    return ComposedSystem(_bodies(masses, capacities, dimension, 0.0), conductance=conductance)
+    bodies = _bodies(masses, capacities, dimension, 0.0)
+    of_axis = np.eye(2 * dimension + 1)[dimension:-1]
+    total = {"momentum" if dimension == 1 else f"momentum {i + 1}": p for i, p in enumerate(of_axis)}
+    constants = {name: Quadratic(np.zeros(len(bodies) * len(p)), np.tile(p, len(bodies))) for name, p in total.items()}
+    inverse = 1.0 / positive(masses, "masses", len(bodies))
+    constants["kinetic energy"] = Quadratic(jnp.outer(inverse, of_axis.sum(axis=0)).ravel())
+    return ComposedSystem(bodies, conductance=conductance, momentum_maps=constants)
 
 
 def thermo_springs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -20,9 +21,12 @@ from ..tracing.interpret import at_points
 from .base import System
 from .lie_poisson import LiePoissonSystem
 
+SPATIAL_MOMENTUM = "momentum in space"
+"""The name of ``Ad_star(inverse(g), mu)`` among what is constant along a run."""
+
 
 class AttitudeSystem(System):
-    """A Lie-Poisson system for mu, and ``g' = g hat(grad H(mu))`` beside it [:doc:`/explanation/exact_laws`].
+    """A Lie-Poisson system for mu, and ``g' = g hat(transport(mu))`` beside it [:doc:`/explanation/exact_laws`].
 
     A state is mu followed by the entries of g, row by row, their imaginary parts last where there are any. Energy,
     entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.
@@ -46,6 +50,7 @@ class AttitudeSystem(System):
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self._of_momentum(body.energy)
         self.entropy = None if body.entropy is None else self._of_momentum(body.entropy)
+        self.preserved_as, self.decided = body.preserved_as, body.decided
 
     @property
     def unrollable(self) -> bool:
@@ -90,12 +95,19 @@ class AttitudeSystem(System):
         """The momenta: what functions of the state are functions of."""
         return x[..., : self.body.dim]
 
+    def sizes(self, k):
+        """Those of momenta, which have a unit, and of attitudes, which have none."""
+        n = self.body.dim
+        return jnp.concatenate([self.body.sizes(k[..., :n]), super().sizes(k[..., n:])], axis=-1)
+
     def presented(self, solution):
         mu, g = self.split(solution.x)
-        stats = dataclasses.replace(solution.stats, attitude_residual=self.distance(solution.x))
-        dense = solution.dense
-        if dense is not None:
-            dense = dataclasses.replace(dense, x=self.points(dense.x), k=self.points(dense.k))
+        stats = dataclasses.replace(
+            solution.stats,
+            attitude_residual=self.distance(solution.x),
+            spatial_momentum_change=self.change_in_space(solution.x),
+        )
+        dense = None if solution.dense is None else solution.dense.through(self.points)
         return dataclasses.replace(
             self.body.presented(solution), x=mu, attitude=np.ascontiguousarray(g), dense=dense, stats=stats
         ).with_provenance(
@@ -107,15 +119,33 @@ class AttitudeSystem(System):
 
     def distance(self, x) -> float:
         """The largest distance of the attitudes of states, shape (m, n), from the group, relative to their size."""
-        rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
-        return float(np.max(at_points(_distance, self, np.asarray(x)[rows])))
+        return float(np.max(_at_states(_distance, self, x)))
+
+    def change_in_space(self, x) -> float:
+        """The largest change of the momentum in space along states, shape (m, n), the first being that at the start.
+
+        Relative to the largest of the terms that it is the sum of.
+        """
+        found, sizes = _at_states(_in_space, self, x)
+        size = float(np.max(sizes))
+        return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
+
+    @property
+    def constants(self):
+        return (SPATIAL_MOMENTUM,) if self.body.torque_free else ()
+
+    @property
+    def blocks(self):
+        return slice(0, self.body.dim), slice(self.body.dim, None)
 
     def invariants(self):
         return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
 
     def _vector_field(self, x):
-        mu, g = self.split(x)
-        return self.join(self.body._vector_field(mu), g @ self.body.algebra.hat(self.body.energy.gradient(mu)))
+        (mu, g), body = self.split(x), self.body
+        dS = None if body.entropy is None else body.entropy.gradient(mu)
+        xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
+        return self.join(body._vector_field(mu), g @ body.algebra.hat(xi))
 
     def _of_momentum(self, energy: Energy) -> Energy:
         terms = tuple(OfFirst(term, self.body.dim) for term in energy.terms)
@@ -126,15 +156,33 @@ class AttitudeSystem(System):
         return 2 if jnp.iscomplexobj(self.group.identity) else 1
 
 
+def _at_states(function: Callable, system: AttitudeSystem, x):
+    """The values of ``function(system, x)`` at states, shape (m, n)."""
+    rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
+    return at_points(function, system, np.asarray(x)[rows])
+
+
 def _distance(system: AttitudeSystem, x) -> jax.Array:
     return system.group.defect(system.split(x)[1])
+
+
+def _in_space(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
+    """The momentum in space, and the size of the largest terms in it."""
+    (mu, g), group = system.split(x), system.group
+    action = group.Ad(group.inverse_map(g))
+    return mu @ action, jnp.max(jnp.abs(mu) @ jnp.abs(action))
+
+
+UNIT = 2.0**-300
+"""Angles beside a momentum are kept in a unit this small, so that they count for nothing in the length of a step that
+is measured by the momentum, be that of 1e20 or of 1e-20. A power of two, so that nothing is rounded."""
 
 
 class TurningSystem(System):
     """A body in coordinates (mu, theta) around an attitude g, which it turns to ``g exp(hat(theta))``.
 
-    ``theta' = dexp(theta)^-1 grad H(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method that
-    needs no more. The laws are those of mu.
+    ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
+    that needs no more. The laws are those of mu. Theta is in units of :data:`UNIT`.
 
     Attributes
     ----------
@@ -153,6 +201,7 @@ class TurningSystem(System):
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _OnMomentum.of(body.dissipation, self.pulled)
+        self.preserved_as, self.decided = body.preserved_as, body.decided
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
@@ -162,25 +211,20 @@ class TurningSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         body, n = self.whole.body, self.whole.body.dim
-        motion = body.field(x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL))
-        return jnp.concatenate([motion, maps.inverse_dexp(body.algebra, x[n:], dH[:n], self.order)])
+        given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+        turning = maps.inverse_dexp(body.algebra, self.angles(x), body.transport(*given), self.order)
+        return jnp.concatenate([body.field(*given), UNIT * turning])
 
     # -- coordinates --------------------------------------------------------------------------------------------------
 
     def around(self, x) -> jax.Array:
         """The coordinates of a state around its own attitude."""
-        mu = self.whole.split(x)[0]
+        mu = self.whole.points(x)
         return jnp.concatenate([mu, jnp.zeros_like(mu)])
 
-    def lowered_rates(self, k) -> jax.Array:
-        """In coordinates what :meth:`raised_rates` makes of them."""
-        rates, turns = self.whole.split(k)
-        return jnp.concatenate([rates, self.whole.body.algebra.vee(turns)], axis=-1)
-
-    def raised_rates(self, k) -> jax.Array:
-        """Vectors of coordinates, shape (stages, dim), with matrices of the algebra in place of theta."""
-        n = self.whole.body.dim
-        return self.whole.join(k[..., :n], self.whole.body.algebra.hat(k[..., n:]))
+    def angles(self, v) -> jax.Array:
+        """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
+        return v[..., self.whole.body.dim :] / UNIT
 
 
 class _OnMomentum(Carried):

@@ -202,6 +202,51 @@ def test_dissipations_add():
     assert unsure.entropy_law is None
 
 
+@pytest.mark.parametrize("parts", [list, tuple])
+def test_a_list_of_dissipations_is_their_sum(parts):
+    """In the constructor of every kind of system that takes a dissipation, beside a force too."""
+    H, S, x = lt.Quadratic([1 / 3, 1 / 2, 1.0]), lt.Quadratic(np.ones(3)), points(mf.so(3))
+    a, b, damping = lt.ProjectedMetric(rate=0.3), lt.KillingDissipation(rate=0.2), lt.LandauLifshitz(0.1)
+
+    def force(xi):
+        return 0.1 * xi * xi
+
+    makers = [
+        (lambda given: lt.LiePoissonSystem(mf.so(3), H, S, given), (a, b)),
+        (lambda given: lt.EulerPoincareSystem(mf.so(3), lt.Quadratic([3.0, 2.0, 1.0]), S, given), (a, b)),
+        (lambda given: lt.EulerPoincareSystem(mf.so(3), lt.Quadratic([3.0, 2.0, 1.0]), S, given, force), (a, b)),
+        (lambda given: lt.MetriplecticSystem(None, H, lambda y: y[0], given, dim=3), (a, lt.ProjectedMetric(rate=0.1))),
+        (lambda given: lt.SpinSystem(1, lambda s: s[0, 0] * s[0, 1], given), (damping, lt.LandauLifshitz(0.3))),
+    ]
+    for make, given in makers:
+        listed, added = make(parts(given)), make(given[0] + given[1])
+        assert len(listed.dissipation.terms) == len(added.dissipation.terms) >= 2
+        assert np.array_equal(listed.vector_field(x), added.vector_field(x))
+        assert not np.allclose(listed.vector_field(x), make(given[0]).vector_field(x), rtol=1e-3)
+    alone = lt.LiePoissonSystem(mf.so(3), H, S, parts([a]))
+    assert isinstance(alone.dissipation, lt.ProjectedMetric)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ([], "dissipation is an empty list"),
+        ((), "dissipation is an empty list"),
+        ([lt.DoubleBracket(0.1), None], r"dissipation\[1\] must be a Dissipation of this library, not NoneType"),
+        ([[lt.DoubleBracket(0.1)]], r"dissipation\[0\] must be a Dissipation of this library, not list"),
+        ("friction", "a list of them or None, not str"),
+        ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation drives the entropy up"),
+    ],
+)
+def test_lists_that_are_no_sum(given, words):
+    """One line that names the part, with a force beside it too."""
+    H = lt.Quadratic([1 / 3, 1 / 2, 1.0])
+    for kind, more in ((lt.LiePoissonSystem, {}), (lt.EulerPoincareSystem, {"force": lambda xi: xi})):
+        with pytest.raises(lt.InputError, match=words) as caught:
+            kind(mf.so(3), H, None, given, **more)
+        assert "\n" not in str(caught.value)
+
+
 # -- controls: what must fail -------------------------------------------------------------------------------------
 
 
@@ -352,3 +397,10 @@ def test_a_dissipation_that_extends_another_stays_what_it_is():
     once = friction(lt.KillingDissipation(0.3))
     assert np.abs(once).max() > 0.01
     np.testing.assert_allclose(friction(Twice(0.3)), 2.0 * once, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", [lt.ProjectedMetric, lt.Friction, lt.FrictionOperator])
+def test_a_rate_in_the_place_of_a_matrix_is_told_its_name(kind):
+    with pytest.raises(lt.InputError, match=f"^{kind.__name__} takes .* and 0.3 is a number: for a rate say rate=0.3$"):
+        kind(0.3)
+    assert float(kind(np.eye(3), rate=0.3).rate) == 0.3
