@@ -12,8 +12,8 @@ import jax
 class Module(eqx.Module):
     """An equinox module whose methods are bound as Python binds them, unless they are given to another module to keep.
 
-    Equinox makes a pytree of each method that is looked up. That takes 30 us a call: a fifth of what it costs to trace
-    a step, and half of what a short run costs. A pytree is needed only where a method becomes part of another module,
+    Equinox makes a pytree of each method that is looked up, which is a good part of what it costs to trace a step, and
+    of a short run. A pytree is needed only where a method becomes part of another module,
     so that the parameters of its object are parameters there.
     """
 

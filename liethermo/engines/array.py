@@ -11,7 +11,7 @@ from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
 from .rules import RULES, Rules
-from .stepping import State, begin, in_order, take_step
+from .stepping import State, begin, first_state, in_order, take_step
 
 
 def advance(
@@ -87,6 +87,29 @@ class ArrayEngine:
 
     def step(self, state: State, h, noise=None) -> State:
         return self.advance(state, h, 1, 1, noise)[0]
+
+    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
+        found, block = np.empty_like(x), min(TOGETHER, self.portion)
+        for first in range(0, len(x), block):
+            some = np.minimum(np.arange(first, first + block), len(x) - 1)  # of one length, for one program
+            ends = _ends(self.system, self.method, jnp.asarray(x[some]), jnp.asarray(h[some]), self.rules)
+            found[some] = np.asarray(ends)
+        return found
+
+
+TOGETHER = 64
+"""Steps from states of their own that one call takes."""
+
+
+@program
+def _ends(system: System, method: OneStepMethod, x, h, rules: Rules):
+    def end(given):
+        start, size = given
+        after = take_step(system, method, first_state(system, method, start), size, rules)
+        return jnp.where(after.status == Code.COMPLETED, after.x, jnp.nan)
+
+    return jax.lax.map(end, (x, h))
 
 
 def rows(noise) -> jax.Array | None:

@@ -61,6 +61,13 @@ class Engine(Protocol):
         """The state after one step, or as it was with the status of a failure."""
         ...
 
+    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Where steps of sizes h, shape (m,), end that begin at states x, shape (m, n); NaN where one cannot be taken.
+
+        Each is the first step of a run of its own.
+        """
+        ...
+
 
 class Noise(Protocol):
     """Where the increments of a trajectory come from."""
@@ -118,6 +125,13 @@ class Chosen:
     def step(self, state: State, h) -> State:
         noise = self._noise(state, 1, h)
         return self._attempt(lambda engine, state: engine.step(state, h, noise), state)
+
+    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        try:
+            return self._engine.ends(x, h)
+        except UnsupportedPrimitive as error:
+            self._fall_back(error)
+            return self._engine.ends(x, h)
 
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise.rows(int(state.step), steps, h)

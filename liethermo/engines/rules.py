@@ -57,6 +57,9 @@ class Rules:
         Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
     steered : float
         Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself.
+    constant : float
+        Value of H, relative to what it varies by, from which its rounding is far above that of the state: see
+        :data:`..functions.gradients.NOISY`.
     """
 
     large: int = 1_000
@@ -75,6 +78,7 @@ class Rules:
     corrected: float = 64 * EPS
     vanished: float = 1e-280
     steered: float = 4 * EPS
+    constant: float = 100.0
 
     def size(self, components: int) -> Callable[[jax.Array], jax.Array]:
         """What the size of a vector, shape (n,) or (stages, n), is for so many components of a state."""

@@ -1,4 +1,4 @@
-"""Where in a step an event happens: a root, looked for one attempt after another [Chandrupatla 1997]."""
+"""Where in a step a function changes its sign, looked for one attempt after another [Chandrupatla 1997]."""
 
 from __future__ import annotations
 
@@ -37,6 +37,9 @@ class Search(NamedTuple):
 NONE = np.zeros(len(Search._fields))
 """No search, as an array."""
 
+VALUE = Search._fields.index("fa")
+"""The place of the last value in a search as an array."""
+
 
 def begun(whole, before, after) -> Search:
     """The search in a step with these values at its ends."""
@@ -57,6 +60,11 @@ def narrowed(search: Search, value) -> tuple[Search, jax.Array]:
     share = t + _part(t, other, c, value, fo, fc, 0.5 * least / jnp.maximum(width, least)) * (other - t)
     narrower = Search(search.whole, share, t, value, other, fo, c, fc)
     return _either(done, _last(search.whole, best), narrower), done & (best == t)
+
+
+def located(value) -> Search:
+    """No search any more, but what the function is where one has ended."""
+    return Search(*jnp.asarray(NONE))._replace(fa=jnp.zeros(()) + value)
 
 
 def _last(whole, share) -> Search:

@@ -97,8 +97,9 @@ def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, rules: Rule
     return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), jnp.zeros(()))
 
 
-def noise_of(system: System, x, rules: Rules = RULES) -> jax.Array:
+def noise_of(system: System, method: OneStepMethod, x, rules: Rules = RULES) -> jax.Array:
     """The size at which the motion from a state is rounded, as a whole."""
+    system, x = method.judged(system, x)
     return rules.size(x.size)(with_rounding(system.vector_field, x)[1])
 
 
@@ -212,6 +213,7 @@ def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules =
     """The slopes of an explicit method, which there is nothing to solve for."""
     k = method.slopes(system, x, low, h, k)
     missed, none = method.missed(system, x, low, h, k), jnp.zeros((), dtype=jnp.int64)
+    x = method.judged(system, x)[1]
     missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(missed))  # it is the length of a vector
     converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
@@ -231,6 +233,6 @@ def newton_steps(system: System, method: OneStepMethod, x, low, h, rules: Rules 
 
 
 def scale_of(x, h, k, rules: Rules = RULES):
-    """What updates of slopes are measured against."""
+    """What updates of slopes are measured against, either way in time; x is the part of a state that they are of."""
     measure = rules.size(x.size)
-    return measure(x) / h + measure(k) + rules.vanished
+    return measure(x) / jnp.abs(h) + measure(k) + rules.vanished

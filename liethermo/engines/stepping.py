@@ -107,7 +107,7 @@ def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rul
     system, method, state, back = in_order(system, method, state, rules)
 
     def noise():
-        return noise_of(system, state.x, rules)
+        return noise_of(system, method, state.x, rules)
 
     if method.explicit:
         solved = explicit(system, method, state.x, state.low, h, state.k, rules)
@@ -125,8 +125,9 @@ def equations(
     def slopes(k):
         return method.slopes(system, state.x, state.low, h, k)
 
-    measure = rules.size(state.x.size)
-    whole = measure(state.x) / h  # once a step
+    x = method.judged(system, state.x)[1]
+    measure = rules.size(x.size)
+    whole = measure(x) / h  # once a step
 
     return slopes, method.predict(state.k, state.before), lambda k: whole + measure(k) + rules.vanished
 
@@ -141,7 +142,8 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         pending = steering(system, new, new_low, energy, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
-    size = jnp.maximum(rules.size(x.size)(x), h * solved.noise)
+    own = method.judged(system, x)[1]
+    size = jnp.maximum(rules.size(own.size)(own), h * solved.noise)
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
     mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))
@@ -206,12 +208,14 @@ def steering(system: System, x, low, energy, first_energy) -> jax.Array:
 
     Each step is exact but for a few roundings, whose sum walks at random: by 1e-13 in 1e6 steps for a general energy.
     Where it has come to more than a few roundings of H itself, it is taken back, far below the rounding of the state.
+    Beside a large constant in H discrete gradients leave out defects below its rounding: there as much as one rounding
+    of it is taken back.
     """
     gradient = system.energy.gradient(x)
     error = (energy - first_energy) + jnp.dot(gradient, low)
-    size = system.energy.sensitivity(x)
-    most = 0.25 * EPS * size
-    amount = jnp.where(jnp.abs(error) > RULES.steered * jnp.maximum(jnp.abs(first_energy), size), error, 0.0)
+    value, size = jnp.abs(first_energy), system.energy.sensitivity(x)
+    most = EPS * jnp.maximum(0.25 * size, value - RULES.constant * size)
+    amount = jnp.where(jnp.abs(error) > RULES.steered * jnp.maximum(value, size), error, 0.0)
     square = jnp.dot(gradient, system.raised(x, gradient))
     return jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0)
 

@@ -12,6 +12,9 @@ import numpy as np
 DEPENDENT = 1e-24
 """Square of what is left of a vector, relative to its own, below which it depends on those before it."""
 
+VANISHED = 1e-280
+"""Square of a vector below which it is none: products of its components have lost their digits."""
+
 
 class Frame(NamedTuple):
     """Orthonormal vectors that span what given ones span; zero instead of one that depends on those before it.
@@ -86,7 +89,7 @@ def towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
         for unit, square in units:
             own = own - (jnp.dot(v, unit) / square) * unit
         square = jnp.dot(own, own)
-        use = square > DEPENDENT * jnp.dot(v, v)
+        use = square > jnp.maximum(DEPENDENT * jnp.dot(v, v), VANISHED)
         square = jnp.where(use, square, 1.0)
         own = jnp.where(use, own, 0.0)
         found = found + ((product - jnp.dot(v, found)) / square) * own

@@ -32,13 +32,21 @@ from .path import Finer, Path
 
 EPS = float(np.finfo(np.float64).eps)
 
-DIFFERENCE_NOISE = 8 * EPS
-"""Rounding error of ``H(x') - H(x)`` relative to the size at which the values are rounded: a few roundings inside H."""
+DIFFERENCE_NOISE = 4 * EPS
+"""Rounding error of ``H(x') - H(x)`` relative to the size at which the values are rounded: a few roundings inside H. It
+is less than what an audit allows H to change by, so that what is taken for rounding breaks no law."""
 
 CURVATURE_SWITCH = 1e-6
 """Relative second difference of the slope, about 0.15 (|d|/L)^2 on a length L over which H varies, above which the
 defect is always used. There |d|/L > 2.6e-3, so the quotient's noise is below 1e-13 of the gradient; below it the
-three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even in 1e7 steps."""
+three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even in 1e7 steps. A constant in H, or large
+terms that cancel there, make the noise as many times larger: see :data:`NOISY`."""
+
+NOISY = 1e-11
+"""Largest noise of the difference, relative to the gradient times the step, at which a defect below the noise is used.
+The equations of an implicit step are then solved to their plateau all the same. Where the values of H are rounded more
+coarsely, as beside a large constant, a defect that is less than their rounding is left to the steering of the
+energy."""
 
 
 class DiscreteGradient(Module):
@@ -78,7 +86,12 @@ class DiscreteGradient(Module):
 
 
 class Gonzalez(DiscreteGradient):
-    """Midpoint discrete gradient ``grad H(z) + [H(x') - H(x) - grad H(z).d] d/|d|^2``, z = x + d/2 [BFM 4.3]."""
+    """Midpoint discrete gradient ``grad H(z) + [H(x') - H(x) - grad H(z).d] d/|d|^2``, z = x + d/2 [BFM 4.3].
+
+    ``noisy`` is :data:`NOISY`, or what takes its place where no equation is solved with it.
+    """
+
+    noisy: float = eqx.field(static=True, default=NOISY)
 
     @property
     def orderless(self) -> bool:
@@ -90,7 +103,8 @@ class Gonzalez(DiscreteGradient):
         predicted = jnp.dot(middle, d) + (5 / 18) * jnp.dot(second, d)
         difference = _difference(term, x, d, low, middle)
         slope, size, length = (jnp.linalg.norm(v) for v in (middle, x, d))
-        defect = _gated_defect(*difference, predicted, slope * size, jnp.dot(second, d), slope * length)
+        along = jnp.dot(second, d)
+        defect = _gated_defect(*difference, predicted, slope * size, along, slope * length, self.noisy)
         return middle + _divide((5 / 18) * jnp.dot(second, d) + defect, jnp.dot(d, d)) * d
 
 
@@ -157,7 +171,7 @@ class CoordinateIncrement(DiscreteGradient):
         along, slope = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
         second = along[:, 0] + along[:, 2] - 2.0 * along[:, 1]
         mean = along[:, 1] + (5 / 18) * second
-        sizes = jnp.abs(values[1:]) + jnp.abs(values[:-1]) + term.rounded(x)
+        sizes = _largest(values[1:], values[:-1], term.rounded(x))
         found = values[1:] - values[:-1]
         defect = _gated_defect(found, sizes, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
         return mean + _divide(defect, d)
@@ -298,7 +312,7 @@ class Change(NamedTuple):
         # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
         difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
         slope = jnp.max(jnp.linalg.norm(ends, axis=1))
-        size = jnp.abs(before) + jnp.abs(after) + term.rounded(x)
+        size = _largest(before, after, term.rounded(x))
         noise = DIFFERENCE_NOISE * size + 4 * EPS * slope * jnp.linalg.norm(x)
         return cls(difference, noise, gradients)
 
@@ -313,7 +327,8 @@ def corrected(change: Change, gradients, k, direction: Direction, h, b, smooth=0
     slope, spread = jnp.linalg.norm(mean), jnp.maximum(spread, jnp.max(jnp.linalg.norm(gradients - mean, axis=1)))
     defect = change.difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
     length = jnp.sqrt(jnp.dot(b, jnp.sum(d * d, axis=1)))
-    harmless = 1.0 - _gate(_divide(defect, h * direction.square) * length, HARMLESS * slope * direction.share)
+    harm = jnp.maximum(jnp.abs(defect) * (1.0 / HARMLESS), change.noise * (1.0 / NOISY))
+    harmless = 1.0 - _gate(_divide(harm, h * direction.square) * length, slope * direction.share)
     opened = jnp.maximum(_gate(defect, change.noise), harmless * _gate(spread, SPREAD * slope))
     return gradients + _divide(smooth + _let_through(defect, opened), h * direction.square) * d
 
@@ -342,10 +357,15 @@ def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array
     """
     new, new_low = compensated(x, low + d)
     before, after = _values(term, jnp.stack([x, new]))
-    return (after - before) + jnp.dot(gradient, new_low - low), jnp.abs(before) + jnp.abs(after) + term.rounded(x)
+    return (after - before) + jnp.dot(gradient, new_low - low), _largest(before, after, term.rounded(x))
 
 
-def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale):
+def _largest(before, after, terms):
+    """The size at which the values at both ends are rounded: theirs, or that of the terms inside."""
+    return jnp.maximum(jnp.maximum(jnp.abs(before), jnp.abs(after)), terms)
+
+
+def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale, noisy=NOISY):
     """Defect of a predicted difference of two values of H, shut out where it is no more than rounding noise.
 
     ``size`` is that at which the values are rounded, ``argument_effect`` is ``|grad H| |x|``: one rounding of the
@@ -353,7 +373,9 @@ def _gated_defect(difference, size, predicted, argument_effect, second_differenc
     """
     defect = difference - predicted
     noise = DIFFERENCE_NOISE * size + 4 * EPS * argument_effect
-    opened = jnp.maximum(_gate(defect, noise), _gate(second_difference, CURVATURE_SWITCH * slope_scale))
+    curved = jnp.abs(second_difference) * (1.0 / CURVATURE_SWITCH) - slope_scale
+    harmless = 2.0 * slope_scale - noise * (1.0 / noisy)
+    opened = jnp.maximum(_gate(defect, noise), _share(jnp.minimum(curved, harmless), slope_scale))
     return _let_through(defect, opened)
 
 
@@ -365,7 +387,12 @@ def _let_through(defect, opened):
 
 def _gate(size, threshold):
     """0 where ``|size| <= threshold``, 1 from twice that on, linear (so continuous) between."""
-    return jnp.clip(jnp.abs(size) / jnp.maximum(threshold, _TINY) - 1.0, 0.0, 1.0)
+    return _share(jnp.abs(size) - threshold, threshold)
+
+
+def _share(part, whole):
+    """The quotient of two numbers, the second positive or zero, between 0 and 1."""
+    return jnp.clip(part / jnp.maximum(whole, _TINY), 0.0, 1.0)
 
 
 def _divide(numerator, denominator):

@@ -67,6 +67,29 @@ def with_rounding(function: Callable, x) -> tuple[jax.Array, jax.Array]:
     return right, jnp.where(jnp.isfinite(size), size, 0.0)
 
 
+def rounding(function: Callable, x, sizes) -> jax.Array:
+    """The size at which ``function(x)`` is rounded, to first order, where x itself is.
+
+    Errors so small change nothing that the function decides: one that jumps is not rounded by the size of its jump.
+
+    Parameters
+    ----------
+    function : function from an array, shape (n,), to a number
+    sizes : array, shape (n,)
+        The components of x are known to about eps times these.
+    """
+    closed = jax.make_jaxpr(function)(x)
+
+    def erring(shares):
+        numbers = itertools.count()
+        given = x + (_erring(sizes, next(numbers), shares) - sizes)
+        return _evaluated(closed.jaxpr, closed.consts, [given], numbers, shares)[0]
+
+    none = jnp.zeros(SAMPLES)
+    found = [jax.jvp(erring, (none,), (direction,))[1] for direction in jnp.eye(SAMPLES)]
+    return jnp.max(jnp.abs(jnp.stack(found)))
+
+
 def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], shares) -> list:
     """The results of a program each of whose instructions errs, by shares of what it gives."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))

@@ -130,13 +130,32 @@ class OneStepMethod(Module):
         """Whether it gives :meth:`error`."""
         return type(self).error is not OneStepMethod.error
 
+    def unknowns(self, system: System) -> int:
+        """How many components a slope has: as many as a state, or as the part of it that a step is solved for."""
+        return system.dim
+
     def judged(self, system: System, x) -> tuple[System, jax.Array]:
-        """The part of the system, and of the state, that the estimate of the error is about."""
+        """The part of the system, and of the state, that a step is solved for; slopes and errors are of its size.
+
+        The rest of the state follows from it in :meth:`move`, and no tolerance of the one is measured by the other.
+        """
         return system, x
 
     def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        """The gradients of the energy that the step uses at its stages, shape (stages, n)."""
+        """The velocities of a body at the stages, :meth:`.System.transport` of what the step takes for dH.
+
+        Shape (stages, n); an attitude follows them.
+        """
         raise InputError(f"{self} does not say which velocities it moves with, so attitudes cannot be reconstructed")
+
+    def transports(self, system: System) -> bool:
+        """Whether an attitude can follow its steps exactly, so that the momentum in space is kept to rounding.
+
+        An implicit method can where its slopes at Gauss nodes are Pi times :meth:`velocities`. An explicit one can
+        where its steps end on the coadjoint orbit that they began on.
+        """
+        del system
+        return False
 
     def explain(self, system: System, x, k, h) -> str:
         """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
@@ -224,7 +243,7 @@ class GaussMethod(OneStepMethod):
 ONE_SIZE = (
     "what a variational scheme keeps without holding it, such as the energy of a free motion, it keeps by steps of one "
     "size alone, which conserve a function near it [Hairer, Lubich & Wanner 2006, VIII.1]; steps that follow an error "
-    "let it drift. Take a smaller fixed step, or lt.MetriplecticGauss where laws are to hold at steps of any size"
+    "let it drift. Take a smaller fixed step, or lt.MetriplecticGauss where laws are to hold in long steps too"
 )
 """Why variational schemes have steps of one size."""
 

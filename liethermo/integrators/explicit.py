@@ -15,7 +15,7 @@ import manifolds as mf
 from ..dissipation.base import portions
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import towards
+from ..functions.frames import VANISHED, towards
 from ..functions.gradients import EPS, Gonzalez
 from ..systems import ChartSystem, System
 from .base import OneStepMethod
@@ -30,6 +30,16 @@ for the states between. Error and what is missed are over h."""
 NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
 """What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
 back, and the most that one takes back: far below what its rounding is."""
+
+
+NOISY = 1e-8
+"""As :data:`..functions.gradients.NOISY`, for a step that is not iterated: noise in what a function changes by is no
+more than its rounding, and does not add up, since the values at which one step ends are those that the next begins
+with."""
+
+DIFFERENCE = 16.0 * EPS
+"""What a change of a function may be off, relative to the size at which its values are rounded: a few roundings of
+both."""
 
 
 class Law(NamedTuple):
@@ -125,6 +135,15 @@ class ExplicitMethod(OneStepMethod):
     def keeps(self, system: System, name: str) -> bool:
         return name in system.first_integrals()
 
+    def transports(self, system: System) -> bool:
+        """On orbits of two dimensions: their levels are orbits everywhere, but for momenta that nothing moves.
+
+        Among larger ones some have fewer dimensions than the levels around them, as that of a body on se(3) that spins
+        but does not move. Near these the turn that makes up for an error is much larger than the error.
+        """
+        casimirs = system.casimirs()
+        return system.has_all_casimirs and casimirs.keys() <= set(self.held) and system.dim - len(casimirs) <= 2
+
     def on(self, system: System) -> OneStepMethod:
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
         method = in_charts(seen, system, self.retraction, "exp")
@@ -202,7 +221,7 @@ class ExplicitMethod(OneStepMethod):
 
     def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
         """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
-        change, spheres = Gonzalez(), system.spheres
+        change, spheres = Gonzalez(NOISY), system.spheres
         functions = [law.function for law in laws]
         before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
 
@@ -238,14 +257,26 @@ class ExplicitMethod(OneStepMethod):
                 return d, missed, squares
             if made == 0:
                 return again()
-            done = (missed**2 <= EPS**2 * jnp.dot(d, d) * squares) | (squares == 0.0)
-            return jax.lax.cond(done.all(), lambda: (d, missed, squares), again)  # of a short step one is enough
+            # of a short step one is enough
+            return jax.lax.cond(done(d, missed, squares), lambda: (d, missed, squares), again)
+
+        def done(d, missed, squares) -> jax.Array:
+            none = squares <= VANISHED
+            share = missed * (missed / jnp.where(none, 1.0, squares))  # no product of four small numbers, which is zero
+            return ((share <= EPS**2 * jnp.dot(d, d)) | none).all()
+
+        def hidden() -> jax.Array:
+            """What rounding of the values may make of what is missed: nothing where there is a closed form."""
+            return DIFFERENCE * jnp.stack(
+                [sum((t.rounded(x) for t in f.terms if not t.is_quadratic), jnp.zeros(())) for f in functions]
+            )
 
         d = landed(d)
         ends = gradients(d)
         d, missed, squares = corrected(0, d, ends, directions(d, ends))
-        lengths = jnp.sqrt(jnp.where(squares == 0.0, 1.0, squares))
-        return d, jnp.max(jnp.abs(jnp.where(squares == 0.0, 0.0, missed / lengths)))
+        rounding = jax.lax.cond(done(d, missed, squares), lambda: jnp.zeros_like(missed), hidden)
+        lengths = jnp.sqrt(jnp.where(squares <= VANISHED, 1.0, squares))
+        return d, jnp.max(jnp.where(squares <= VANISHED, 0.0, jnp.maximum(jnp.abs(missed) - rounding, 0.0) / lengths))
 
     def _laws(self, system: System) -> list[Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""

@@ -86,13 +86,28 @@ class Fluctuating(OneStepMethod):
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.at_midpoint(system, x, low, h, k)
+        return (system.field(z, dH, dS, dL) + sum(B.times(w) for B, w in self._pushes(system, z, dH, dL, h)))[None]
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        z, dH, dS, dL = self.method.at_midpoint(system, x, low, h, k)
+        pushes = self._pushes(system, z, dH, dL, h)
+        return sum((B.velocity(w) for B, w in pushes if B.velocity), start=system.transport(z, dH, dS, dL))[None]
+
+    def transports(self, system: System) -> bool:
+        assert system.dissipation is not None
+        point = jnp.asarray(system.samples(1)[0])
+        return all(B.velocity is not None for _, B in factors_at(system.dissipation, system, point))
+
+    def _pushes(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
+        """The factors of the summands, each with what it is applied to: drift and noise."""
         assert system.dissipation is not None
         parts = factors(system.dissipation, system, z, dH, dL)
-        B, quanta = beside([B for _, B in parts]), self._quanta(parts)
+        quanta, ends = self._quanta(parts), np.cumsum([B.size for _, B in parts])[:-1]
         push = quanta * divergence(system.dissipation, system, z)
         if self.density is not None:
-            push = push + quanta * B.transposed(self.density.gradient(z))
-        return (system.field(z, dH, dS, dL) + B.times(push + jnp.sqrt(2.0 * quanta) * (self.dW / h)))[None]
+            push = push + quanta * beside([B for _, B in parts]).transposed(self.density.gradient(z))
+        push = push + jnp.sqrt(2.0 * quanta) * (self.dW / h)
+        return list(zip([B for _, B in parts], jnp.split(push, ends), strict=True))
 
     def _quanta(self, parts: list[tuple[Dissipation, Factor]]) -> jax.Array:
         """``k``, or ``k T`` where the energy is taken by a bath, for every column."""
@@ -100,9 +115,6 @@ class Fluctuating(OneStepMethod):
         return self.boltzmann * jnp.concatenate(
             [jnp.full(B.size, T) for T, (_, B) in zip(factors_of_k, parts, strict=True)]
         )
-
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        return self.method.velocities(system, x, low, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return self.method.increment(h, k)

@@ -1,4 +1,4 @@
-"""Metriplectic Gauss: any even order, with both laws exact for every energy and every entropy.
+"""Metriplectic Gauss: even orders, with both laws exact for every energy and every entropy.
 
 Its derivation is in :doc:`/explanation/exact_laws`.
 """
@@ -51,8 +51,9 @@ class MetriplecticGauss(GaussMethod):
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 
-    Momentum maps are held on request alone. Nearer to a relative equilibrium than O(h^{2s}), such as a circular orbit,
-    the levels of H and J may leave a step nowhere to go; it then ends with a status.
+    Momentum maps are held on request alone, or where the dissipation is told to preserve them. Nearer to a relative
+    equilibrium than O(h^{2s}), such as a circular orbit, the levels of H and J may leave a step nowhere to go; it then
+    ends with a status.
 
     One implicit equation of s times the size of the state. An iteration costs s gradients of H and S; for each that is
     not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
@@ -72,7 +73,8 @@ class MetriplecticGauss(GaussMethod):
     retraction : str or manifolds.Retraction, optional
         On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
     held : tuple of str
-        Names of the functions of the system to hold. A run fills it in with the Casimirs that the system conserves.
+        Names of the functions of the system to hold. A run fills it in with what the system conserves of its Casimirs
+        and of what its dissipation is told to preserve.
     moving : tuple of int, optional
         Which of ``preserve`` are momentum maps, that move the state, and not Casimirs; a run finds out.
     """
@@ -97,7 +99,7 @@ class MetriplecticGauss(GaussMethod):
         self.moving = moving
 
     def on(self, system: System) -> OneStepMethod:
-        held = tuple(sorted(system.first_integrals() & system.casimirs().keys()))
+        held = tuple(sorted(name for name in system.first_integrals() if self._holds(system, name)))
         method = self._with(lambda C: seen_on(system, C), held)
         if self.functions and not is_traced((system, method)):
             moved = at_points(_share_moved, (system, method.functions), system.samples(4)).max(axis=0)
@@ -135,6 +137,18 @@ class MetriplecticGauss(GaussMethod):
     # -- the stage equations ------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        return jax.vmap(lambda *stage: self._slope(system, *stage))(*self._at_stages(system, x, low, h, k))
+
+    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+        names = tuple(system.preserved_by_name())
+
+        def velocity(u, dH, dS, known):
+            return system.transport(u, dH, dS, tuple(known[name].discrete for name in names))
+
+        return jax.vmap(velocity)(*self._at_stages(system, x, low, h, k))
+
+    def _at_stages(self, system: System, x, low, h, k) -> tuple:
+        """The stages, shape (s, n), and there what the step takes for dH, dS and the other gradients, by name."""
         A, b, _ = gauss(self.number)
         u = x + (low + h * (A @ k))
 
@@ -144,7 +158,9 @@ class MetriplecticGauss(GaussMethod):
                 return Gradients(plain, plain)
             return Gradients(stage_gradients(C, x, low, h, k, A, b, finer(self.number)), plain)
 
-        S, parts, dH = system.entropy, _made_of(system), self.velocities(system, x, low, h, k)
+        S, parts = system.entropy, _made_of(system)
+        symmetries = self._symmetries(system, u)
+        dH = stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number), symmetries)
         known = {name: at_stages(C) for name, C in (self._kept(system) | parts | system.preserved_by_name()).items()}
         if S is None:
             dS = jnp.zeros_like(k)
@@ -153,18 +169,13 @@ class MetriplecticGauss(GaussMethod):
         else:
             discrete = jnp.stack([known[name].discrete for name in parts])
             dS = composed_gradients(S, list(parts.values()), discrete, x, low, h, k, A, b)
-        return jax.vmap(lambda *stage: self._slope(system, *stage))(u, dH, dS, known)
-
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        A, b, _ = gauss(self.number)
-        symmetries = self._symmetries(system, x + (low + h * (A @ k)))
-        return stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number), symmetries)
+        return u, dH, dS, known
 
     def _slope(self, system: System, u, dH, dS, known: dict[str, Gradients]) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
         system = system.here(u)
         motion = self._motion(system, u, dH, known)
-        names = tuple(system.preserved_by_name())
+        names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
         for part, own in () if system.dissipation is None else portions(system.dissipation, names):
             motion = motion + self._force(part, own, system, u, dH, dS, known)
         return motion
@@ -181,24 +192,57 @@ class MetriplecticGauss(GaussMethod):
         off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
         return off(system.poisson.sharp(u, dH))
 
-    def _force(self, part: Dissipation, own: tuple[str, ...], system: System, u, dH, dS, known) -> jax.Array:
-        """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions."""
-        dL, lowers = tuple(known[name].discrete for name in own), part.energy_law != "conserved"
-        functions = self._kept(system) | (_made_of(system) if lowers else {})
+    def _force(
+        self, part: Dissipation, own: tuple[tuple[str, str], ...], system: System, u, dH, dS, known
+    ) -> jax.Array:
+        """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions.
+
+        These have a key among ``known``, and a name among the functions of the system.
+        """
+        dL, functions = (
+            tuple(known[key].discrete for key, _ in own),
+            self._imposed(part, {name for _, name in own}, system),
+        )
+        if not functions:
+            return part.force(system, u, dH, dS, dL)
+        gradients = [known[name] for name in functions] + [known[key] for key, name in own if name not in functions]
+        if part.energy_law != "conserved":
+            off = _projector(system, u, gradients)
+            return off(part.force(system, u, off(dH), dS, dL))
+        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
+        return off(part.force(system, u, dH, off(dS), dL))
+
+    def _imposed(self, part: Dissipation, own: set[str], system: System) -> dict[str, Energy]:
+        """The functions that a dissipation has to keep, by name, where it does not keep them all by construction."""
+        functions = self._kept(system) | (_made_of(system) if part.energy_law != "conserved" else {})
         exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
         casimirs = {ENTROPY, *self._casimirs(system)} if part.keeps_casimirs else set()
 
         def safe(name: str, C: Energy) -> bool:  # kept by construction
             return name in own or (C.is_quadratic and (exact or name in casimirs))
 
-        if not part.symmetric or all(safe(*function) for function in functions.items()):
-            return part.force(system, u, dH, dS, dL)
-        gradients = [known[name] for name in functions]
-        if lowers:
-            off = _projector(system, u, gradients)
-            return off(part.force(system, u, off(dH), dS, dL))
-        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
-        return off(part.force(system, u, dH, off(dS), dL))
+        return {} if not part.symmetric or all(safe(*function) for function in functions.items()) else functions
+
+    def transports(self, system: System) -> bool:
+        """Where nothing is projected off the slopes."""
+        names = system.preserved_names
+        parts = () if system.dissipation is None else portions(system.dissipation, names)
+        plain = all(C.is_quadratic for C in (self._kept(system) | _made_of(system)).values())
+        return plain and not any(self._imposed(part, set(own), system) for part, own in parts)
+
+    def keeps(self, system: System, name: str) -> bool:
+        known = name in system.casimirs() or name in system.preserved_names
+        return self._holds(system, name) if known else super().keeps(system, name)
+
+    def _holds(self, system: System, name: str) -> bool:
+        """Whether it holds a constant of the system unasked: Casimirs, and what the dissipation is told to preserve.
+
+        A skew friction is not projected, and keeps by itself what is quadratic alone.
+        """
+        if name not in system.casimirs() and name not in system.preserved_names:
+            return False
+        projected = system.dissipation is None or system.dissipation.symmetric
+        return projected or system.functions()[name].is_quadratic
 
     def _kept(self, system: System) -> dict[str, Energy]:
         """What is held, by name."""

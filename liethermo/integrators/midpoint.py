@@ -75,7 +75,10 @@ class MetriplecticMidpoint(OneStepMethod):
         return z, dH, dS, dL
 
     def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        return self.gradient(system.energy, x, h * k[0], low)[None]
+        return system.transport(*self.at_midpoint(system, x, low, h, k))[None]
+
+    def transports(self, system: System) -> bool:
+        return True
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return collocation_error(system, x, low, h, k)

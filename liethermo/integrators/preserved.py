@@ -23,9 +23,12 @@ def seen_on(system: System, C: Energy) -> Energy:
 
 
 def check_preserved(system: System, functions: Sequence[Energy]) -> None:
-    """Raise InputError unless the system conserves each of the functions."""
+    """Raise InputError where the system does not conserve one of the functions.
+
+    Where that cannot be found out, as outside the domain of an entropy, they count as claimed.
+    """
     for C, kept in zip(functions, system.conserves(tuple(functions)), strict=True):
-        if not kept:
+        if kept is False:
             name = getattr(getattr(C, "function", None), "__name__", str(C))
             raise InputError(
                 f"the system does not conserve the preserved function {name}: holding it would change the "

@@ -35,8 +35,8 @@ class MetriplecticRungeKutta(ExplicitMethod):
     quadrature.
 
     A step costs 4, 7 or 11 evaluations of the field, and one to four corrections, as many as it takes: for each, one
-    value of what each function changes by. There is nothing to iterate, so it is many times as fast as an implicit
-    step; but stiff systems ask for short steps. A step that is too long for its corrections fails with a status.
+    value of what each function changes by. There is nothing to iterate, but stiff systems ask for short steps. A step
+    that is too long for its corrections fails with a status.
 
     On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
     same laws. See :class:`InCharts`.

@@ -22,6 +22,16 @@ LOWEST, HIGHEST = 2, 24
 """Orders: beyond the highest, double precision has no use for more."""
 
 
+TOLERANCE = 1e-10
+"""What the order is chosen for where no tolerance is given."""
+
+
+def _asked_for(tolerance: float | None) -> int:
+    """The order that a relative tolerance asks for [Jorba & Zou 2005]."""
+    order = math.ceil(1.0 - 0.5 * math.log(TOLERANCE if tolerance is None else tolerance))
+    return min(max(LOWEST, order), HIGHEST)
+
+
 class MetriplecticTaylor(ExplicitMethod):
     """Taylor steps with both laws exact, explicit, of any order from 2 to 24.
 
@@ -39,12 +49,13 @@ class MetriplecticTaylor(ExplicitMethod):
 
     A step costs about ``p^2 / 2`` times the products of the field, ``p / 2`` evaluations of the entropy production, and
     one correction or a few. Steps are long: in double precision no method takes fewer. It is for accuracies from 1e-8
-    on, and for states between the steps: ``solution(t)`` is of the order of the method.
+    on.
 
     Parameters
     ----------
     order : int or None
-        From 2 to 24. None: for adaptive steps, what their tolerance asks for, ``1 - log(rtol) / 2`` [Jorba & Zou 2005].
+        From 2 to 24. None: what the tolerance of adaptive steps asks for, ``1 - log(rtol) / 2`` [Jorba & Zou 2005], and
+        13, which 1e-10 asks for, where there is no tolerance.
     preserve : sequence of functions or energies
         Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
     retraction : str or manifolds.Retraction, optional
@@ -67,10 +78,11 @@ class MetriplecticTaylor(ExplicitMethod):
     def suited(self, tolerance: float | None) -> MetriplecticTaylor:
         if self.number is not None:
             return self
-        if tolerance is None:
-            raise InputError(f"{self} takes its order from a tolerance: give an order, or adaptive steps")
-        order = min(max(LOWEST, math.ceil(1.0 - 0.5 * math.log(tolerance))), HIGHEST)
-        return type(self)(order, self.functions, self.retraction, self.held)
+        return type(self)(_asked_for(tolerance), self.functions, self.retraction, self.held)
+
+    @property
+    def order(self) -> int:
+        return _asked_for(None) if self.number is None else self.number
 
     @property
     def stages(self) -> int:

@@ -1,6 +1,6 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
-from .attitude import AttitudeSystem, TurningSystem
+from .attitude import SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
 from .base import System
 from .chart import ChartSystem
 from .composed.bodies import Copies, Subsystem
@@ -16,6 +16,7 @@ from .simple_closed import SimpleClosedSystem
 from .spins import HeatBaths, SpinSystem
 
 __all__ = [
+    "SPATIAL_MOMENTUM",
     "AttitudeSystem",
     "ChartSystem",
     "ComposedSystem",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from copy import copy
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,18 +14,26 @@ import numpy as np
 
 from manifolds._arrays import is_traced, real_array
 
-from ..dissipation.base import Dissipation
+from ..dissipation.base import Dissipation, portions, total
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
 from ..functions.energy import Energy, as_energy
+from ..functions.frames import frame
 from ..functions.on_spaces import on_points, on_sites
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
-from .kinds import Kind
+from .kinds import Decided, Kind
 
 SCALES = (1.0, 1e-4, 1e4)
 """Scales of the random points at which the system is asked which functions it conserves."""
+
+AROUND, NEARER = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
+"""States near which it is asked too, and how near, relative to the size of a state."""
+
+
+TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
+"""Times at which it is asked that of a system whose energy depends on time."""
 
 
 class Arranged(NamedTuple):
@@ -88,17 +97,17 @@ class System(Kind):
             self.energy = recognised(self.energy, dim)
             self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
             self.momentum_maps = {name: recognised(J, dim) for name, J in self.momentum_maps.items()}
-        if dissipation is not None and not isinstance(dissipation, Dissipation):
-            raise InputError(
-                f"dissipation must be a Dissipation of this library or None, not {type(dissipation).__name__}"
-            )
-        if dissipation is not None and self.entropy is None and dissipation.needs_entropy:
-            raise InputError(f"{type(dissipation).__name__} drives the entropy up, so the system needs an entropy")
+        dissipation = total(dissipation)
+        for part in () if dissipation is None or self.entropy is not None else dissipation.terms:
+            if part.needs_entropy:
+                raise InputError(f"{type(part).__name__} drives the entropy up, so the system needs an entropy")
         self.dissipation = None
         if dissipation is not None:
             dissipation = on_sites(dissipation, self.shape)
             dissipation = traced_energies(dissipation, dim, "a preserved function")
             self.dissipation = self._traced_dissipation(dissipation.prepared(self))
+        if self.preserved and not is_traced(self):
+            self.preserved_as = self._preserved_names()
         if validate and not is_traced(self):
             self._validate()
 
@@ -125,6 +134,18 @@ class System(Kind):
         entropy = self._needed_entropy()
         return self.evaluated(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
 
+    def energy_fall(self, x, t=None) -> jax.Array:
+        """The rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...); likewise."""
+
+        def fall(system: System, y):
+            if system.dissipation is None:
+                return jnp.zeros(())
+            dH = system.energy.gradient(y)
+            dS = None if system.entropy is None else system.entropy.gradient(y)
+            return -system.dissipation.change(system, y, dH, dS, system._preserved_gradients(y), dH)
+
+        return self.evaluated(fall, x, t, "()")
+
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
         """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
 
@@ -136,6 +157,33 @@ class System(Kind):
             return jnp.zeros((self.dim, self.dim))
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in part.preserve)
         return jax.jacfwd(lambda dS: part.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
+
+    def transport(self, x, dH, dS, dL=()) -> jax.Array:
+        """The velocity that moves the state, ``x' = Pi(x) transport`` but for torques, for gradients of either kind.
+
+        It is dH and what the dissipations add to it [:meth:`liethermo.Dissipation.velocity`]. On a Lie algebra an
+        attitude follows it, ``g' = g hat(transport)``.
+        """
+        for sigma in self._velocities(x, dH, dS, dL):
+            dH = dH if sigma is None else dH + sigma
+        return dH
+
+    @property
+    def torque_free(self) -> bool:
+        """Whether the motion is all ``Pi(x) transport``: on a Lie algebra the momentum in space is then constant."""
+        found: list[bool] = []
+
+        def ask(x):
+            velocities = self._velocities(x, x, x, (x,) * len(self.preserved))
+            found.append(all(sigma is not None for sigma in velocities))
+
+        jax.eval_shape(ask, jax.ShapeDtypeStruct((self.dim,), jnp.float64))
+        return found[0]
+
+    def _velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
+        """Those of the dissipations, None where one is a torque."""
+        parts = () if self.dissipation is None else portions(self.dissipation, dL)
+        return [part.velocity(self, x, dH, dS, own) for part, own in parts]
 
     # -- time -------------------------------------------------------------------------------------------------------
 
@@ -206,48 +254,129 @@ class System(Kind):
         return () if self.dissipation is None else self.dissipation.preserve
 
     def functions(self) -> dict[str, Energy]:
-        """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name."""
-        return self.momentum_maps | self.preserved_by_name() | self.casimirs()
+        """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name; one name for one quantity."""
+        casimirs, own = self.casimirs(), dict[str, Energy]()
+        for name, L in zip(self.preserved_names, self.preserved, strict=True):
+            if name not in self.momentum_maps and name not in own:
+                own[name] = L
+        return self.momentum_maps | own | casimirs
+
+    @property
+    def preserved_names(self) -> tuple[str, ...]:
+        """What each of :attr:`preserved` is called among :meth:`functions`."""
+        return tuple(self.preserved_by_name()) if self.preserved_as is None else self.preserved_as
 
     def preserved_by_name(self) -> dict[str, Energy]:
-        """:attr:`preserved`, each with a name."""
+        """:attr:`preserved`, each with a key of its own."""
         return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
+
+    def _preserved_names(self) -> tuple[str, ...]:
+        """What is preserved, by the name of the momentum map or Casimir it is a multiple of, or by one of its own."""
+        known = self.momentum_maps | self.casimirs()
+        functions = (*known.values(), *self.preserved)
+        points = np.concatenate([self.samples(2, seed, scale) for seed, scale in enumerate(SCALES)])
+        gradients = at_points(_gradients, functions, points)  # shape (points, functions, n)
+        names, taken = list(known), {"energy", "entropy"}
+        for i, (fallback, L) in enumerate(self.preserved_by_name().items(), start=len(known)):
+            same = next((names[j] for j in range(i) if _proportional(gradients[:, i], gradients[:, j])), None)
+            given = getattr(getattr(L, "function", None), "__name__", "")
+            usable = given.isidentifier() and given not in {*names, *taken}
+            names.append(same or (given if usable else fallback))
+        return tuple(names[len(known) :])
 
     def first_integrals(self) -> frozenset[str]:
         """The names of those of :meth:`functions` that the system conserves.
 
         Momentum maps are claimed to be. A Casimir is conserved if the dissipation keeps it, and what the dissipation is
         told to preserve if the motion and the other summands keep it: where no construction says so, it is found out at
-        random points, or left out while the system is being traced.
+        random points, or left out while the system is being traced. What the dissipation is told to preserve counts as
+        conserved where that cannot be found out.
         """
+        return self._found().constant
+
+    def undecided(self) -> frozenset[str]:
+        """The names of those of :meth:`functions` of which it is not found out whether the system conserves them.
+
+        At none of the points that were tried all of the motion could be evaluated, as where an entropy is defined for
+        few states.
+        """
+        return self._found(declared=False).unknown
+
+    def decided_near(self, x) -> System:
+        """This system, with what random points leave open found out near states that are in its domain.
+
+        Parameters
+        ----------
+        x : array, shape (n,) or (m, n)
+        """
+        if self.decided is not None or is_traced(self) or not self.undecided():
+            return self
+        found = copy(self)
+        object.__setattr__(found, "decided", self._found(near=np.asarray(self.state(x, batch=True))))
+        return found
+
+    def _found(self, near=None, declared: bool = True) -> Decided:
+        """What it conserves; with ``declared``, what its dissipation is told to preserve unless it is seen not to."""
+        if self.decided is not None:
+            return self.decided
         claimed, casimirs = set(self.momentum_maps), self.casimirs()
         if self.dissipation is None or self.dissipation.keeps_casimirs:
             claimed |= set(casimirs)
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            kept = [False] * len(others) if is_traced(self) else self.conserves(tuple(others.values()))
-        return frozenset(claimed | {name for name, constant in zip(others, kept, strict=True) if constant})
+            kept = [False] * len(others) if is_traced(self) else self.conserves(tuple(others.values()), near)
+        verdicts = dict(zip(others, kept, strict=True))
+        if declared:
+            verdicts |= {name: True for name in self.preserved_names if verdicts.get(name, True) is None}
+        constant = claimed | {name for name, verdict in verdicts.items() if verdict}
+        return Decided(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
-    def invariants(self) -> dict[str, tuple[Energy, bool]]:
-        """Functions worth recording along a run, by name, each with whether the system conserves it."""
-        kept = self.first_integrals()
-        return {name: (function, name in kept) for name, function in self.functions().items()}
+    def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
+        """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""
+        found = self._found()
+        verdicts = {name: None if name in found.unknown else name in found.constant for name in self.functions()}
+        return {name: (function, verdicts[name]) for name, function in self.functions().items()}
 
-    def conserves(self, functions: tuple[Energy, ...]) -> list[bool]:
+    def conserves(self, functions: tuple[Energy, ...], near: np.ndarray | None = None) -> list[bool | None]:
         """Whether each function is constant along the vector field, at random points inside its domain.
 
         The motion and each dissipation have to keep it, each judged by its own size: a friction 1e12 times as slow as
         the motion is a friction still. Or else what one makes of it, another takes back. Points are of several scales.
+
+        Parameters
+        ----------
+        near : array, shape (n,) or (m, n), optional
+            States that are inside the domain: points near them are tried too.
+
+        Returns
+        -------
+        list of bool or None
+            None where it could be evaluated at no point: then it is not known.
         """
         if not functions:
             return []
+        if self.is_driven:
+            found = [self.at_time(t).conserves(functions, near) for t in TIMES]
+            return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
         points = np.concatenate([self.samples(4, seed, scale) for seed, scale in enumerate(SCALES)])
+        if near is not None:
+            points = np.concatenate([points, self._around(near)])
         rates, sizes = at_points(_rates_of_change, (self, functions), points)  # shape (points, parts, functions)
         inside = np.isfinite(rates).all(axis=1)
         with np.errstate(invalid="ignore"):
             each = (np.abs(rates) <= AXIOM_TOLERANCE * sizes).all(axis=1)
             together = np.abs(rates.sum(axis=1)) <= AXIOM_TOLERANCE * np.abs(rates).max(axis=1)
-        return [bool(use.any() and kept[use].all()) for use, kept in zip(inside.T, (each | together).T, strict=True)]
+        verdicts = zip(inside.T, (each | together).T, strict=True)
+        return [bool(kept[use].all()) if use.any() else None for use, kept in verdicts]
+
+    def _around(self, x) -> np.ndarray:
+        """Some of the states x, shape (m, n), and on R^n points around them, ever nearer: they lie in most domains."""
+        x = np.reshape(np.asarray(x), (-1, self.dim))[:AROUND]
+        if self.space is not None:
+            return x
+        random = np.random.default_rng(0).standard_normal((len(NEARER), *x.shape))
+        lengths = np.linalg.norm(x, axis=1, keepdims=True) / np.sqrt(self.dim)
+        return np.concatenate([x, *(x + nearer * lengths * w for nearer, w in zip(NEARER, random, strict=True))])
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -362,7 +491,40 @@ def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
         parts.append(part.force(system, x, dH, dS, dL))
         speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
     sizes = jnp.linalg.norm(gradients, axis=1)
-    return jnp.stack(parts) @ gradients.T, jnp.stack(speeds)[:, None] * sizes
+    rates = jnp.stack(parts) @ gradients.T
+    energy = system.energy.value(x)  # a derivative may be finite where the function is not defined
+    all_ = energy if system.entropy is None else energy + system.entropy.value(x)
+    defined = jnp.isfinite(jnp.stack([energy, *[all_] * (len(parts) - 1)]))
+    rates = jnp.where(defined[:, None], rates, jnp.nan)
+    for i, part in enumerate(() if system.dissipation is None else system.dissipation.terms, start=1):
+        if part.preserve:  # by construction, wherever it is defined
+            kept = _spanned(gradients, [L.gradient(x) for L in part.preserve])
+            rates = rates.at[i].set(jnp.where(kept, 0.0, rates[i]))
+    return rates, jnp.where(rates == 0.0, 1.0, jnp.stack(speeds)[:, None] * sizes)
+
+
+def _spanned(gradients, vectors) -> jax.Array:
+    """Which of some gradients, shape (m, n), are combinations of vectors, shape (m,)."""
+    off = frame(vectors).off
+    rest = jnp.stack([off(gradient) for gradient in gradients])
+    return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
+
+
+def _gradients(functions: tuple[Energy, ...], x) -> jax.Array:
+    return jnp.stack([f.gradient(x) for f in functions])
+
+
+def _proportional(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether one of two gradients, shape (points, n), is a multiple of the other, the same one everywhere."""
+    inside = np.isfinite(one).all(axis=1) & np.isfinite(other).all(axis=1)
+    one, other = one[inside], other[inside]
+    lengths = np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)
+    if not (lengths[0] > 0.0).any() or not np.array_equal(lengths[0] > 0.0, lengths[1] > 0.0):
+        return False
+    at = int(np.argmax(lengths[1]))
+    i = int(np.argmax(np.abs(other[at])))
+    missed = np.linalg.norm(one - (one[at, i] / other[at, i]) * other, axis=1)
+    return bool((missed <= AXIOM_TOLERANCE * lengths[0]).all())  # at each point by itself: their scales differ
 
 
 def _seen(system: System, x, alpha):

@@ -46,6 +46,7 @@ class ChartSystem(System):
         self.poisson = mf.NoPoisson(self.dim) if trivial else _Poisson(system, coordinates, place)
         self.momentum_maps = {name: self.pulled(J) for name, J in system.momentum_maps.items()}
         self.dissipation = _Force.of(system.dissipation, self.pulled, system, coordinates, place)
+        self.preserved_as, self.decided = system.preserved_as, system.decided
 
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""

@@ -24,10 +24,6 @@ state or of its velocity, which convergence and errors are measured against. A p
 """
 
 
-TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
-"""Times at which it is looked at what a body conserves."""
-
-
 class DrivenSystem(System):
     """A system with ``H(x, t)``, made autonomous: ``x' = Pi dH + force``, ``t' = 1``, ``W' = dH/dt`` at fixed x.
 
@@ -60,6 +56,7 @@ class DrivenSystem(System):
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _OnBody.of(body.dissipation, self._of_body)
+        self.preserved_as, self.decided = body.preserved_as, body.decided
 
     @property
     def kind(self) -> str:
@@ -138,11 +135,10 @@ class DrivenSystem(System):
     def has_all_casimirs(self) -> bool:
         return self.body.has_all_casimirs
 
-    def conserves(self, functions):
-        """Whether the body does, as it is at some times: beside the clock, in its unit, nothing else would count."""
-        own = tuple(_WithoutClock(f) for f in functions)
-        found = [self.body.at_time(t).conserves(own) for t in TIMES]
-        return [all(kept) for kept in zip(*found, strict=True)]
+    def conserves(self, functions, near=None):
+        """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""
+        near = None if near is None else near[..., : self.body.dim]
+        return self.body.conserves(tuple(_WithoutClock(f) for f in functions), near)
 
     @property
     def ledger(self):
@@ -154,11 +150,7 @@ class DrivenSystem(System):
 
     def presented(self, solution):
         dense, body = solution.dense, self.body
-        if dense is not None and dense.along is None:
-            dense = dataclasses.replace(dense, x=dense.x[..., :-2], k=dense.k[..., :-2])
-        elif dense is not None:
-            along = dense.along
-            dense = dataclasses.replace(dense, along=lambda x, v: along(x, v)[..., :-2])
+        dense = None if dense is None else dense.through(lambda x: x[..., :-2])
         x = np.ascontiguousarray(solution.x[:, :-2])
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
         if hasattr(body, "algebra"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
-from ..dissipation.base import Dissipation
+from ..dissipation.base import Dissipation, total
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
 from ..functions.checks import check_scalar
@@ -79,7 +79,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         algebra: mf.LieAlgebra,
         lagrangian,
         entropy=None,
-        dissipation: Dissipation | None = None,
+        dissipation: Dissipation | Sequence[Dissipation] | None = None,
         force: Callable | None = None,
         momentum_maps=(),
         validate: bool = True,
@@ -90,7 +90,8 @@ class EulerPoincareSystem(LiePoissonSystem):
         self.lagrangian = check_scalar(energy, algebra.dim, "the Lagrangian", timed=True)
         if force is not None:
             forced = EulerPoincareForce(force)
-            dissipation = forced if dissipation is None else dissipation + forced
+            given = total(dissipation)
+            dissipation = forced if given is None else given + forced
         energy = _hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)
 

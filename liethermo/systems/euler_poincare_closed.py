@@ -11,12 +11,13 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
 from ..functions.checks import check_scalar, check_shape, recognised
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, Function, as_energy
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .base import System
@@ -31,7 +32,8 @@ class EulerPoincareClosedSystem(System):
     with ``delta xi = eta' + [xi, eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is
     constant and the entropy does not fall, as long as ``f . xi <= 0``, which :meth:`check` tests. The spatial momentum
     ``Ad*_{g^-1} l_xi`` is constant in the directions that commute with all others in which f acts: friction between the
-    parts of a body does not touch its angular momentum.
+    parts of a body does not touch its angular momentum. So the Casimirs of the algebra are constants, as functions of
+    the body's momentum ``l_xi``, unless f changes them: these are :meth:`casimirs`.
 
     The state is (xi, S), shape (dim + 1,).
 
@@ -57,6 +59,7 @@ class EulerPoincareClosedSystem(System):
     algebra: mf.LieAlgebra
     lagrangian: Callable
     friction: Callable | None
+    invariants_of_momentum: dict[str, Energy]
 
     domain: ClassVar[str] = "a positive temperature"
 
@@ -67,6 +70,10 @@ class EulerPoincareClosedSystem(System):
         if friction is not None:
             friction = check_shape(friction, ((n,), ()), (n,), "the friction", "(xi, S)")
         self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
+        self.invariants_of_momentum = {
+            name: recognised(Function(OfMomentum(as_energy(C, "a Casimir"), lagrangian)), n + 1)
+            for name, C in algebra.leading_casimirs()
+        }
         structure = OnAlgebra(algebra, lagrangian)
         if not is_traced(lagrangian):
             hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
@@ -93,6 +100,9 @@ class EulerPoincareClosedSystem(System):
         """``l_xi``, shape (..., dim), at a state or a batch of states."""
         return jnp.vectorize(lambda y: self.momentum(y[:-1], y[-1]), signature="(n)->(m)")(self.state(x, batch=True))
 
+    def casimirs(self) -> dict[str, Energy]:
+        return self.invariants_of_momentum
+
     def outside(self, x) -> str:
         T = float(at_points(_temperature, self, np.asarray(x)[None])[0])
         return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
@@ -101,6 +111,16 @@ class EulerPoincareClosedSystem(System):
         force, xi = self.friction_force(x[:-1], x[-1]), x[:-1]
         size = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
         return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(size > 0.0, size, 1.0)}
+
+
+class OfMomentum(Module):
+    """A function of the momentum ``l_xi``, as one of the state."""
+
+    energy: Energy
+    lagrangian: Callable
+
+    def __call__(self, x):
+        return self.energy.value(jax.grad(self.lagrangian)(x[:-1], x[-1]))
 
 
 class ReducedEnergy(Energy):

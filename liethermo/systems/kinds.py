@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,13 @@ from ..functions.energy import Energy
 from ..functions.spheres import Spheres
 
 
+class Decided(NamedTuple):
+    """Names of functions of a system: of those that it conserves, and of those that this is not known of."""
+
+    constant: frozenset[str]
+    unknown: frozenset[str]
+
+
 class Kind(Module):
     """A kind of system: its data, and answers that a subclass may replace; :class:`System` has what follows from them.
 
@@ -32,6 +39,10 @@ class Kind(Module):
     momentum_maps: dict[str, Energy]
     dim: int = eqx.field(static=True)
     space: mf.Space | None = eqx.field(static=True)
+    preserved_as: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
+    """What the functions are called that the dissipation is told to preserve, one after another."""
+    decided: Decided | None = eqx.field(static=True, kw_only=True, default=None)
+    """What it conserves, where that has been found out near the states of a run."""
     production_name: ClassVar[str] = "dS/dt"
     domain: ClassVar[str] = ""
     """What a state of the system has to have beyond finite components, in words."""
@@ -56,7 +67,8 @@ class Kind(Module):
     def field(self, x, dH, dS, dL=()) -> jax.Array:
         """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
 
-        This is the one definition of the dynamics; integrators differ in the gradients they hand it.
+        dS may be None of a system without an entropy. This is the one definition of the dynamics; integrators differ in
+        the gradients they hand it.
         """
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
@@ -111,6 +123,11 @@ class Kind(Module):
         return {}
 
     @property
+    def constants(self) -> tuple[str, ...]:
+        """Names of what is constant along a run and is no function with one value, such as a momentum in space."""
+        return ()
+
+    @property
     def balance(self) -> tuple[str, ...]:
         """Which entries of the ledger a solution has in its energy, and its laws are stated without."""
         return ()
@@ -131,6 +148,11 @@ class Kind(Module):
     def pulled(self, energy: Energy) -> Energy:
         """A function of the states that the user sees, as one of the states here."""
         return energy
+
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """The parts of a state that have sizes of their own, such as a momentum and the attitude beside it."""
+        return (slice(None),)
 
     # -- the metric of the space --------------------------------------------------------------------------------------
 

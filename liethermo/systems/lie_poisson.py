@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -32,14 +33,15 @@ class LiePoissonSystem(System):
         Or of mu and the time t: see :class:`liethermo.TimeDependent`.
     entropy : likewise, optional
         A Casimir function of the algebra (checked).
-    dissipation : Dissipation, optional
+    dissipation : Dissipation, or a list of them that act together; optional
     momentum_maps : dict of functions, or a sequence of them
         Conserved quantities of a symmetry: checked by :meth:`check`, recorded and audited along runs.
     validate : bool
         Test the axioms at a few random points and refuse a system that fails.
     group : manifolds.MatrixGroup, optional
-        A group of this algebra: :func:`liethermo.integrate` then returns attitudes g(t) with ``g' = g hat(grad H(mu))``
-        beside mu(t). Velocities are the body's, so that the spatial momentum is ``Ad_star(inverse(g), mu)``.
+        A group of this algebra: :func:`liethermo.integrate` then returns attitudes g(t) beside mu(t), with
+        ``g' = g hat(xi)``. There xi is :meth:`transport`: the gradient of H, and what friction inside adds to it. It
+        is the body's, so that the momentum in space is ``Ad_star(inverse(g), mu)``, constant where no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
         How; by default so that the spatial momentum of a free body is kept, where the group has such a way, else by
         Cayley's map where that stays in the group. See :class:`liethermo.WithAttitude`.
@@ -63,7 +65,7 @@ class LiePoissonSystem(System):
         algebra: mf.LieAlgebra,
         energy,
         entropy=None,
-        dissipation: Dissipation | None = None,
+        dissipation: Dissipation | Sequence[Dissipation] | None = None,
         momentum_maps=(),
         validate: bool = True,
         group: mf.MatrixGroup | None = None,
@@ -86,7 +88,8 @@ class LiePoissonSystem(System):
         if self.dissipation is None or self.dissipation.momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
         action = self.algebra.action(dH)
-        return action.ad_star(x + self.dissipation.momentum(dH, action.bracket(dS)))
+        turned = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
+        return action.ad_star(x + self.dissipation.momentum(dH, turned))
 
     def casimirs(self) -> dict[str, Energy]:
         return _recorded_casimirs(self.algebra, self.algebra.basis_names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ class MetriplecticSystem(System):
         None for a system that only relaxes.
     energy, entropy : function from x, shape (n,), to a scalar, or an Energy
         The energy may depend on time: a function of x and t, see :class:`liethermo.TimeDependent`.
-    dissipation : Dissipation, optional
+    dissipation : Dissipation, or a list of them that act together; optional
     dim : int
         Number of state components; needed where ``poisson`` is a plain function or None, and no space is given.
     momentum_maps : dict of functions, or a sequence of them
@@ -49,7 +49,7 @@ class MetriplecticSystem(System):
         poisson: mf.PoissonStructure | Callable | None,
         energy,
         entropy=None,
-        dissipation: Dissipation | None = None,
+        dissipation: Dissipation | Sequence[Dissipation] | None = None,
         dim: int | None = None,
         momentum_maps=(),
         validate: bool = True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -44,7 +44,7 @@ class SpinSystem(System):
     sites : int or tuple of int
     energy : Energy or function from s, shape ``(*sites, 3)``, to a scalar
         Such as a sum of the terms in ``lt.magnetism``. May depend on time.
-    dissipation : LandauLifshitz, optional
+    dissipation : LandauLifshitz, or a list of dissipations that act together; optional
     baths : HeatBaths, optional
     ratio : float, or array of the shape of the sites
         gamma_i.
@@ -63,7 +63,7 @@ class SpinSystem(System):
         self,
         sites,
         energy,
-        dissipation: Dissipation | None = None,
+        dissipation: Dissipation | Sequence[Dissipation] | None = None,
         baths: HeatBaths | None = None,
         ratio=1.0,
         momentum_maps=(),

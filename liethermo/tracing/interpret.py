@@ -1,7 +1,7 @@
 """Small functions at a few points, without a compiler: unrolled, then interpreted with NumPy.
 
-XLA takes a good part of a second to compile what is then run once, on four points. Interpreting the scalar program
-takes milliseconds. What is too large for that, or cannot be unrolled, is compiled after all.
+XLA would compile what is then run once, on four points, which takes far longer than to interpret the scalar program.
+What is too large for that, or cannot be unrolled, is compiled after all.
 """
 
 from __future__ import annotations

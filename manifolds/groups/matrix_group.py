@@ -80,7 +80,7 @@ class MatrixGroup:
     algebra : LieAlgebra
     defect : callable
         ``g -> array``, shape (...): how far g is from the group relative to its size, of the order of the smallest
-        relative change of g that brings it there.
+        relative change of g that brings it there. One that takes one matrix is applied to each.
     inverse_map, exp_map, log_map, cayley_map, inverse_cayley_map : callable or None
         ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
         or None where the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
@@ -100,6 +100,10 @@ class MatrixGroup:
     inverse_cayley_map: Callable = maps.inverse_cayley
     adjoint_cayley_map: Callable | None = maps.adjoint_cayley
     restore_map: Callable = closed.unchanged
+
+    def __post_init__(self) -> None:
+        if getattr(self.defect, "__module__", "") != closed.__name__:  # those are known to take batches
+            object.__setattr__(self, "defect", _of_batches(self.defect, self.name, self.algebra._known_basis()))
 
     @property
     def dim(self) -> int:
@@ -390,6 +394,35 @@ class MatrixGroup:
             f"has the eigenvalue {nearest:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
             f"number {CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
         )
+
+
+@dataclass(frozen=True)
+class _OfEach:
+    """A function of one matrix, shape (m, m), as one of batches."""
+
+    function: Callable
+
+    def __call__(self, g):
+        return jnp.vectorize(self.function, signature="(m,n)->()")(g)
+
+
+def _of_batches(defect: Callable, name: str, basis: np.ndarray) -> Callable:
+    """The defect of a group as a function of batches; LieAlgebraError where it is none of a matrix."""
+
+    def shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
+        try:
+            return np.shape(jax.eval_shape(defect, jax.ShapeDtypeStruct((*batch, *basis.shape[1:]), basis.dtype)))
+        except (TypeError, ValueError, IndexError):
+            return None
+
+    if shape((2, 3)) == (2, 3):
+        return defect
+    if shape(()) != ():
+        raise LieAlgebraError(
+            f"the defect of {name} must be a number for a matrix, a JAX array of shape {basis.shape[1:]}: it gives "
+            f"{'an error' if shape(()) is None else f'an array of shape {shape(())}'}"
+        )
+    return _OfEach(defect)
 
 
 _MAPS = {

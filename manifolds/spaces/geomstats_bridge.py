@@ -1,8 +1,7 @@
 """Any geomstats manifold with a metric as a state space, through a callback to the host.
 
-geomstats runs in NumPy: a compiled program stops at every call and hands it the arrays. That makes such a space a
-hundred or more times slower than a native one, and confines it to the CPU and the array engine. Batches go over in one
-call.
+geomstats runs in NumPy: a compiled program stops at every call and hands it the arrays. That makes such a space slower
+than a native one, and confines it to the CPU and the array engine. Batches go over in one call.
 
 Derivatives, forward and reverse, are central differences of order 8 on the host, over geodesics where a point varies:
 right to about 1e-12 for the closed forms of geomstats, to less for its numerical solvers. There are none of second

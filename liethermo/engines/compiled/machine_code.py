@@ -40,14 +40,19 @@ _lock = threading.Lock()
 
 @functools.cache
 def _this_machine() -> tuple[llvm.Target, str, str, str]:
-    """This machine, and what tells its machine code, and the compiler's version, from others."""
+    """This machine, and what tells its machine code, and the compiler's version, from others.
+
+    ``$LIETHERMO_CPU`` names another processor whose instructions to use, one that this machine can stand in for: as
+    LLVM names them, such as ``x86-64-v3``, which has AVX2 and no AVX-512.
+    """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     library = ctypes.util.find_library("m")
     if library:
         llvm.load_library_permanently(library)
-    triple, cpu = llvm.get_process_triple(), llvm.get_host_cpu_name()
-    features = llvm.get_host_cpu_features().flatten()
+    triple, named = llvm.get_process_triple(), os.environ.get("LIETHERMO_CPU", "")
+    cpu = named or llvm.get_host_cpu_name()
+    features = "" if named else llvm.get_host_cpu_features().flatten()
     version = ".".join(map(str, llvm.llvm_version_info))
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 

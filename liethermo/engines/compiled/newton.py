@@ -13,7 +13,7 @@ import numpy as np
 from llvmlite import ir
 
 from ..rules import Rules
-from ..stages import Iteration, noise_of, scale_of
+from ..stages import Iteration, noise_of
 from .loop import NUMBERS, SOLVED, Layout, Piece
 from .machine_code import MachineCode
 from .writer import NUMBER, WHOLE, Writer
@@ -22,13 +22,16 @@ GIVEN = ("dW", "x", "low", "h", "k", "before")
 """What is taken from a block, beside the trajectory's own parameters."""
 
 
-def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece], rules: Rules) -> dict[str, Piece]:
+def newton_pieces(
+    both: Callable, driven: Callable, scale: Callable, piece: Callable[..., Piece], rules: Rules
+) -> dict[str, Piece]:
     """The programs of Newton's method: see :func:`solver`.
 
     Parameters
     ----------
     both : function from parameters to a system and a method
     driven : function from parameters and the increments of a step to a system and the method of that step
+    scale : function from a state, a step and slopes to what updates of the slopes are measured against
     piece : function from a function, the names of its arguments and of its results
     """
 
@@ -58,8 +61,7 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
         return k - step, k, found, jnp.ones(()), jnp.max(jnp.abs(step))
 
     def worse(x, h, k, damped, found, sought, factor, length):
-        scale = scale_of(x, h, k, rules)
-        halve = (damped > 0.0) & (factor > 0.5**rules.halvings) & (length > rules.plateau * scale)
+        halve = (damped > 0.0) & (factor > 0.5**rules.halvings) & (length > rules.plateau * scale(x, h, k))
         return jnp.where(halve & ~(found < sought), 1.0, 0.0)
 
     def halved(k, step, factor, length):
@@ -67,10 +69,10 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
 
     def judge(x, h, k, old, update, best, stalled, previous, made, used, factor, found, missed, noise, regular):
         s = Iteration(old, update, best, stalled, previous, made).after(k, rules)
-        scale = scale_of(x, h, k, rules)
-        defined = jnp.isfinite(found + scale) & (regular > 0.0)
-        plain, used = s.settled(scale, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
-        converged = defined & (plain | s.settled(scale, rules, missed, noise))
+        size = scale(x, h, k)
+        defined = jnp.isfinite(found + size) & (regular > 0.0)
+        plain, used = s.settled(size, rules), jnp.where(factor == 1.0, used + 1.0, rules.reuse)
+        converged = defined & (plain | s.settled(size, rules, missed, noise))
         goes_on = defined & ~converged & (s.made < rules.newton)
         uncertain = defined & ~converged & (s.stalled >= 2) & (noise == 0.0)
         renew = (used >= rules.reuse) | s.slower(rules.stale)
@@ -82,7 +84,8 @@ def newton_pieces(both: Callable, driven: Callable, piece: Callable[..., Piece],
         )
 
     def sound(p, x):
-        return noise_of(both(p)[0], x)
+        system, method = both(p)
+        return noise_of(system, method, x)
 
     def settle(missed, noise, goes_on):
         settled = missed <= rules.plateau * noise

@@ -1,4 +1,4 @@
-"""The compiled engine: a user's plain functions at the speed of C, for small systems on the CPU.
+"""The compiled engine: a user's plain functions as machine code, for small systems on the CPU.
 
 The steps of the array engine, for one system and method, are traced, unrolled to scalar programs (:mod:`liethermo.
 tracing.scalarize`) and placed in a loop over steps (:mod:`.loop`) that LLVM compiles. The system's parameters (the
@@ -65,6 +65,13 @@ class CompiledEngine:
     def step(self, state: State, h, noise=None) -> State:
         return self._run(state, h, 1, 1, noise)[0]
 
+    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
+        blocks = self._stepper.begin(self._parameters, x)
+        self._stepper.run(self._parameters, blocks, h, 1, 1)
+        found = self._stepper.fields(blocks, ("x", "status"))
+        return np.where(found["status"].reshape(-1, 1) == 0.0, found["x"], np.nan)
+
     def _run(self, state: State, h, saves: int, every: int, noise) -> tuple[State, np.ndarray]:
         blocks = self._stepper.block_of(state)
         out = self._stepper.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
@@ -114,10 +121,13 @@ class Stepper:
         self._functions: tuple[Callable, Callable] | None = None
         self._newton: MachineCode | None = None
         system, size = form.build(parameters), form.size
-        n, stages = system.dim, method.stages
+        n, stages, unknowns = system.dim, method.stages, method.unknowns(system)
 
         def both(p) -> tuple[System, OneStepMethod]:
             return form.build(p[:size]), own.build(p[size:])
+
+        def scale(x, h, k):
+            return scale_of(method.judged(system, x)[1], h, k, rules)
 
         def begin(p, x):
             return first_state(*both(p), x)
@@ -139,22 +149,23 @@ class Stepper:
                 s = Iteration(solved.k, solved.residual, best, stalled, previous, made + 1.0)
                 return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
             s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
-            converged, going = s.stands(scale_of(x, h, s.k, rules), rules)
+            converged, going = s.stands(scale(x, h, s.k), rules)
             return *s, jnp.where(converged, 1.0, 0.0), jnp.where(going, 1.0, 0.0)
 
-        def concluded(p, h, guess, update, converged, defined, made, newtons, noise, *state):
+        def concluded(p, h, guess, update, converged, defined, made, newtons, noise, dW, *state):
             defined = jnp.isfinite(update) & (defined > 0.0)
             solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
-            return conclude(*both(p), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
+            return conclude(*driven(p, dW), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
 
-        self._both, self._driven, self._explicit, self._increments = both, driven, method.explicit, method.increments
+        self._both, self._driven, self._scale = both, driven, scale
+        self._explicit, self._increments = method.explicit, method.increments
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
         self._shapes["dW"] = (method.increments,)
-        self._shapes |= dict.fromkeys(("k", "guess", "old", "new", "direction", "changes"), (stages, n))
-        self._shapes["before"] = (0 if method.explicit else stages, n)
+        self._shapes |= dict.fromkeys(("k", "guess", "old", "new", "direction", "changes"), (stages, unknowns))
+        self._shapes["before"] = (0 if method.explicit else stages, unknowns)
 
         after = ("converged", "going")
-        solved = "h guess update converged defined made newtons noise"
+        solved = "h guess update converged defined made newtons noise dW"
         programs = {
             "begin": Spec(begin, "p x", FIELDS),
             "prepare": Spec(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
@@ -347,7 +358,7 @@ class Stepper:
         """The address of Newton's method, which is compiled when a step first needs it."""
         with self._lock:
             if self._newton is None:
-                pieces = newton_pieces(self._both, self._driven, self._piece, self._rules)
+                pieces = newton_pieces(self._both, self._driven, self._scale, self._piece, self._rules)
                 linear = {"linear": pieces["linearise"].program.shapes[0]}
                 names = {name for piece in pieces.values() for name in (*piece.arguments, *piece.results)} - {"p"}
                 shapes = {name: self._shapes.get(name, ()) for name in sorted(names)} | linear

@@ -74,6 +74,12 @@ class SparseEngine:
         energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
 
+    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
+        states = [self.step(self.begin(jnp.asarray(start)), size) for start, size in zip(x, h, strict=True)]
+        solved = np.array([int(s.status) == Code.COMPLETED for s in states])
+        return np.where(solved[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
+
     def step(self, state: State, h, noise=None) -> State:
         """One step; where it fails the state is left as it was, with a status."""
         del noise
@@ -97,14 +103,14 @@ class SparseEngine:
             found = self._improved(state, h, s, misfit, scale, self._inverse, PATIENT.halvings if renew else 1)
             if found is None and renew:
                 s = s._replace(stalled=jnp.asarray(2))  # no step, however short, solves the equations better
-                noise = _noise(self.system, state.x)
+                noise = _noise(self.system, self.method, state.x)
                 break
             renew = found is None
             if found is not None:
                 s, misfit, scale = found
                 renew = bool(s.slower(PATIENT.stale)) and float(s.update) > PATIENT.plateau * float(scale)
             if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale, PATIENT)):
-                noise = _noise(self.system, state.x)
+                noise = _noise(self.system, self.method, state.x)
         defined = bool(jnp.isfinite(misfit).all())
         return Solved(
             k=s.k,
@@ -190,7 +196,7 @@ def _misfit(system: System, method: OneStepMethod, state: State, h, k) -> tuple[
 
 
 @program
-def _noise(system: System, x) -> Any:
+def _noise(system: System, method: OneStepMethod, x) -> Any:
     """The size at which the misfit is rounded."""
     return jnp.max(with_rounding(lambda x: system.weights(x) * system.vector_field(x), x)[1])
 

@@ -1,4 +1,4 @@
-"""Galerkin variational integrators for simple closed systems: any even order, and no step without its heat."""
+"""Galerkin variational integrators for simple closed systems: even orders, and no step without its heat."""
 
 from __future__ import annotations
 

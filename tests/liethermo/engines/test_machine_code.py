@@ -2,12 +2,14 @@
 
 import gc
 import itertools
+import platform
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from llvmlite import binding as llvm
 from llvmlite import ir
 
 from liethermo.engines.compiled import machine_code
@@ -143,6 +145,35 @@ def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
         assert compiled(program)(np.ones(2))[0][0] == 3.25
     assert len(made) == 4
     assert file.read_bytes() == whole
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="its processors have other names")
+def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
+    """Its instructions alone, and in files of its own."""
+    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
+    program, made = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
+    monkeypatch.setattr(machine_code, "_compile", lambda *a, make=machine_code._compile: made.append(1) or make(*a))
+    try:
+        for cpu in ("x86-64", "x86-64-v2"):
+            monkeypatch.setenv("LIETHERMO_CPU", cpu)
+            machine_code._this_machine.cache_clear()
+            for _ in range(2):
+                assert compiled(program, 8)(np.ones((8, 2)))[0].tolist() == [[4.75, 4.75]] * 8
+            assert "ymm" not in machine_code._machine().emit_assembly(llvm.parse_assembly(WIDE))
+    finally:
+        monkeypatch.delenv("LIETHERMO_CPU")
+        machine_code._this_machine.cache_clear()
+    assert len(made) == len(list(tmp_path.glob("*.o"))) == 2
+
+
+WIDE = """
+define void @add(<8 x double>* %p) {
+  %a = load <8 x double>, <8 x double>* %p
+  %b = fadd <8 x double> %a, %a
+  store <8 x double> %b, <8 x double>* %p
+  ret void
+}
+"""
 
 
 def test_a_module_that_llvm_refuses_is_an_error():

@@ -8,7 +8,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.integrators.lobatto import lobatto_rule
 from tests.liethermo.integrators.test_on_manifolds import CASES, starts
-from tests.liethermo.integrators.test_orders import nonlinear_systems
+from tests.liethermo.integrators.test_orders import NONLINEAR
 
 Taylor = lt.MetriplecticTaylor
 BODY = lt.models.rigid_body((5.0, 4.0, 2.0), rate=0.5)
@@ -33,9 +33,10 @@ def test_quadrature(nodes):
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("order", "length"), [(2, 0.1), (5, 0.2), (6, 0.2), (12, 0.3), (20, 0.6)])
-@pytest.mark.parametrize(("system", "x0"), nonlinear_systems())
-def test_observed_order(system, x0, order, length):
+@pytest.mark.parametrize("name", NONLINEAR)
+def test_observed_order(name, order, length):
     """Of the error of a step, one more: the mean over eight states, for five lengths."""
+    system, x0 = NONLINEAR[name]
     x0s = 1.5 * x0 * (1.0 + 0.3 * np.random.default_rng(1).standard_normal((8, len(x0))))
     length = length if len(x0) == 3 else min(length, 0.4)
     exact = np.array([reference(system, x, length, 8) for x in x0s])
@@ -141,13 +142,44 @@ def test_bad_input():
         with pytest.raises(lt.errors.InputError, match=f"of the energy the JAX primitive '{name}' is not smooth") as e:
             attempt(energy)
         assert "MetriplecticRungeKutta" in str(e.value)
-    with pytest.raises(lt.errors.InputError, match="takes its order from a tolerance"):
-        attempt(lambda m: jnp.sum(m * m), None)
-    with pytest.raises(lt.errors.InputError, match="takes its order from a tolerance"):
-        lt.flow(BODY, X0, (0.0, 1.0), 0.1, Taylor())
     with pytest.raises(lt.errors.InputError, match="does not conserve"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, Taylor(8, preserve=lambda m: m[0]))
     friction = Unpromised(lambda x: jnp.eye(2))
     lawless = lt.MetriplecticSystem(None, lambda x: x[0], lambda x: x[1], friction, dim=2, validate=False)
     with pytest.raises(lt.errors.InputError, match="claims none"):
         lt.integrate(lawless, [1.0, 2.0], (0.0, 1.0), 0.1, Taylor(8))
+
+
+def test_without_a_tolerance_the_order_is_that_of_1e_10():
+    """By every way to run: what asks the method and what sets it."""
+    assert Taylor().order == Taylor().suited(None).order == Taylor().suited(1e-10).order == 13
+    ours = lt.integrate(BODY, X0, (0.0, 0.4), 0.2, Taylor(13))
+    states = [
+        lt.integrate(BODY, X0, (0.0, 0.4), 0.2, Taylor()).x[-1],
+        lt.ensemble(BODY, X0[None], (0.0, 0.4), 0.2, Taylor()).x[0],
+        lt.flow(BODY, X0, (0.0, 0.4), 0.2, Taylor()),
+    ]
+    for x in states:
+        assert np.abs(x - ours.x[-1]).max() < 1e-14
+    assert lt.diffrax.Solver(Taylor()).order(None) == 13
+
+
+@pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_spins_that_heat_baths(number):
+    """Against the Runge-Kutta method of order 8, and both laws."""
+    rate = np.array([0.1, 0.5, 0.2])
+    system = lt.models.spin_lattice(
+        3,
+        rate=rate,
+        exchange_constant=0.8,
+        field=(0.2, 0.0, 0.5),
+        baths=lt.HeatBaths(capacity=2.0, temperature=1.5, number=number),
+        bath=None if number == 1 else np.array([1, 0, 1]),
+    )
+    spins = np.random.default_rng(0).standard_normal((3, 3))
+    x0 = system.state(spins / np.linalg.norm(spins, axis=1)[:, None])
+    run = lt.integrate(system, x0, (0.0, 1.0), 0.1, Taylor(12))
+    other = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticRungeKutta(8))
+    assert np.abs(run.x[-1] - other.x[-1]).max() < 1e-12
+    assert run.audit().passed, str(run.audit())
+    assert np.ptp(run.entropy) > 0.1

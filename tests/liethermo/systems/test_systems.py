@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.integrators import registered_methods
 from tests.cases import energy_of, state_of
 
 SPHERE = lt.Quadratic(np.ones(3))
@@ -82,6 +84,31 @@ def test_a_force_keeps_the_energy_whatever_it_is():
     solution = lt.integrate(system, [0.5, 1.0, -0.3], (0.0, 20.0), 0.1)
     assert solution.audit().passed
     assert solution.stats.least_entropy_increment < 0  # nothing was promised
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(
+    ("algebra", "method"),
+    [
+        pytest.param(algebra, method, id=f"{algebra.name}-{method}")
+        for method in registered_methods()
+        for algebra in (mf.so(3), mf.se(3))
+    ],
+)
+def test_a_force_on_a_body_without_an_entropy(algebra, method):
+    """BFM Example 3.1, as SciPy has it from the structure constants."""
+    n, C, inertia = algebra.dim, algebra.structure_constants, np.linspace(1.0, 2.0, algebra.dim)
+    start, T, steps = np.linspace(0.5, 1.0, n), 1.0, 50 if method.order > 1 else 1000
+
+    def motion(t, mu):
+        xi = mu / inertia
+        return np.einsum("abc,a,c->b", C, xi, mu - 0.1 * xi**3)
+
+    exact = solve_ivp(motion, (0.0, T), start, rtol=1e-10, atol=1e-12).y[:, -1]
+    system = lt.EulerPoincareSystem(algebra, lt.Quadratic(inertia), force=lambda xi: -0.1 * xi**3)
+    run = lt.integrate(system, start, (0.0, T), T / steps, method)
+    assert run.audit().passed
+    assert np.abs(run.x[-1] - exact).max() < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -588,3 +588,29 @@ def test_solve_and_determinant():
         assert np.allclose(x, y, rtol=1e-11, atol=1e-11)
     assert "lapack" not in ours.lower(a, b).as_text()
     assert "lapack" in theirs.lower(a, b).as_text()  # control
+
+
+@pytest.mark.parametrize(
+    "defect",
+    [
+        lambda g: jnp.abs(g[0, 0] * g[1, 1] - g[0, 1] * g[1, 0] - 1.0),
+        lambda g: jnp.abs(jnp.linalg.det(g) - 1.0).max(),
+    ],
+    ids=["by entries", "a maximum over all"],
+)
+def test_a_defect_of_one_matrix_is_applied_to_each(defect):
+    group = mf.MatrixGroup("mine", mf.sl(2), defect)
+    assert group.leaves("exp") < 1e-14
+    g = np.stack([np.eye(2), 2.0 * np.eye(2), np.diag([2.0, 0.5])])
+    assert group.belongs(g).tolist() == [True, False, True]
+    assert group == mf.MatrixGroup("mine", mf.sl(2), defect)
+
+
+@pytest.mark.parametrize(
+    ("defect", "told"), [(lambda g: float(g[0, 0]), "an error"), (lambda g: g - 1.0, r"an array of shape \(2, 2\)")]
+)
+def test_what_is_no_defect(defect, told):
+    with pytest.raises(
+        mf.LieAlgebraError, match=f"^the defect of mine must be a number for a matrix.* it gives {told}$"
+    ):
+        mf.MatrixGroup("mine", mf.sl(2), defect)

@@ -1,0 +1,24 @@
+"""How rounding sees a function, to first order: its terms and its state are rounded, its jumps are not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from liethermo.functions.rounding import rounding
+
+X = np.array([0.5, 2.0])
+CASES = {
+    "a difference": (lambda x: x[0] - 0.5, 0.5),
+    "a sum of large terms": (lambda x: (x[0] + 1e6) - 1e6, 1e6),
+    "another unit": (lambda x: 1e-20 * (x[0] - 0.5), 0.5e-20),
+    "a steep function": (lambda x: jnp.sqrt(jnp.abs(x[0] - 0.5 + 1e-12)), 0.25e6),
+    "a jump": (lambda x: jnp.where(2.0 * x[0] > 1.0, 1.0, -1.0), 0.0),
+    "beside a hole": (lambda x: jnp.where(x[0] > 0.5, jnp.nan, x[0] - 0.5), 0.5),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_size_at_which_a_function_is_rounded(name):
+    """To a factor: errors are drawn from one half to one."""
+    function, size = CASES[name]
+    assert 0.3 * size <= float(rounding(function, X, np.abs(X))) <= 3.0 * size

@@ -1,0 +1,56 @@
+"""What the docstring of a model promises to be constant is held by every method that holds anything, and has a row."""
+
+import numpy as np
+import pytest
+
+import liethermo as lt
+
+PROMISES = {
+    "body_with_wheels": (
+        lt.models.body_with_wheels,
+        [0.3, 1.0, 0.4, 0.1, -0.2, 0.3, 0.0],
+        {"mu1**2 + mu2**2 + mu3**2": lambda system, x: np.sum(np.asarray(system.momenta(x))[:, :3] ** 2, axis=1)},
+    ),
+    "moving_thermo_particles": (
+        lt.models.moving_thermo_particles,
+        [0.0, 1.0, 0.1, 1.0, -0.3, 0.5],
+        {
+            "momentum": lambda system, x: x[:, 1] + x[:, 4],
+            "kinetic energy": lambda system, x: 0.5 * (x[:, 1] ** 2 + x[:, 4] ** 2),
+        },
+    ),
+    "thermo_springs": (
+        lt.models.thermo_springs,
+        [0.0, 1.0, 0.1, 1.0, -0.3, 0.5],
+        {"momentum": lambda system, x: x[:, 1] + x[:, 4]},
+    ),
+    "free rigid body": (
+        lambda: lt.models.free_rigid_body((3.0, 2.0, 1.0)),
+        [0.3, 1.0, 0.4],
+        {"mu1**2 + mu2**2 + mu3**2": lambda system, x: np.sum(x**2, axis=1)},
+    ),
+}
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(6), lt.MetriplecticGauss(2)], ids=str)
+@pytest.mark.parametrize("name", PROMISES)
+def test_what_is_promised_is_held_and_has_a_row(name, method):
+    build, x0, constants = PROMISES[name]
+    system = build()
+    assert constants.keys() <= system.first_integrals()
+    run = lt.integrate(system, x0, (0.0, 20.0), 0.1, method)
+    rows = {row.law: row for row in run.audit().rows}
+    for constant, of in constants.items():
+        values = of(system, np.asarray(run.x))
+        assert np.abs(values - values[0]).max() <= 1e-13 * np.abs(values).max()
+        assert rows[f"drift of {constant}"].passed is not False
+
+
+def test_friction_on_the_rotation_leaves_no_constant():
+    """The momentum that it changes is shown, and not held."""
+    wheels = lt.models.body_with_wheels()
+    rubbed = lt.EulerPoincareClosedSystem(wheels.algebra, wheels.lagrangian, lambda xi, S: -0.1 * xi + 0.0 * S)
+    assert not rubbed.first_integrals()
+    assert "mu1**2 + mu2**2 + mu3**2" in rubbed.functions()
+    free = lt.EulerPoincareClosedSystem(wheels.algebra, wheels.lagrangian)
+    assert free.first_integrals() == set(free.casimirs())
