@@ -10,6 +10,16 @@ from manifolds.testing import PropertyError, Report
 from .dissipations import check_dissipation
 from .equilibrium import check_equilibrium
 from .methods import check_method
+from .relations import RELATIONS, check_relations
 from .systems import check_system
 
-__all__ = ["PropertyError", "Report", "check_dissipation", "check_equilibrium", "check_method", "check_system"]
+__all__ = [
+    "RELATIONS",
+    "PropertyError",
+    "Report",
+    "check_dissipation",
+    "check_equilibrium",
+    "check_method",
+    "check_relations",
+    "check_system",
+]

@@ -1,0 +1,527 @@
+"""The suite of relations: what must not change a result, or must change it in a known way.
+
+No reference solution is needed: a run is compared with the same run written down in another way. A constant in an
+energy, another unit, another basis, a span in two parts or another front end tells nothing new of the motion, so
+whatever it changes is a fault [metamorphic testing: Chen, Cheung & Yiu 1998].
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import importlib.util
+import tempfile
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from manifolds.testing import Report, Suite
+
+from ..engines.choice import COMPILED_DIM, is_small
+from ..errors import InputError
+from ..functions.energy import Pullback
+from ..functions.gradients import EPS
+from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..interop.scipy import solve_ivp
+from ..results.load import load
+from ..results.solution import Solution
+from ..runs.adaptive import Adaptive
+from ..runs.ensemble import ensemble
+from ..runs.integrate import integrate
+from ..studies.axes import replicas
+from ..studies.study import Study
+from ..systems import LiePoissonSystem, System
+from ..tracing.scalarize import UnsupportedPrimitive
+from .changed import Change, Pair, changed, closed_over, halved, inside, replaced, shifted
+from .runs import STEPS, start_of, step_of
+
+ROUNDING = 1e-11
+"""By how much states may differ that differ by rounding alone, relative to their size: steps of a short run make 1e-14
+of it, and what grows near a state multiplies that."""
+
+SHARE = 10.0
+"""By how much two runs may differ whose steps divide the time in two ways, in errors of the method."""
+
+CONSTANTS = (1.0, -1.0, 1e4)
+"""What is added to an energy, in units of its own size."""
+
+SUMMED = 100.0
+"""Roundings of a large constant that the steps of a short run add up to: 20 were seen."""
+
+UNITS = ((1e12, 1e-12), (1e-12, 1e12), (1e20, 1.0), (1e-20, 1e-20))
+"""Units of the state and of time."""
+
+PLACES = 9
+"""States of the motion that an entropy is known near."""
+
+Outcome = str | None
+"""Why a relation is not asked of a case; None where it was."""
+
+
+class Case:
+    """A run, and what other runs have to be like.
+
+    Parameters
+    ----------
+    system, method, x0, step
+        As of :func:`check_relations`.
+    time : float
+        How long it is.
+    seed : int
+        Of what is drawn: axes, and the state of a neighbour.
+    """
+
+    def __init__(self, system: System, method: OneStepMethod, x0, step: float | Adaptive, time: float, seed: int):
+        self.system, self.method, self.x0 = system, method, np.asarray(x0, dtype=np.float64)
+        self.step, self.time, self.seed = step, time, seed
+        self.suite, self.name = Suite(f"{method} in a {system.kind}"), ""
+
+    def run(self, system: System | None = None, x0=None, span=None, step=None, **options) -> Solution:
+        """A run like this one but for what is given; one that fails is returned too."""
+        return integrate(
+            self.system if system is None else system,
+            self.x0 if x0 is None else x0,
+            (0.0, self.time) if span is None else span,
+            self.step if step is None else step,
+            self.method,
+            on_failure="return",
+            progress=False,
+            **options,
+        )
+
+    @functools.cached_property
+    def base(self) -> Solution:
+        return self.run()
+
+    @property
+    def size(self) -> float:
+        """The size of the states."""
+        return float(np.abs(self.base.x).max())
+
+    @functools.cached_property
+    def error(self) -> float:
+        """The error of the method, relative to the size, as half of the step or a hundredth of the tolerance tell."""
+        if isinstance(self.step, Adaptive):
+            finer: float | Adaptive = replace(self.step, rtol=0.01 * self.step.rtol, atol=0.01 * self.step.atol)
+        else:
+            finer = 0.5 * self.step
+        return float(np.abs(self.run(step=finer).x[-1] - self.base.x[-1]).max()) / self.size
+
+    @property
+    def rounding(self) -> float:
+        """What rounding may come to. It changes adaptive steps a little, and the state by a part of their error."""
+        return max(ROUNDING, 0.1 * self.step.rtol) if isinstance(self.step, Adaptive) else ROUNDING
+
+    @property
+    def resolved(self) -> float:
+        """What another division into steps may come to."""
+        return max(self.rounding, SHARE * self.error)
+
+    def near(self, what: str, found, expected, allowed: float) -> None:
+        """A row that says how far states are from those expected, relative to their size."""
+        self.suite.small(f"{self.name}: {what}", np.asarray(found) - np.asarray(expected), self.size, allowed)
+
+    def same(
+        self,
+        what: str,
+        run: Solution,
+        back: Callable = lambda x: x,
+        allowed: float | None = None,
+        named: bool = True,
+    ) -> None:
+        """Rows for a run that is to be this one: how it ended, its states, what it keeps and its audit.
+
+        The functions that it keeps have the same names, or, where these are found anew, the same number.
+        """
+        allowed = self.rounding if allowed is None else allowed
+        label = f"{self.name}: {what}"
+        status = (run.status.code, self.base.status.code)
+        self.suite.true(
+            f"{label} ends alike", status[0] == status[1], "" if status[0] == status[1] else run.status.message
+        )
+        if status[0] != status[1]:
+            return
+        whole = len(run.t) == len(self.base.t) and not isinstance(self.step, Adaptive)
+        kept = slice(None) if whole else slice(-1, None)
+        self.near(what, back(run.x[kept]), self.base.x[kept], allowed)
+        if run.attitude is not None and self.base.attitude is not None:
+            self.suite.equal(f"{label}, attitude", run.attitude[kept], self.base.attitude[kept], allowed)
+        ours, theirs = constants(run), constants(self.base)
+        agree = ours == theirs if named else len(ours) == len(theirs)
+        self.suite.true(f"{label}, same constants", agree, "" if agree else f"{sorted(ours)}, not {sorted(theirs)}")
+        passed = run.audit().passed == self.base.audit().passed
+        self.suite.true(f"{label}, same verdict", passed, "" if passed else run.audit().verdict)
+
+
+def constants(run: Solution) -> set[str]:
+    """The names of the functions that a run is said to conserve."""
+    return {*run.laws.conserved, *run.laws.unpromised}
+
+
+# -- the functions of a system --------------------------------------------------------------------------------------
+
+
+def constant(case: Case) -> Outcome:
+    """A constant in the energy is seen in its rounding alone."""
+    if case.system.is_driven:
+        return "the energy depends on time"
+    size = max(abs(float(case.base.energy[0])), float(case.system.energy.sensitivity(case.x0)))
+    for factor in CONSTANTS:
+        run = case.run(replaced(case.system, energy=shifted(case.system.energy, factor * size)))
+        case.same(f"{factor:+g} of the energy's size", run, allowed=max(case.rounding, SUMMED * EPS * abs(factor)))
+    return None
+
+
+def domain(case: Case) -> Outcome:
+    """What functions are where the motion does not come has no part in it."""
+    system = case.system
+    if system.entropy is None or system.space is not None or system.sites:
+        return "there is no entropy on R^n"
+    path = case.base.x
+    places = path[np.unique(np.linspace(0, len(path) - 1, PLACES).astype(int))]
+    apart = np.linalg.norm(path[:, None] - places, axis=2).min(axis=1).max()
+    stride = np.linalg.norm(np.diff(path, axis=0), axis=1).max(initial=0.0)
+    known = inside(system.entropy, places, 2.0 * float(apart + stride) + 1e-6 * case.size)
+    case.same("an entropy that is known near the motion alone", case.run(replaced(system, entropy=known)))
+    return None
+
+
+def closure(case: Case) -> Outcome:
+    """Parameters may be leaves of a system, or numbers that its functions close over."""
+    if case.system.is_driven or case.system.space is not None:
+        return "the energy is no plain function of the state"
+    case.same("parameters closed over", case.run(replaced(case.system, energy=closed_over(case.system.energy))))
+    return None
+
+
+def shares(case: Case) -> Outcome:
+    """A rate may be shared by two dissipations."""
+    if case.system.dissipation is None:
+        return "there is no dissipation"
+    run = case.run(replaced(case.system, dissipation=halved(case.system.dissipation)))
+    case.same("half of the rate, twice", run)
+    rows, ours = ([row.law for row in s.audit().rows] for s in (case.base, run))
+    case.suite.true(
+        f"{case.name}: one row of the audit for each quantity", ours == rows, "" if ours == rows else f"{ours}"
+    )
+    return None
+
+
+# -- coordinates and units ------------------------------------------------------------------------------------------
+
+
+def flat(case: Case) -> Outcome:
+    """Why the state has no other coordinates."""
+    system = case.system
+    if system.is_driven or system.space is not None or system.sites:
+        return "states are no vectors of R^n whose functions depend on them alone"
+    return None
+
+
+def units(case: Case) -> Outcome:
+    """Other units of state, time, energy and entropy."""
+    if reason := flat(case):
+        return reason
+    for state, time in UNITS:
+        change = Change(state * np.eye(case.system.dim), time, state / time, state**0.5)
+        options = (
+            {"step": case.step * time} if isinstance(case.step, float) else {"step": _in_units(case.step, state, time)}
+        )
+        run = case.run(changed(case.system, change), change.there(case.x0), (0.0, case.time * time), **options)
+        case.same(f"states times {state:g}, times times {time:g}", run, change.back)
+    return None
+
+
+def _in_units(step: Adaptive, state: float, time: float) -> Adaptive:
+    own = {name: value * time for name in ("first", "largest") if (value := getattr(step, name)) is not None}
+    return replace(step, atol=step.atol * state, **own)
+
+
+def order(case: Case) -> Outcome:
+    """Components may stand in another order."""
+    n = case.system.dim
+    return _turned(case, "components the other way round", np.eye(n)[::-1])
+
+
+def axes(case: Case) -> Outcome:
+    """Axes may be turned: another basis of the algebra, where there is one."""
+    n = case.system.dim
+    matrix = np.linalg.qr(np.random.default_rng(case.seed).standard_normal((n, n)))[0]
+    return _turned(case, "axes turned", matrix)
+
+
+def _turned(case: Case, what: str, matrix: np.ndarray) -> Outcome:
+    if reason := flat(case):
+        return reason
+    if getattr(case.system, "group", None) is not None:
+        return "the attitude is of a group with a basis of its own"
+    change, system = Change(matrix), case.system
+    run = case.run(changed(system, change), change.there(case.x0))
+    exact = case.method.orderless and not any(isinstance(term, Pullback) for term in system.energy.terms)
+    named = not isinstance(system, LiePoissonSystem)  # another basis has other Casimirs
+    case.same(what, run, change.back, case.rounding if exact else case.resolved, named)
+    return None
+
+
+def side_by_side(case: Case) -> Outcome:
+    """A system beside itself, from two states."""
+    if reason := flat(case):
+        return reason
+    n, other = case.system.dim, neighbour(case)
+    pair = case.run(Pair(case.system), np.concatenate([case.x0, other]))
+    alone = case.base, case.run(x0=other)
+    case.suite.true(f"{case.name}: the pair completes", pair.status.ok, "" if pair.status.ok else pair.status.message)
+    for run, part, name in zip(alone, (pair.x[-1][:n], pair.x[-1][n:]), ("one", "the other"), strict=True):
+        case.near(f"{name} of a pair", part, run.x[-1], case.resolved)
+    passed = pair.audit().passed == all(run.audit().passed for run in alone)
+    case.suite.true(f"{case.name}: the verdict of a pair is that of both", passed)
+    return None
+
+
+def neighbour(case: Case) -> np.ndarray:
+    """Another state, by a twentieth away."""
+    v = np.random.default_rng(case.seed + 1).standard_normal(case.x0.shape)
+    return case.x0 + 0.05 * case.size * v / np.linalg.norm(v)
+
+
+# -- time -----------------------------------------------------------------------------------------------------------
+
+
+def reversal(case: Case) -> Outcome:
+    """A reversible motion goes back the way that it came, where the energy is negative."""
+    system = case.system
+    if system.dissipation is not None or system.is_driven:
+        return "the motion is not reversible"
+    back = case.run(replaced(system, energy=-system.energy), case.base.x[-1])
+    symmetric = not case.method.explicit and not isinstance(case.step, Adaptive)
+    case.near("there and back", back.x[-1], case.x0, case.rounding if symmetric else 2.0 * case.resolved)
+    return None
+
+
+def split(case: Case) -> Outcome:
+    """A span may be cut in two, and states be kept seldom."""
+    seldom = case.run(save_every=5)
+    case.near("every fifth state kept", seldom.x[-1], case.base.x[-1], 0.0)
+    middle = len(case.base.t) // 2
+    if isinstance(case.step, Adaptive) or case.system.is_driven or middle == 0:
+        return None
+    t, x = case.base.t[middle], case.base.x[middle]
+    attitude = {} if case.base.attitude is None else {"attitude": case.base.attitude[middle]}
+    rest = case.run(x0=x, span=(t, case.time), **attitude)
+    case.near("the second half by itself", rest.x[-1], case.base.x[-1], case.rounding)
+    if rest.attitude is not None and case.base.attitude is not None:
+        case.suite.equal(f"{case.name}: its attitude", rest.attitude[-1], case.base.attitude[-1], case.rounding)
+    return None
+
+
+# -- by other ways --------------------------------------------------------------------------------------------------
+
+
+def engines(case: Case) -> Outcome:
+    """Every engine takes the same steps."""
+    case.same("array engine", case.run(engine="array"))
+    if not is_small(case.system, COMPILED_DIM):
+        return None
+    try:
+        case.same("compiled engine", case.run(engine="compiled"))
+    except UnsupportedPrimitive as error:
+        case.suite.without(f"{case.name}: compiled engine", str(error)[:60])
+    return None
+
+
+def many(case: Case) -> Outcome:
+    """A trajectory among others is the one alone."""
+    starts = np.stack([neighbour(case).ravel(), case.x0.ravel(), neighbour(case).ravel()])
+    found = ensemble(case.system, starts, (0.0, case.time), case.step, case.method, progress=False)
+    assert found.x is not None
+    case.near("among three", found.x[1], case.base.x[-1].ravel(), case.rounding)
+    return None
+
+
+def study(case: Case) -> Outcome:
+    """A point of a study is a run, and its values outlive the study."""
+    described = Study(
+        case.system,
+        {"replica": replicas(np.stack([neighbour(case).ravel(), case.x0.ravel()]))},
+        t_span=(0.0, case.time),
+        step=case.step,
+        method=case.method,
+        measure={"final": "final"},
+    )
+    described.run(progress=False)
+    results = described.results
+    del described
+    gc.collect()
+    case.near("a point, of a study that is gone", results.final.values[1], case.base.x[-1].ravel(), case.rounding)
+    return None
+
+
+def file(case: Case) -> Outcome:
+    """What is saved is what is loaded."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.nc"
+        case.base.save(path)
+        found = load(path)
+    assert isinstance(found, Solution)
+    alike = np.array_equal(found.x, case.base.x) and np.array_equal(found.t, case.base.t)
+    case.suite.true(f"{case.name}: loaded to the bit", alike and found.status == case.base.status)
+    same = str(found.audit()) == str(case.base.audit())
+    case.suite.true(f"{case.name}: the audit is that of the run", same)
+    return None
+
+
+def scipy(case: Case) -> Outcome:
+    """SciPy's call takes the steps of ``integrate``, and finds the event that ``until`` finds."""
+    if case.system.sites or case.system.space is not None:
+        return "SciPy's states are vectors"
+    if not case.method.has_estimate:
+        return "the method has no estimate of its error"
+    step = case.step if isinstance(case.step, Adaptive) else Adaptive(1e-8)
+
+    def solved(**options):
+        span = (0.0, case.time)
+        return solve_ivp(case.system, span, case.x0, case.method, rtol=step.rtol, atol=step.atol, **options)
+
+    ours = case.run(step=step)
+    case.near("solve_ivp", solved().y[:, -1], ours.x[-1], case.rounding)
+    i = int(np.argmax(np.abs(ours.x[-1] - ours.x[0])))
+    crossing = _Crossing(i, float(0.5 * (ours.x[0, i] + ours.x[-1, i])))
+    if crossing.level == ours.x[0, i]:
+        return None
+    until = case.run(step=step, until=lambda x: x[i] - crossing.level)
+    found = solved(events=crossing)
+    there = found.status == 1 and until.event_time is not None
+    case.suite.true(f"{case.name}: both find the event", there, found.message)
+    if there:
+        assert found.t_events is not None
+        assert found.y_events is not None
+        when = found.t_events[0][0] - until.event_time
+        case.suite.small(f"{case.name}: when it is", when, case.time, case.rounding)
+        case.near("where it is", found.y_events[0][0], until.x[-1], case.rounding)
+    return None
+
+
+class _Crossing:
+    """The event that a component crosses a level, as SciPy has it."""
+
+    terminal = True
+
+    def __init__(self, component: int, level: float):
+        self.component, self.level = component, level
+
+    def __call__(self, t, y):
+        return y[self.component] - self.level
+
+
+def diffrax(case: Case) -> Outcome:
+    """Diffrax's loop takes the steps of ``integrate``; backwards it takes those of minus the field."""
+    if importlib.util.find_spec("diffrax") is None:
+        return "diffrax is not installed"
+    if isinstance(case.step, Adaptive) or case.system.is_driven or case.system.space is not None or case.system.sites:
+        return "steps of one size on R^n are compared"
+    import diffrax as peer
+
+    from ..interop.diffrax import Solver, Term
+
+    term, solver, h = Term(case.system), Solver(case.method), case.step
+
+    def solved(start: float, end: float, step: float, x):
+        control = peer.ConstantStepSize()
+        run = peer.diffeqsolve(
+            term, solver, start, end, step, x, stepsize_controller=control, max_steps=100_000, throw=False
+        )
+        assert run.ys is not None
+        return run.ys[-1], bool(run.result == peer.RESULTS.successful)
+
+    x, ok = solved(0.0, case.time, h, case.x0)
+    case.suite.true(f"{case.name}: diffeqsolve succeeds", ok)
+    case.near("diffeqsolve", x, case.base.x[-1], case.rounding)
+    x, ok = solved(case.time, 0.0, -h, x)
+    case.suite.true(f"{case.name}: backwards it succeeds", ok)
+    case.near("there and back", x, case.x0, 2.0 * case.resolved)
+    return None
+
+
+RELATIONS: dict[str, Callable[[Case], Outcome]] = {
+    "constant": constant,
+    "domain": domain,
+    "closure": closure,
+    "shares": shares,
+    "units": units,
+    "order": order,
+    "axes": axes,
+    "side by side": side_by_side,
+    "reversal": reversal,
+    "split": split,
+    "engines": engines,
+    "ensemble": many,
+    "study": study,
+    "file": file,
+    "scipy": scipy,
+    "diffrax": diffrax,
+}
+"""By name."""
+
+
+def check_relations(
+    system: System,
+    method: OneStepMethod | None = None,
+    x0=None,
+    step: float | Adaptive | None = None,
+    *,
+    relations: Collection[str] | None = None,
+    time: float | None = None,
+    seed: int = 0,
+) -> Report:
+    """Compare a run with itself, written down in other ways: what must not change a result, or must change it so.
+
+    A constant in the energy; units of state and time by factors up to 1e20; components in another order and axes
+    turned (another basis of the algebra); a rate shared by two dissipations; parameters closed over; an entropy that is
+    known near the motion alone; a system beside itself; the motion backwards; a span in two parts; every engine; the
+    run in an ensemble, in a study, from a file, by SciPy's and by diffrax's call.
+
+    Parameters
+    ----------
+    system : System
+    method : OneStepMethod, optional
+        ``MetriplecticGauss(1)`` by default.
+    x0 : array, optional
+        The state that runs start from; a random one by default.
+    step : float or Adaptive, optional
+        By default the state moves by a hundredth of its size in a step.
+    relations : collection of str, optional
+        Some of ``liethermo.testing.RELATIONS``; by default all.
+    time : float, optional
+        That a run takes; by default forty steps, the state moving by two fifths of its size.
+    seed : int
+        Of the state, and of the axes.
+
+    Returns
+    -------
+    Report
+        A relation that cannot be asked of the system has a row that says why.
+
+    Raises
+    ------
+    PropertyError
+        If a relation does not hold.
+    InputError
+        If there is no relation of a name.
+    """
+    wanted = list(RELATIONS if relations is None else relations)
+    if unknown := set(wanted) - set(RELATIONS):
+        raise InputError(f"there is no relation {unknown.pop()!r}; there are {', '.join(RELATIONS)}")
+    start = start_of(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
+    h = step_of(system, start)
+    step = h if step is None else step
+    length = STEPS * (h if isinstance(step, Adaptive) else step)
+    case = Case(
+        system, DEFAULT_METHOD if method is None else method, start, step, length if time is None else time, seed
+    )
+    for name in wanted:
+        case.name = name
+        if (reason := RELATIONS[name](case)) is not None:
+            case.suite.without(name, reason)
+    return case.suite.report()
