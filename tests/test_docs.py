@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 import runpy
@@ -145,7 +146,213 @@ def test_a_name_that_does_not_exist_is_found(code_links):
         code_links.resolve("lt.integrat")
 
 
+def test_python_in_code_font_is_right(code_spans):
+    """What a page says in passing: names exist, arguments are those of their functions, what is complete runs."""
+    wrong, read = [], 0
+    for page in PAGES:
+        text = page.read_text()
+        bound = code_spans.names_of("\n".join(BLOCK.findall(text)))
+        for span in code_spans.spans(text):
+            try:
+                read += code_spans.check(span, bound)
+            except code_spans.SpanError as error:
+                wrong.append(f"{_name(page)}: {span}: {error}")
+    assert wrong == []
+    assert read > 400
+
+
+def test_blocks_that_are_not_executed_are_right(code_spans):
+    """Those for clusters: a page marks them as ``py``. Other blocks of Python are marked as ``python``, and run."""
+    fences = [(page, fence) for page in PAGES for fence in re.findall(r"^```(\w+)$", page.read_text(), re.MULTILINE)]
+    assert {fence for _, fence in fences} <= {"python", "py", "sh", "bash", "toml", "text"}
+    for page in PAGES:
+        for block in re.findall(r"^```py\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
+            code_spans.check_block(block)
+    with pytest.raises(code_spans.SpanError, match="no attribute 'runn'"):
+        code_spans.check_block("import sys\n\nfor client in sys.argv:\n    study.runn(client)")
+
+
+@pytest.mark.parametrize(
+    ("span", "words"),
+    [
+        ("colour=3", "no public function has an argument 'colour'"),
+        ("colour=", "no public function has an argument 'colour'"),
+        ("lt.integrate(system, x0, colour=3)", "unexpected keyword argument 'colour'"),
+        ("lt.Study(..., colour=3)", "unexpected keyword argument 'colour'"),
+        ("step=lt.Adaptive(colour=3)", "unexpected keyword argument 'colour'"),
+        ("system.vector_field(x, colour=3)", "unexpected keyword argument 'colour'"),
+        ("solution.colour", "no attribute 'colour'"),
+        ("lt.integrat(x)", "no 'integrat'"),
+        ("ProjectedMetrics()", "there is no 'ProjectedMetrics'"),
+        ("colour()", "no function or method 'colour'"),
+        ("Quadratic(A, b, c, d)", "too many positional arguments"),
+        ("MetriplecticGauss(stages=9)", "stages is an integer from 1 to 8"),
+        ("dissipation='friction'", "no public function takes such a value as 'dissipation'"),
+        ("dissipation=[lt.ProjectedMetric(), 3]", "no public function takes such a value as 'dissipation'"),
+    ],
+)
+def test_python_in_code_font_that_is_wrong_is_found(code_spans, span, words):
+    with pytest.raises(code_spans.SpanError, match=words):
+        code_spans.check(span)
+
+
+def test_what_is_no_python_is_left_alone(code_spans):
+    for span in ("make bench", "liethermo --version", "docs/_build/html", "CITATION.cff", ".png", "rtol * max|x|"):
+        assert not code_spans.check(span)
+    table = "| other | here |\n|---|---|\n| `Foreign(colour=3)` | `lt.Adaptive(rtol=1e-3)` |\n\n`step=0.1` {doc}`index`"
+    assert code_spans.spans(table) == ["lt.Adaptive(rtol=1e-3)", "step=0.1"]
+
+
+UNLIMITED = re.compile(
+    r"any even order|\b(?:holds?|monotone)\b[^.]*\b(?:any|every) step size"
+    r"|\bsteps?\b[^.;]*whatever\s+(?:its|the step) size",
+    re.IGNORECASE,
+)
+"""Promises for orders that no method has, and for steps that a method cannot take."""
+
+
+def test_orders_and_step_sizes_are_told_as_they_are():
+    """As many stages as the methods take, and no promise for steps that a method cannot take."""
+    most = max(s for s in range(1, 20) if _takes(s))
+    told = {page: re.findall(r"even orders? up to (\d+)", page.read_text()) for page in PAGES}
+    assert {_name(page): set(orders) for page, orders in told.items() if orders} == {
+        "README.md": {str(2 * most)},
+        "docs/index.md": {str(2 * most)},
+    }
+    assert f"s = 1 … {most} " in (ROOT / "docs/explanation/accuracy.md").read_text()
+    found = [f"{_name(path)}: {words}" for path in TEXTS for words in UNLIMITED.findall(path.read_text())]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "`MetriplecticGauss` has any even order",
+        "The laws hold for every step size; accuracy does not.",
+        "**The laws hold in every step**, whatever its size: energy constant",
+        "keep the energy to rounding and the entropy growing at every step, whatever the step size.",
+    ],
+)
+def test_a_promise_without_limits_is_found(words):
+    assert UNLIMITED.search(words)
+
+
+def _takes(stages: int) -> bool:
+    try:
+        liethermo.MetriplecticGauss(stages)
+    except liethermo.InputError:
+        return False
+    return True
+
+
+NUMBER = r"(?:\d[\d.,]*|two|three|four|five|six|ten|twenty|fifty|a?\s?hundred|a?\s?thousand|many|several)(?: or more)?"
+PART = r"(?:half|(?:a|an|one|two) (?:third|half|quarter|fifth|tenth|twentieth|hundredth)s?|twice|\d+ (?:%|per cent))"
+SPEED = re.compile(
+    rf"\d\s?(?:ns|µs|us|ms)\b|\b(?:nano|micro|milli)seconds?\b"
+    rf"|\b(?:{NUMBER} times|twice)\s+(?:as\s+(?:fast|slow|cheap|dear)|faster|slower|cheaper)|\bspeed of C\b"
+    rf"|\b(?:takes?|took|costs?)\s+(?:some |about )?{PART}\b|\b{NUMBER} (?:seconds|minutes) a (?:step|call|run)"
+    rf"|\btakes?\s+(?:a second|some seconds|a few seconds|{NUMBER} (?:seconds|minutes))",
+    re.IGNORECASE,
+)
+"""How fast the library is, in numbers."""
+
+
+def _figures_of_speed(path: Path) -> list[str]:
+    """Those in the words of a page, or in the docstrings of a module."""
+    if path.suffix == ".py":
+        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Expr)]
+        words = [node.value.value for node in nodes if isinstance(node.value, ast.Constant)]
+        text = "\n\n".join(word for word in words if isinstance(word, str))
+    else:
+        text = _words(path)
+    return [match[0] for match in SPEED.finditer(text)]
+
+
+def test_figures_of_speed_are_on_the_page_of_benchmarks_alone():
+    """That page is written by what measures them; elsewhere they would differ from it sooner or later."""
+    benchmarks = ROOT / "docs/reference/benchmarks.md"
+    assert len(_figures_of_speed(benchmarks)) > 100
+    ours = [path for path in TEXTS if path != benchmarks and not path.is_relative_to(ROOT / "examples")]
+    texts = [*ours, ROOT / "CHANGELOG.md"]
+    assert len(texts) > 300
+    found = [f"{_name(path)}: {figure}" for path in texts for figure in _figures_of_speed(path)]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "Native spaces are a hundred times faster and have derivatives of every order.",
+        "geomstats runs in NumPy on the host, a hundred or more times slower than a native space",
+        "machine code of their own for small ones, ten times as fast and\nmore, after some seconds of compiling",
+        "takes 18 ms of processor time",
+        "| 10⁵ | 0.060 s | 0.6 µs | 0.8 GB |",
+        "so that every pass goes through the memory without gaps: that takes a third of the time.",
+        "Plain Python functions at the speed of C",
+        "compiles the equations to machine code, which takes a second or two",
+        "costs a quarter of what it did; ensembles take half the time",
+    ],
+)
+def test_a_figure_of_speed_is_found(words, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(words)
+    assert _figures_of_speed(page)
+
+
 @pytest.fixture
 def code_links(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
     return importlib.import_module("code_links")
+
+
+@pytest.fixture
+def code_spans(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    return importlib.import_module("code_spans")
+
+
+TEXTS = [
+    *PAGES,
+    *(path for path in sorted((ROOT / "examples").rglob("*")) if path.suffix in (".py", ".rst", ".toml")),
+    *(path for package in ("liethermo", "manifolds") for path in sorted((ROOT / package).rglob("*.py"))),
+]
+INSIDE = re.compile(
+    r"internal friction|friction (?:inside|between its parts)|inside (?:it|them) rubs?|nothing acts"
+    r"|friction (?:turns|brings|lets)[^.]* (?:body|whole)",
+    re.IGNORECASE,
+)
+KEPT = re.compile(r"(?:keeps|constant|cannot change|takes nothing from)\s+(?:\w+\s+){0,2}energy|energy is\s+constant")
+CONTROLLED = re.compile(r"\brigid_body\b|KillingDissipation\(")
+LEFT_ALONE = re.compile(r"DoubleBracket|body_with_wheels")
+
+
+def _wrong_bodies(text: str) -> list[str]:
+    """Paragraphs that tell of friction inside a body that keeps its kinetic energy.
+
+    That of the controlled body is constant, but a torque acts on it. Where one text has both kinds of bodies, which
+    is which is for its reader to judge.
+    """
+    one = CONTROLLED.search(text) and not LEFT_ALONE.search(text)
+    paragraphs = [re.sub(r"\s*\n(?:#|\s)*", " ", paragraph) for paragraph in re.split(r"\n\s*\n", text)]
+    return [paragraph for paragraph in paragraphs if INSIDE.search(paragraph) and (one or KEPT.search(paragraph))]
+
+
+def test_no_text_mistakes_the_controlled_body_for_one_with_friction_inside():
+    wrong = [f"{_name(path)}: {paragraph[:120]}" for path in TEXTS for paragraph in _wrong_bodies(path.read_text())]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A body tumbles. Friction inside it turns motion into heat and takes nothing from its energy, so it settles.",
+        "Something inside it rubs. Nothing acts from outside.\n\nbody = lt.models.rigid_body(inertia=(3.0, 2.0, 1.0))",
+        "A rigid body whose internal friction keeps its energy and lets it settle on its axis of greatest inertia.",
+        "A body turns; friction inside it keeps its energy and lets it settle.",
+        "A rigid body with internal friction: its energy is\nconstant, its entropy grows.",
+        "# Friction inside it produces entropy\n# but cannot change its energy\n\nname = 'rigid_body'",
+        "Friction brings the whole to the state of greatest entropy.\n\nlt.KillingDissipation(1.0)",
+    ],
+)
+def test_a_body_told_wrongly_is_found(text):
+    assert _wrong_bodies(text)

@@ -1,6 +1,6 @@
 """A Sphinx extension: moving pictures that a reader can turn, computed by the build.
 
-``momentum-sphere`` is a relaxing body on its energy surface, ``sphere-field`` a decaying flow on the sphere. The
+``momentum-sphere`` is the relaxed rigid body on its energy surface, ``sphere-field`` a decaying flow on the sphere. The
 content of each directive says in words what it shows.
 """
 

@@ -40,8 +40,8 @@ print(f"{g.casimir_count()} Casimirs: {centre} and {casimir}")
 # out and J take up their energy.
 
 energy = lt.Quadratic([1.0, 2.0, 2.0, 0.0])
-friction = lt.ProjectedMetric(preserve=[centre], rate=0.05)
-system = lt.LiePoissonSystem(g, energy, entropy=casimir, dissipation=friction)
+dissipation = lt.ProjectedMetric(preserve=[centre], rate=0.05)
+system = lt.LiePoissonSystem(g, energy, entropy=casimir, dissipation=dissipation)
 print(system.check())
 
 solution = lt.integrate(system, [0.2, 1.2, 0.0, 1.0], t_span=(0.0, 30.0), step=0.05)

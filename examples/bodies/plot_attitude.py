@@ -3,8 +3,9 @@ What does a relaxing body look like from outside?
 =================================================
 
 The momentum of a body lives in its own frame. Given the group, the integrator returns the attitude too: the rotation
-g(t) from the body to space, with ``g' = g hat(Omega)``. A box that spins about its middle axis tumbles; as friction
-inside it produces entropy at constant energy, it ends up turning about its axis of greatest inertia.
+g(t) from the body to space, with ``g' = g hat(Omega)``. A box that spins about its middle axis tumbles. Here a torque
+that does no work turns it, as in Morrison's rigid body (1986): it ends up turning about its axis of greatest
+inertia, with the energy that it had.
 """
 
 import matplotlib.pyplot as plt
@@ -28,7 +29,7 @@ print(solution.audit())
 print(f"off the rotations by at most {float(mf.SO(3).defect(solution.attitude).max()):.0e}")
 
 # %%
-# Without friction the momentum seen from space, ``g mu``, does not move. By Cayley's map it stays to rounding.
+# Without a torque the momentum seen from space, ``g mu``, does not move. By Cayley's map it stays to rounding.
 
 free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / inertia), group=mf.SO(3))
 tumbling = lt.integrate(free, [0.02, 1.0, 0.02], (0.0, 60.0), 0.05)
@@ -36,7 +37,8 @@ in_space = np.einsum("tij,tj->ti", tumbling.attitude, tumbling.x)
 print(f"the spatial momentum of the free body drifts by {np.abs(in_space - in_space[0]).max():.0e}")
 
 # %%
-# The box seen from outside, with its momentum, which is at first along the middle edge, in the end along the shortest.
+# The box under the torque, seen from outside, with its momentum, which is at first along the middle edge, in the end
+# along the shortest. The momentum turns in space too, since a torque acts.
 
 corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2
 faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]

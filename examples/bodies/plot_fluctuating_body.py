@@ -2,9 +2,10 @@
 How does a body fluctuate about its axis?
 =========================================
 
-Friction turns a free body to the axis of its largest moment of inertia, where the entropy is largest at the energy that
-it has. With the noise that belongs to the friction it does not stay there: it wanders over its energy surface, and
-comes to the measure ``exp(S / k)`` on it. On every path the energy is that of the start, to rounding.
+The dissipation of Morrison's rigid body (1986) turns it to the axis of its largest moment of inertia, where the entropy
+``S = 2 |mu|^2`` is largest at the energy that it has. With the noise that belongs to the dissipation it does not stay
+there: it wanders over its energy surface, and comes to the measure ``exp(S / k)`` on it. On every path the energy is
+that of the start, to rounding.
 """
 
 import matplotlib.pyplot as plt

@@ -2,7 +2,7 @@
 Inertias and a rate from a noisy record
 =======================================
 
-Derivatives of a trajectory by its parameters turn measurements into parameters. A body tumbles and relaxes; its
+Derivatives of a trajectory by its parameters turn measurements into parameters. Morrison's rigid body relaxes; its
 momentum is recorded with noise of two per cent. Least squares finds the moments of inertia and the rate of dissipation
 again, with the Jacobian from ``lt.flow``: it differentiates the discrete flow itself, by the implicit function theorem.
 

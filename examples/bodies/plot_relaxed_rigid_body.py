@@ -1,10 +1,10 @@
 """
-Where does a body with internal friction settle?
-================================================
+Where does Morrison's rigid body settle?
+========================================
 
-A rigid body with internal friction, in the form of Bloch, Farré Puiggalí and Martín de Diego (2024): its energy is
-constant, its entropy :math:`S = |\\mu|^2/2` grows, and it ends by spinning about its axis of greatest inertia. This is
-the run of their Figure 1.
+A torque that does no work acts on a rigid body (Morrison 1986). Its energy is constant, its entropy
+:math:`S = |\\mu|^2/2` grows, and it ends by spinning about its axis of greatest inertia. This is the run of Figure 1 of
+Bloch, Farré Puiggalí and Martín de Diego (2024).
 """
 
 import liethermo as lt
@@ -14,7 +14,7 @@ body = lt.models.rigid_body(inertia)
 solution = lt.integrate(body, [0.001, 1.0, 0.001], t_span=(0.0, 60.0), step=0.1)
 
 # %%
-# The scheme keeps both laws at every step and at any step size, and the audit says so.
+# The scheme keeps both laws at every step, and the audit says so.
 
 print(solution.audit())
 

@@ -1,6 +1,6 @@
 """
-Any even order, with both laws exact
-====================================
+Order after order, with both laws exact
+=======================================
 
 ``MetriplecticGauss`` of s stages is of order 2s. Here neither the energy nor the entropy is quadratic, on two algebras:
 a body with an anharmonic energy on so(3)*, and a top-like system on se(3)* whose entropy is a function of a Casimir.
@@ -37,7 +37,7 @@ top = lt.LiePoissonSystem(
 )
 cases = [
     ("anharmonic body, so(3)*", anharmonic, [0.8, 0.5, 0.9]),
-    ("top with friction, se(3)*", top, [0.4, 0.3, 0.8, 0.3, 0.2, 0.9]),
+    ("top with dissipation, se(3)*", top, [0.4, 0.3, 0.8, 0.3, 0.2, 0.9]),
 ]
 
 # %%

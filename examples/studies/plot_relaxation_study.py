@@ -1,9 +1,9 @@
 """
-How long does a body wobble?
-============================
+How long does a body take to relax?
+===================================
 
-A body with internal friction ends by spinning about its axis of greatest inertia. How long that takes depends on its
-shape and on the friction: a grid of 50 by 20 runs.
+Morrison's rigid body (1986) ends by spinning about its axis of greatest inertia. How long that takes depends on its
+inertias and on the rate of its dissipation: a grid of 50 by 20 runs.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ study = lt.Study(
     t_span=(0.0, 600.0),
     step=0.2,
     measure={"tau": "relaxation_time"},
-    names={"ratio": "middle moment of inertia, of the greatest", "rate": "friction"},
+    names={"ratio": "middle moment of inertia, of the greatest", "rate": "rate of dissipation"},
 )
 print(study.run())
 
@@ -35,7 +35,7 @@ print(study.run())
 lt.plot.study(study.results)
 
 # %%
-# The stronger the friction the shorter the time, nearly in inverse proportion. The body begins near its axis of least
+# The larger the rate the shorter the time, nearly in inverse proportion. The body begins near its axis of least
 # inertia, and stays there the longer the less the middle moment differs from the least.
 
 tau = study.results.tau
