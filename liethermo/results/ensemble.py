@@ -14,7 +14,7 @@ from manifolds._tables import html_grid
 
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
-from .audit import Audit, AuditRow, Tolerances, accuracy_row
+from .audit import Audit, AuditRow, Tolerances, accuracy_row, coverage_of
 from .evidence import Evidence
 from .files import ENSEMBLE_FORMAT, Saved, as_parts, described, from_parts, places
 from .many import laws_of_many
@@ -29,8 +29,8 @@ SENTENCES = {
     Code.COMPLETED: "reached t = {t:.15g} in {n} steps",
     Code.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration stopped at "
     "a residual of {r:.2g} relative to the state; try a smaller step",
-    Code.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy or the vector field "
-    "is not finite there; check the domain of the functions, or try a smaller step",
+    Code.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector field or "
+    "the event function is not finite there; check the domain of the functions, or try a smaller step",
     Code.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
     Code.EVENT: "the event happened at t = {t:.15g} in {n} steps",
     Code.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
@@ -101,7 +101,7 @@ class Ensemble(Saved):
         Done on the system from outside, where its energy depends on time; the drift and the increments of the energy
         are then those of the energy less the work.
     reasons : mapping from int to str
-        Why trajectories are inadmissible.
+        Why trajectories are inadmissible, or have failed where that is known.
     provenance : dict
         Library version, method, step, system, date: JSON data.
     """
@@ -195,7 +195,10 @@ class Ensemble(Saved):
         """How a trajectory ended, in words, its index first."""
         i = self._place(i)
         facts = {"t": self.end_time[i], "n": self.steps[i], "next": self.steps[i] + 1, "r": self.residual[i]}
-        text = SENTENCES[Code(self.status[i])].format(reason=self.reasons.get(i, ""), **facts)
+        code, reason = Code(self.status[i]), self.reasons.get(i, "")
+        text = SENTENCES[code].format(reason=reason, **facts)
+        if reason and code != Code.INADMISSIBLE:
+            text = f"step {facts['next']} could not be taken: {reason}"
         return f"trajectory {i}: {text}"
 
     def status_of(self, i: int) -> Status:
@@ -275,7 +278,8 @@ class Ensemble(Saved):
     ) -> Audit:
         """The laws at every step of every trajectory, each by the one that kept it worst; printing it gives a table.
 
-        The local error is estimated in the first step of at most 32 trajectories.
+        Local errors are measured along at most 32 trajectories, from their start as far as can be afforded; of adaptive
+        steps, in the first one. The verdict says how many steps were looked at, where it was not all.
 
         Parameters
         ----------
@@ -299,7 +303,8 @@ class Ensemble(Saved):
         rows.append(AuditRow("trajectories that failed", float(failed), 0.0, failed == 0))
         least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
         drift, residual = (float(a.max(initial=0.0, where=moved)) for a in (self.energy_drift, self.residual))
-        return Audit(drift, least, np.nan, residual, tuple(rows))
+        coverage = coverage_of(self.evidence, int(self.steps.sum()))
+        return Audit(drift, least, np.nan, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
 

@@ -45,7 +45,7 @@ class Solution(Saved):
     event_time : float or None
         When the event of ``integrate(until=...)`` happened.
     dense : Dense or None
-        The polynomials between the steps (``integrate(dense=True)``); not written to files.
+        The states between the steps (``integrate(dense=True)``); not written to files.
     attitude : ndarray, shape (times, m, m), or None
         Elements of the group of the system, where it has one.
     evidence : Evidence
@@ -74,7 +74,9 @@ class Solution(Saved):
         return {**vars(self), "evidence": self.evidence, "witness": None}
 
     def __call__(self, t) -> np.ndarray:
-        """States at any times, shape (..., n), from the collocation polynomials of the steps.
+        """States at any times, shape (..., n): each is where a step ends that begins at the last state before.
+
+        So it has the order of the method, and the laws hold there too.
 
         Raises
         ------
@@ -94,7 +96,8 @@ class Solution(Saved):
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held and the steps resolve the motion, as a table.
 
-        Some steps are taken again when this is first called, from at most 64 states of the run.
+        When this is first called the steps are looked at: all of them where that can be afforded, otherwise those where
+        the motion is fastest, and the verdict says how many. The worst are taken again.
 
         Parameters
         ----------

@@ -66,6 +66,8 @@ class Stats:
         Of one step. These three are None where no step was followed (no step taken, or ``Reference``).
     attitude_residual : float or None
         Largest distance from the group of the attitudes kept, relative to their size; None without a group.
+    spatial_momentum_change : float or None
+        Largest change of the momentum in space ``Ad_star(inverse(g), mu)`` among the states kept, relative to its size.
     wall_time : float
         Seconds, compilation included.
     """
@@ -80,6 +82,7 @@ class Stats:
     least_entropy_increment: float | None = None
     largest_energy_increment: float | None = None
     attitude_residual: float | None = None
+    spatial_momentum_change: float | None = None
     wall_time: float = 0.0
 
     @property
@@ -96,7 +99,8 @@ class Laws:
     outside. ``balance`` names those of them that the energy of a solution contains, and its law is stated without
     (``dH = work``). ``inexact`` says which of the two laws ("energy", "entropy") the method makes no claim to keep: an
     audit judges them all the same, and says so. ``mean`` names those of the two laws that fluctuations leave for the
-    mean alone: on paths both may rise and fall.
+    mean alone: on paths both may rise and fall. ``unknown`` names the functions of which it could not be found out
+    whether the system conserves them.
     """
 
     energy: str | None = "conserved"
@@ -107,6 +111,7 @@ class Laws:
     balance: tuple[str, ...] = ()
     unpromised: tuple[str, ...] = ()
     mean: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Laws:

@@ -17,10 +17,10 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import COMPILED_DIM
+from ..engines.codes import Code
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
-from ..engines.paced import step_all
-from ..engines.stepping import TELLING, begin
+from ..engines.stepping import TELLING, begin, take_step
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
@@ -149,12 +149,17 @@ def run_compiled(
     by_threads(work, len(record.x0), course.steps)
 
 
-def first_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
-    """The states after one step of all members of a small family, each of its own size."""
+Followed = tuple[dict[str, np.ndarray], np.ndarray]
+"""The fields of states after some steps, and the states after each, shape (trajectories, steps, n)."""
+
+
+def follow_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> Followed:
+    """All members of a small family after so many steps, each of its own size."""
     lanes, number = Lanes(family, method), len(x)
     blocks = lanes.stepper.begin(lanes.parameters(slice(None), number), x)
-    lanes.stepper.run(lanes.first, blocks, np.resize(h, len(blocks) * LANES), 1, 1)
-    return {name: values[:number] for name, values in lanes.stepper.fields(blocks).items()}
+    states = lanes.stepper.run(lanes.first, blocks, np.resize(h, len(blocks) * LANES), steps, 1)
+    after = {name: values[:number] for name, values in lanes.stepper.fields(blocks).items()}
+    return after, np.asarray(states)[:number, :, :-2]
 
 
 def calls(course: Course, limit: int):
@@ -211,12 +216,37 @@ def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tall
             return
 
 
-def first_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray) -> dict[str, np.ndarray]:
-    """The states after one step of all members of a small family, each of its own size."""
+def follow_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> Followed:
+    """All members of a small family after so many steps, each of its own size."""
     parameters, axes = family.batched(slice(None))
-    state = begin_all(family.form, parameters, axes, method, jnp.asarray(x))
-    state = step_all(family.form, parameters, axes, method, state, jnp.asarray(h))
-    return {name: np.asarray(value) for name, value in state._asdict().items()}
+    state, found = begin_all(family.form, parameters, axes, method, jnp.asarray(x)), []
+    for done in range(0, steps, TOGETHER):
+        number = min(TOGETHER, steps - done)
+        state, states = follow_all(family.form, parameters, axes, method, state, jnp.asarray(h), jnp.asarray(number))
+        found.append(np.asarray(states)[:, :number])
+    return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(found, axis=1)
+
+
+TOGETHER = 32
+"""Steps that one call follows at most."""
+
+
+@program
+def follow_all(form, parameters, axes, method, state, h, steps):
+    """So many steps of all, each of its own size, and the states after each."""
+
+    def one(p, state, h):
+        system = form.rebuild(p)
+
+        def step(i, carry):
+            state, states = carry
+            after = take_step(system, method, state, h)
+            state = jax.tree_util.tree_map(lambda a, b: jnp.where(state.status == Code.COMPLETED, a, b), after, state)
+            return state, states.at[i].set(state.x)
+
+        return jax.lax.fori_loop(0, steps, step, (state, jnp.zeros((TOGETHER, *state.x.shape))))
+
+    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, h)
 
 
 @program

@@ -12,23 +12,25 @@ from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.ensemble import Ensemble
-from ..results.evidence import has_estimate
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, pacing_of
-from .batches import THREADS, Tally, first_array, first_compiled, run_array, run_compiled
+from .batches import THREADS, Tally, follow_array, follow_compiled, run_array, run_compiled
 from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .paced import Many
-from .preparation import NO_GROUP, as_run, check_choice, laws_of
+from .preparation import NO_GROUP, as_run, check_choice, decided, laws_of
 from .presented import provenance_of
 from .progress import Progress
-from .record import Alone, FirstSteps, Record
+from .record import Alone, Followed, Record
 from .stepwise import stops_of
 from .timetable import Course
 
 __all__ = ["THREADS", "Ensemble", "ensemble"]
+
+FOLLOWED = 256
+"""Steps that an audit takes again of a trajectory by the array engine, whose steps are slow."""
 
 
 def ensemble(
@@ -118,11 +120,12 @@ def ensemble(
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
     states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
-    run = np.arange(len(states))
+    size = len(states)
+    run = np.arange(size)
     if reasons:
         run = np.setdiff1d(run, list(reasons))
         family, states = family.select(run), states[run]
-    told = member = family.representative
+    told = member = decided(family.representative, states)
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
     if isinstance(member, AttitudeSystem):
@@ -134,7 +137,7 @@ def ensemble(
     if isinstance(member, DrivenSystem):
         family, states = family.through(DrivenSystem), np.asarray(member.begin(states, course.start, batch=True))
     method.check(member)
-    record = Record(family, member, states, course, outputs)
+    record = Record(family, member, states, course, outputs, np.nan if isinstance(step, Adaptive) else course.h)
     event = None if until is None else Event(until, member)
     pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
 
@@ -159,10 +162,12 @@ def ensemble(
         if chosen == "array":
             take(chosen, Tally(bar.update))
     record.close()
-    first = FirstSteps(record, method, first_compiled if chosen == "compiled" else first_array)
+    reasons = dict(reasons) | {int(run[j]): text for j, text in record.reasons.items()}
+    again, most = (follow_compiled, course.steps) if chosen == "compiled" else (follow_array, FOLLOWED)
+    followed = Followed(record, method, again, 1 if isinstance(step, Adaptive) else min(course.parts[0].full, most))
     return record.result(
         run,
-        len(reasons) + len(run),
+        size,
         reasons=reasons,
         laws=laws_of(member, method, {}),
         engine=chosen,
@@ -174,7 +179,7 @@ def ensemble(
             "engine": chosen,
             "noise": None if noise is None else noise.listed(),
         },
-        witness=first if has_estimate(method) else None,
+        witness=None if method.increments else followed,
         alone=Alone(record, method, run),
     )
 

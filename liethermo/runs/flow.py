@@ -25,7 +25,7 @@ def flow(
     method: OneStepMethod | None = None,
     save_every: int | None = None,
 ) -> jax.Array:
-    """The state that x0 flows to, a differentiable function of x0 and of the parameters of the system.
+    """The final state of the flow from x0, a differentiable function of x0 and of the parameters of the system.
 
     The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations:
     the stage equations ``k = slopes(x, k)`` define k, and their linearisation its derivative (implicit function
@@ -44,12 +44,14 @@ def flow(
     method : OneStepMethod
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int, optional
-        Return every n-th state, n this number, and the first and the last one.
+        Return the states on the way too: every n-th, n this number, and the first and the last one.
 
     Returns
     -------
-    array, shape (n,), or (times, n); ``(*sites, d)`` instead of n, of a system on sites
-        NaN from where a step could not be solved: inside a compiled function nothing can be raised.
+    array, shape (n,), or (times, n)
+        The final state, the one at the end of t_span; with ``save_every`` states at several times, the final one last.
+        ``(*sites, d)`` instead of n, of a system on sites. NaN from where a step could not be solved: inside a
+        compiled function nothing can be raised.
 
     Raises
     ------
@@ -121,9 +123,9 @@ def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Arra
         solved = solve_stages(
             lambda k: slopes(dynamic, k),
             guess,
-            lambda k: scale_of(x, h, k),
+            lambda k: scale_of(method.judged(system, x)[1], h, k),
             newton_steps(system, method, x, low, h),
-            lambda: noise_of(system, x),
+            lambda: noise_of(system, method, x),
         )
         return jnp.where(solved.converged, solved.k, jnp.nan)
 

@@ -17,10 +17,11 @@ from ..systems import AttitudeSystem, DrivenSystem, System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import NO_GROUP, as_run, check_choice, prepared
+from .preparation import NO_GROUP, as_run, check_choice, decided, prepared
 from .progress import Progress
 from .run import Run
 from .timetable import Timetable
+from .watch import Watch
 
 UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
 
@@ -34,7 +35,7 @@ def integrate(
     *,
     save_every: int = 1,
     save_at=None,
-    until: Relaxed | Callable | None = None,
+    until: Relaxed | Callable | Watch | None = None,
     dense: bool = False,
     engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
@@ -61,14 +62,17 @@ def integrate(
     save_at : array of times, optional
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
-        Stop where the entropy production has fallen below ``lt.Relaxed(tol)``, or where the function crosses zero:
-        located to rounding by a step that ends there. ``solution.event_time`` and the status tell whether it happened.
-        Two crossings within a step of given size are not seen; adaptive steps are looked at between their ends too.
+        Stop where the entropy production, or the fall of the energy, is below that of ``lt.Relaxed(tol)``, or where the
+        function is zero and changes its sign: located to rounding by a step that ends there. ``solution.event_time``
+        and the status tell whether it happened. A jump or a pole is no zero: a step ends there, the run goes on, and
+        the status says so. Where the function is not a number between two signs, the run ends with the status
+        "non_finite". Two crossings within a step of given size are not seen; adaptive steps are looked at between
+        their ends too.
     dense : bool
-        Keep the collocation polynomials too, so that ``solution(t)`` is known at any time.
+        Keep all states, so that ``solution(t)`` is known at any time: by a step from the last state before t.
     engine : {"auto", "array", "compiled", "sparse"}
-        JAX programs for systems of any size, or machine code of their own for small ones, ten times as fast and
-        more, after some seconds of compiling the first time; it is kept on disk. "auto" compiles for up to 16
+        JAX programs for systems of any size, or machine code of their own for small ones, which takes less time a
+        step; it is compiled the first time, and kept on disk. "auto" compiles for up to 16
         components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
         with a warning, where the system uses what cannot be compiled. "sparse" solves stiff steps of large systems with
         sparse matrices; "auto" takes it from 200 components on, where the system knows which of its components act on
@@ -109,7 +113,7 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    system, method = as_run(system, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
+    system, method = as_run(decided(system, x0), method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     prepared(system, method)  # refuses what the method cannot run
     if attitude is not None and not isinstance(system, AttitudeSystem):
         raise InputError(NO_GROUP)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from manifolds._arrays import is_traced
+
 from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import OneStepMethod, WithAttitude
@@ -19,6 +21,16 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
     if given not in choices:
         *others, last = map(repr, choices)
         raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+
+
+def decided(system: System, x0) -> System:
+    """The system, with what it conserves found out near the states that a run starts from, where that is open."""
+    return system.decided_near(x0) if _open(system) else system
+
+
+@remembered
+def _open(system: System) -> bool:
+    return not is_traced(system) and bool(system.undecided())
 
 
 @remembered
@@ -55,15 +67,17 @@ def prepared(system: System, method) -> tuple[dict, Laws]:
 def laws_of(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     keeps = method.keeps if isinstance(method, OneStepMethod) else lambda system, name: False
-    constants = [name for name, (_, kept) in invariants.items() if kept]
+    constants = [*(name for name, (_, kept) in invariants.items() if kept), *system.constants]
+    unknown = tuple(name for name, (_, kept) in invariants.items() if kept is None)
     conserved = tuple(name for name in constants if keeps(system, name))
     unpromised = tuple(name for name in constants if name not in conserved)
     if isinstance(method, OneStepMethod) and method.increments:  # what holds on paths, and what in the mean
         energy = "conserved" if system.energy_law == "conserved" else None
         mean = ("energy", "entropy") if energy is None else ("entropy",)
-        return Laws(energy, None, conserved, tuple(system.ledger), (), system.balance, unpromised, mean)
+        return Laws(energy, None, conserved, tuple(system.ledger), (), system.balance, unpromised, mean, unknown)
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     ledger = tuple(system.ledger)
-    return Laws(system.energy_law, system.entropy_law, conserved, ledger, inexact, system.balance, unpromised)
+    of_both = system.energy_law, system.entropy_law
+    return Laws(*of_both, conserved, ledger, inexact, system.balance, unpromised, unknown=unknown)

@@ -18,16 +18,20 @@ from ..results.ensemble import Ensemble
 from ..results.evidence import (
     STEPS_AGAIN,
     STILL,
+    TINY,
     WHOLE,
     Evidence,
-    error_at,
     laws_functions,
+    most_and_others,
     sizes,
-    spread,
+    taken_again,
+    worst_of,
 )
+from ..results.looking import LOOKED_NUMBERS, REPLAY, Steps
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import at_points
+from .ending import about_many
 from .family import Family
 from .presented import Again, presented
 from .timetable import Course
@@ -37,6 +41,11 @@ NUMBERS = (
     "residual energy_sensitivity entropy_sensitivity first_energy entropy_change smallest_energy largest_energy "
     "end_time first_step distance"
 ).split()
+
+FAILED = (Code.NOT_CONVERGED, Code.NON_FINITE, Code.STEP_UNDERFLOW, Code.STEP_LIMIT)
+
+EXPLAINED = 1_000
+"""Trajectories that failed of which more is said than that, at most."""
 
 Part = slice | np.ndarray
 """Which trajectories, of those that are run."""
@@ -54,9 +63,12 @@ class Record:
     x0 : array, shape (B, n)
     course : Course
     outputs : {"final", "trajectory", "summary"}
+    h : float
+        The size of the steps; NaN of adaptive ones.
     """
 
-    def __init__(self, family: Family, member: System, x0: np.ndarray, course: Course, outputs: str):
+    def __init__(self, family: Family, member: System, x0: np.ndarray, course: Course, outputs: str, h: float):
+        self.h = h
         self.family, self.member, self.x0, self.course = family, member, x0, course
         self.times, self.counts, self.total = course.times, course.counts, course.steps
         size = len(x0)
@@ -69,6 +81,7 @@ class Record:
         self.x = np.empty((size, member.dim)) if outputs == "final" else None
         self.path = np.full((size, len(self.times), member.dim + 2), np.nan) if outputs == "trajectory" else None
         self.work = np.empty(size)
+        self.reasons: dict[int, str] = {}
 
     def begin(self, chosen: Part, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
         """The states at the start."""
@@ -94,6 +107,7 @@ class Record:
             late = np.arange(len(self.counts)) >= np.searchsorted(self.counts, steps, side="right")[:, None]
             self.path[chosen] = np.where(late[..., None], np.nan, self.path[chosen])
 
+    @np.errstate(over="ignore", invalid="ignore")  # what has overflowed is not known
     def finish(self, chosen: Part, before: Mapping, after: Mapping, status: np.ndarray, end_time: np.ndarray) -> None:
         """How some trajectories ended, and when."""
         rows, energy, first = self.rows, after["energy"], before["energy"]
@@ -115,10 +129,25 @@ class Record:
         rows["relaxation_time"][chosen] = (end * (end_time - self.course.start) - after["integral"]) / change
         self.status[chosen], self.steps[chosen] = status, after["step"]
         self.iterations[chosen] = after["fixed_point"] + after["newton"]
+        self._explain(chosen, after["x"], status, end_time)
         if self.x is not None:
             self.x[chosen] = after["x"]
         if isinstance(self.member, DrivenSystem):
             self.work[chosen] = self.member.work(after["x"])
+
+    def _explain(self, chosen: Part, x: np.ndarray, status: np.ndarray, end_time: np.ndarray) -> None:
+        """What is known of trajectories that failed, of the first of them at least."""
+        status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
+        failed = np.flatnonzero(np.isin(status, FAILED))[: max(0, EXPLAINED - len(self.reasons))]
+        if not len(failed):
+            return
+        places = np.arange(len(self.x0))[chosen][failed]
+        own = self.family.select(places).flat(slice(None), len(places))
+        speeds = _fields((self.family.form, own.shape[1]), np.concatenate([own, x[failed]], axis=1))
+        for i, j, speed in zip(failed, places, speeds, strict=True):
+            now = float(end_time[i])
+            if text := about_many(x[i], self.x0[j], speed, now - self.course.start, now, self.h):
+                self.reasons[int(j)] = text
 
     def close(self) -> None:
         """Nothing is known of trajectories that were not finished."""
@@ -204,28 +233,64 @@ class Alone:
         return replace(found, provenance=plain.provenance)
 
 
-class FirstSteps:
-    """Finds the local errors of first steps, and how the laws' functions are rounded there, when it is called."""
+class Followed:
+    """Finds the local errors of steps, and how the laws' functions are rounded, when it is called.
 
-    def __init__(self, record: Record, method: OneStepMethod, step_all: Callable):
-        some = spread(len(record.x0), STEPS_AGAIN)
+    Some trajectories are followed again from their start: half of them those that took most iterations, half evenly
+    spread. Their worst steps are compared with short ones.
+
+    Parameters
+    ----------
+    follow : function of (family, method, x, h, steps)
+        As :func:`.batches.follow_compiled` and :func:`.batches.follow_array`.
+    equal : int
+        Steps of one size that the run has taken from its start.
+    """
+
+    def __init__(self, record: Record, method: OneStepMethod, follow: Callable, equal: int):
+        effort = record.iterations / np.fmax(record.steps, 1)
+        some = most_and_others(effort, STEPS_AGAIN)
         self.family, self.member, self.method = record.family.select(some), record.member, method
         self.x, self.distance = np.ascontiguousarray(record.x0[some]), record.rows["distance"][some]
-        self.h, self.start, self.step_all = record.rows["first_step"][some], record.course.start, step_all
+        self.h, self.start, self.follow = record.rows["first_step"][some], record.course.start, follow
+        self.taken = record.steps[some]
+        self.most = max(1, min(equal, LOOKED_NUMBERS // (REPLAY * self.x.size)))
 
+    @np.errstate(over="ignore", invalid="ignore")  # what has overflowed is not known
     def __call__(self) -> Evidence:
         form, number = self.family.form, len(self.x)
         own = self.family.flat(slice(None), number)
-        after = self.step_all(self.family, self.method, self.x, self.h)
-        moved = np.abs(self._seen(after["x"] + after["low"]) - self._seen(self.x)).max(axis=1)
         found = Evidence(terms=self._terms(own))
-        told = (after["status"] == 0) & (moved > STILL * np.abs(self.x).max(axis=1))
+        after, states = self.follow(self.family, self.method, self.x, self.h, self.most)
+        of, place = np.nonzero(np.arange(self.most) < np.fmin(after["step"], self.taken)[:, None])
+        if not len(of):
+            return found
+        path = np.concatenate([self.x[:, None], states], axis=1)
+        steps = Steps(self.start + place * self.h[of], self.h[of], path[of, place], path[of, place + 1])
+        model, whole = (form, own.shape[1]), WHOLE * self.distance
+
+        def field(at: np.ndarray, x: np.ndarray) -> np.ndarray:
+            given = np.broadcast_to(own[of[at], None], (*x.shape[:2], own.shape[1]))
+            flat = np.concatenate([given, x], axis=2).reshape(-1, own.shape[1] + x.shape[2])
+            return _fields(model, flat).reshape(x.shape)
+
+        again, missed = worst_of(steps, field, whole[of], taken_again(self.x.shape[1]))
+        chosen, x, h = self.family.select(of[again]), steps.x[again], steps.h[again]
+        parts = taken_again(self.x.shape[1])
+        (one, _), (short, _) = (self.follow(chosen, self.method, x, h / m, m) for m in (1, parts))
+        ends = [self._seen(after["x"] + after["low"]) for after in (one, short)]
+        start = self._seen(x)
+        moved = np.abs(ends[0] - start).max(axis=1)
+        known = (one["status"] == 0) & (short["status"] == 0)
+        told = ~known | (moved > STILL * np.abs(start).max(axis=1))
         if not told.any():
             return found
-        steps = np.concatenate([own, self.x, self.h[:, None], after["k"].reshape(number, -1)], axis=1)[told]
-        errors = at_points(_first_errors, (form, self.method, len(own[0])), steps)
-        relative = errors / np.fmax(moved, WHOLE * self.distance)[told]
-        return replace(found, local_error=float(np.nan_to_num(relative).max()), error_time=self.start)
+        errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(np.fmax(moved, whole[of[again]]), TINY)
+        errors = np.where(told, np.where(known, errors, missed), 0.0)
+        worst = int(np.argmax(errors))
+        return replace(
+            found, local_error=float(errors[worst]), error_time=float(steps.t[again[worst]]), looked=len(steps.h)
+        )
 
     def _terms(self, own: np.ndarray) -> dict[str, float]:
         """The sizes at which the energy and the entropy are rounded, the largest of some trajectories."""
@@ -242,7 +307,12 @@ def _first_terms(model: tuple[Form, int], at):
     return sizes(laws_functions(form.build(at[:p])), at[p:])[1]
 
 
-def _first_errors(model: tuple[Form, OneStepMethod, int], step):
-    form, method, p = model
-    system = form.build(step[:p])
-    return error_at(system, method, step[p:])
+def _fields(model: tuple[Form, int], at: np.ndarray) -> np.ndarray:
+    """The vector fields of systems at states, shape (m, n), from their parameters and the states, shape (m, p + n)."""
+    with np.errstate(all="ignore"):
+        return np.asarray(at_points(_field, model, at))
+
+
+def _field(model: tuple[Form, int], at):
+    form, p = model
+    return form.build(at[:p]).vector_field(at[p:])

@@ -6,19 +6,16 @@ import dataclasses
 import time
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.stepping import values
-from ..integrators import OneStepMethod, Reference
+from ..integrators import Reference
 from ..results.dense import Dense
 from ..results.solution import Solution
 from ..results.status import Stats, Status
-from ..systems import System
 from ..tracing.interpret import at_points
-from ..tracing.programs import program
 from .adaptive import Adaptive
 from .ending import given_up, stats_of, status_of
 from .events import Event
@@ -27,6 +24,7 @@ from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, Steps, stops_of
 from .stepwise import run as run_stepwise
 from .timetable import Timetable
+from .watch import Watch
 
 MOST_LISTED = 1_000
 """Components up to which the first state is listed in the provenance; an attribute of a file cannot be of any size."""
@@ -87,8 +85,9 @@ class Run:
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
         start, end, every = self.table.start, self.table.end, self.table.every or 1
-        stops, event = stops_of(save_at, start, end), None if until is None else Event(until, self.system)
-        self.step, pieces, last = step, [], None
+        stops, watch = stops_of(save_at, start, end), until if isinstance(until, Watch) else None
+        event = None if until is None or watch else Event(until, self.system)
+        self.step, all_times, all_states, last = step, [self.times[0]], [self.states[0]], None
 
         def keep(steps: Steps):
             nonlocal last
@@ -98,7 +97,8 @@ class Run:
             self.taken.append(np.stack([steps.h, kept]))
             last = None if kept[-1] else steps
             if dense:
-                pieces.append((steps.t[0], steps.h[0], np.asarray(steps.before.x), np.asarray(steps.after.k)))
+                all_times.append(ends)
+                all_states.append(steps.x)
             bar.update(ends[-1])
             self._checkpoint(steps.after)
 
@@ -110,7 +110,7 @@ class Run:
             self.status = Status(Code.INTERRUPTED, "stopped by the user before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-        numbers = self.system.dim * ((1 if save_at is None else 0) / every + (self.method.stages + 1 if dense else 0))
+        numbers = self.system.dim * ((1 if save_at is None else 0) / every + (1 if dense else 0))
         outcome = run_stepwise(
             self.engine,
             state,
@@ -120,37 +120,34 @@ class Run:
             event,
             keep,
             most_kept=MOST_KEPT / max(numbers, 1e-9),
-            singly=dense,
+            watch=watch,
         )
         if last is not None:
             self._append(last, slice(-1, None))
         self.event_time = outcome.event_time
-        if pieces:
-            begins, lengths, x, k = (np.array(column) for column in zip(*pieces, strict=True))
-            self.dense = Dense(
-                begins, lengths, x, k, self.method.weights, None if self.system.space is None else self._along
-            )
+        if dense:
+            self.dense = Dense(np.concatenate(all_times), np.concatenate(all_states), self.engine.ends)
         state, now = outcome.state, self.now
         self.stats = dataclasses.replace(stats_of(state), rejected=outcome.rejected)
         steps = int(state.step)
-        if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit):
-            self.status = given_up(outcome, step, end, now)
+        if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit in ("steps", "memory")):
+            self.status = given_up(self.system, np.asarray(self.states[0][0]), outcome, step, (start, end), now)
         elif event is not None and outcome.limit:
-            text = f"{event.name} is not a number at some states of the step from t = {now:g}, so it is not known when "
-            text += "it happens: extend the function, or take adaptive steps"
+            text = f"{event.name} is not a number at some states near t = {now:g}, and has other signs before and "
+            text += "after: whether it is zero there is not known, so extend the function"
             self.status = Status(Code.NON_FINITE, text, steps, now, float(state.residual))
-        elif event is not None and outcome.event_time is not None:
-            text = f"{event.name}: reached at t = {now:.15g} in {steps} steps"
+        elif outcome.event_time is not None:
+            text = f"{Watch.name if event is None else event.name}: reached at t = {now:.15g} in {steps} steps"
             self.status = Status(Code.EVENT, text, steps, now, float(state.residual))
         else:
             h = step if isinstance(step, float) else float("nan")
             self.status = status_of(self.engine, state, now, h, outcome.interrupted)
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
+                if outcome.jumps:
+                    text += f": it changed its sign {len(outcome.jumps)} times without being zero, first at t = "
+                    text += f"{outcome.jumps[0]:g}"
                 self.status = dataclasses.replace(self.status, message=text)
-
-    def _along(self, x, v) -> np.ndarray:
-        return np.asarray(_along(self.system, self.method, x, v))
 
     def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:
         self.times.append(steps.t[1:][kept])
@@ -238,8 +235,3 @@ class Run:
             "noise": None if self.noise is None else self.noise.listed(),
             "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,
         }
-
-
-@program
-def _along(system: System, method: OneStepMethod, x, v):
-    return jax.vmap(lambda x, v: method.along(system, x, v))(x, v)

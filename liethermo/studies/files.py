@@ -1,6 +1,6 @@
 """The files of a store: arrays of Zarr v3 in a folder, every file written whole, every chunk with a checksum.
 
-The chunks are written here and not by the ``zarr`` package, whose writer takes two milliseconds for each, and which
+The chunks are written here and not by the ``zarr`` package, whose writer is slow where they are small, and which
 reads a chunk that is missing as one of fill values. What is written is plain Zarr v3 with the codecs "bytes" or
 "vlen-utf8" and "crc32c", and ``zarr`` and ``xarray`` read it.
 """
@@ -13,10 +13,13 @@ import fcntl
 import json
 import math
 import os
+import shutil
 import socket
 import struct
+import tempfile
 import time
 import uuid
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -165,6 +168,14 @@ def _why(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"the disk is full ({error.strerror})"
     return str(error.strerror or error)
+
+
+class TemporaryFolder:
+    """A folder that is there as long as this object is."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="liethermo-study-"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
 
 def read(path: Path) -> bytes:

@@ -213,7 +213,7 @@ def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure
         if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")) or name in RESERVED:
             raise InputError(f"a measure cannot be called {name!r}")
         if isinstance(measure, Relaxed):
-            found[name] = EventTime(f"entropy production below {measure.tol:g}")
+            found[name] = EventTime(f"relaxation, to a rate below {measure.tol:g}")
         elif isinstance(measure, At):
             found[name] = AtTimes(measure)
         elif isinstance(measure, str) and measure in FIELDS:

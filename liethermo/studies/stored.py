@@ -42,11 +42,19 @@ def load_study(path: Any) -> xarray.Dataset:
     FileError
         If there is no store.
     """
-    store = Store.open(Path(path))
+    return held_results(Path(path), None)
+
+
+def held_results(path: Path, owner: object) -> xarray.Dataset:
+    """The results in a store; whatever is taken from them, and not read yet, holds the owner of the files."""
+    store = Store.open(path)
     import xarray
+    import zarr
 
     try:
-        found = xarray.open_zarr(store.root, consolidated=True, chunks=None)
+        source = zarr.storage.LocalStore(store.root, read_only=True)
+        vars(source)["owner"] = owner
+        found = xarray.open_zarr(source, consolidated=True, chunks=None)
     except Exception as error:  # of a dozen kinds
         raise FileError(f"{path} cannot be read: {error}") from error
     return found.set_coords([name for name in store.arrays if name not in store.chunked])

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
-import tempfile
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -34,7 +31,7 @@ from .progress import Bar, StudyStatus
 from .running import here, spread
 from .solve import MEASURE_FAILED, STATUSES, Columns, Solver, Task, told
 from .store import FORMAT, Store, Survey, matched
-from .stored import audit, load_study, status, status_of
+from .stored import audit, held_results, status, status_of
 
 if TYPE_CHECKING:
     import xarray
@@ -68,8 +65,8 @@ class Study:
     ----------
     build : System, or function from a dict with one entry for each parameter to a System
         Of a system the axes are its parameters, such as ``"dissipation.rate"``. One program builds the systems of all
-        points where the function accepts traced JAX arrays; otherwise each point is built by itself, which takes some
-        30 ms.
+        points where the function accepts traced JAX arrays; otherwise each point is built by itself, which takes
+        longer.
     axes : dict from str to values
         Lists of numbers or texts, or :func:`zipped`, :func:`latin_hypercube`, :func:`sobol`, :func:`replicas`.
     x0 : array, shape (n,), or function from the dict of a point to one
@@ -78,10 +75,11 @@ class Study:
         As for :func:`integrate` and :func:`ensemble`.
     measure : dict from str to measure
         What is kept of each point: a name ("final", "relaxation_time", "end_time", …), ``lt.Relaxed(tol)`` for the time
-        at which the entropy production falls below it, where the run ends too, ``lt.At(times)``, or any function of a
+        of relaxation to a rate below it, where the run ends too, ``lt.At(times)``, or any function of a
         :class:`Solution` to a number or an array.
     store : path, optional
-        Folder of the results. Without one they are kept until this object is gone.
+        Folder of the results. Without one they are kept until this object and all that is taken from its results are
+        gone.
     attitude : array, shape (m, m), or function from the dict of a point to one, optional
         As for :func:`integrate`.
     noise : Fluctuations, optional
@@ -162,10 +160,10 @@ class Study:
         if unknown:
             raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
         self._spec = None if spec is None else dict(spec)
+        self._folder: files.TemporaryFolder | None = None
         if store is None:
-            folder = tempfile.mkdtemp(prefix="liethermo-study-")
-            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-            store = Path(folder) / "study.zarr"
+            self._folder = files.TemporaryFolder()
+            store = self._folder.path / "study.zarr"
         self.store = Path(store)
         parameters = self._axes.parameters
         self._task = Task(
@@ -247,7 +245,7 @@ class Study:
         FileError
             If there is no store.
         """
-        found = load_study(self.store)
+        found = held_results(self.store, self._folder)
         store = Store.open(self.store)
         mine, theirs = self._axes, store.axes()
         order = {}

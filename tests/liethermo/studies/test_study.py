@@ -1,5 +1,6 @@
 """Studies from beginning to end: values, statuses, restarts, extensions, other studies."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -393,7 +394,7 @@ def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path)
         assert point.entropy.item() == pytest.approx(alone.entropy[list(alone.t).index(1.0)], rel=1e-13)
     assert np.isnan(results.relaxed.sel(rate=1e-9))
     assert results.end.sel(rate=1e-9) == 90.0
-    assert results.relaxed.long_name == "time of entropy production below 0.001"
+    assert results.relaxed.long_name == "time of relaxation, to a rate below 0.001"
 
     def growing(solution):
         return np.ones(2 if solution.entropy[-1] < 0.55 else 3)
@@ -503,3 +504,22 @@ def test_noise_at_a_place_is_that_of_its_seed(tmp_path):
         noise=lt.Fluctuations(0.2, seed, temperature=1.0),
     )  # fmt: skip
     assert np.abs(study.results["final"].values[1] - alone.x[-1]).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    "taken", [lambda results: results["end"], lambda results: results.isel(end_component=0)["end"]]
+)
+def test_results_outlive_a_study_without_a_store(taken):
+    """What is not read yet holds the files, which go with the last that does."""
+    axes = {"dissipation.rate": [0.1, 0.3]}
+    of_ends = lt.Study(lt.models.rigid_body(), axes, x0=X0, t_span=(0.0, 0.2), step=0.1, measure={"end": "final"})
+    of_ends.run(progress=False)
+    folder, expected = of_ends.store.parent, taken(of_ends.results).values
+    kept = taken(of_ends.results)
+    del of_ends
+    gc.collect()
+    assert np.isfinite(expected).all()
+    assert np.array_equal(kept.values, expected)
+    del kept
+    gc.collect()
+    assert not folder.exists()
