@@ -12,6 +12,7 @@ from manifolds.matrices.blocks import BlockDiagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.conditions import require
+from ..functions.indices import Indices
 from .geometry import Geometry
 
 NEGATIVE = "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
@@ -53,6 +54,16 @@ def checked_rates(rates) -> jax.Array:
         least = float(np.asarray(array).min())
         raise InputError(f"a dissipation rate must be >= 0, not {least}: a negative one would lower the entropy")
     return array
+
+
+def checked_bath(bath) -> Indices | None:
+    """The number of a bath, or one for each site; whether there are so many, the system knows."""
+    if bath is None or isinstance(bath, Indices):
+        return bath
+    numbers = np.asarray(bath)
+    if numbers.dtype.kind not in "iu":
+        raise InputError(f"bath is the number of a bath, or an array of these for the sites, not {bath!r}")
+    return Indices(numbers)
 
 
 def not_a_rate(form, dissipation: object, what: str) -> None:

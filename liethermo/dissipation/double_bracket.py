@@ -7,8 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, over_sites, semidefinite
+from .checks import check_matrix, checked_bath, checked_rate, over_sites, semidefinite
 from .factor import Factor, root_of
 
 
@@ -18,7 +19,7 @@ class DoubleBracket(Dissipation):
     ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
     on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir
     and is conserved. On so(3) it moves the momentum of a body that is left to itself and has parts that rub: |mu| is
-    constant, and the kinetic energy falls. The heat is not followed.
+    constant, and the kinetic energy falls. Where a system has baths, they take it: see :class:`liethermo.HeatBaths`.
 
     Parameters
     ----------
@@ -26,13 +27,17 @@ class DoubleBracket(Dissipation):
     metric : array, shape (n, n), optional
         The positive definite form ^♯; by default the identity, or on a manifold the metric of the space. On copies of
         an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
+    bath : int, or array of int of the shape of the sites, optional
+        The number of the bath that takes the heat, from 0; by default the first.
     """
 
     rate: jax.Array
     metric: Any
+    bath: Indices | None = eqx.field(static=True)
 
-    def __init__(self, rate=1.0, metric=None):
+    def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
+        self.bath = checked_bath(bath)
         self.metric = None if metric is None else semidefinite(metric, "the metric")
 
     @property

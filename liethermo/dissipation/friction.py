@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
+from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, form_at, not_a_rate, semidefinite
+from .checks import check_matrix, checked_bath, checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
 
 
@@ -18,9 +20,10 @@ class Friction(Dissipation):
     """``x' = Pi dH - rate * D(x) dH``: the energy falls, ``H' = -rate dH . D dH <= 0``, and is gone.
 
     Without a D it is the gradient flow of the metric. With D = diag(0, gamma) on (q, p) it is the drag
-    ``p' = -gamma v``; on the dual of an algebra it is that of a body in a fluid. The heat is not followed, so no
-    entropy is needed and its law is not claimed. In a bath of a temperature (:class:`liethermo.Fluctuations`) it is
-    Langevin's equation, and the heat is recorded.
+    ``p' = -gamma v``; on the dual of an algebra it is that of a body in a fluid. Where a system has baths
+    (:class:`liethermo.HeatBaths`) they take the heat; where not it is not followed, and no law of an entropy is
+    claimed. At a constant temperature (:class:`liethermo.Fluctuations`) it is Langevin's equation, and the heat is
+    recorded.
 
     Parameters
     ----------
@@ -28,17 +31,21 @@ class Friction(Dissipation):
         Positive semidefinite. A function is taken to have the same rank everywhere. By default the identity, or on a
         manifold the inverse of the metric of the space.
     rate : float, >= 0
+    bath : int, or array of int of the shape of the sites, optional
+        The number of the bath that takes the heat, from 0; by default the first.
     """
 
     D: Callable | jax.Array | None
     rate: jax.Array
+    bath: Indices | None = eqx.field(static=True)
 
-    def __init__(self, D=None, rate=1.0):
+    def __init__(self, D=None, rate=1.0, bath=None):
         not_a_rate(D, self, "the friction D")
         if D is not None and not callable(D):
             D = semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D
         self.rate = checked_rate(rate)
+        self.bath = checked_bath(bath)
 
     @property
     def energy_law(self):

@@ -43,6 +43,28 @@ class Geometry(Protocol):
     @property
     def space(self) -> mf.Space | None: ...
 
+    @property
+    def heating_sites(self) -> tuple[int, ...]:
+        """The sites that may each heat a bath of their own."""
+        ...
+
+    @property
+    def body_dim(self) -> int:
+        """Components of a state, those of baths left out."""
+        ...
+
+    def without_baths(self) -> Geometry:
+        """The geometry of the body alone."""
+        ...
+
+    def at_sites(self, values, v) -> jax.Array:
+        """A vector times a number for each site."""
+        ...
+
+    def over_sites(self, alpha, v) -> jax.Array:
+        """``alpha . v`` at each site."""
+        ...
+
     def raised(self, x, alpha) -> jax.Array:
         """The tangent vector that the metric of the space makes of a covector, shape (n,)."""
         ...

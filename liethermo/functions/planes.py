@@ -15,7 +15,7 @@ from manifolds.structures.spins import Padded, added, reshaped, summed
 
 from .energy import Energy, Negative, Sum
 from .magnetism import SpinEnergy, off_lattice, on_lattice
-from .spins_and_baths import SpinsAndBaths
+from .with_baths import WithBaths
 
 
 def to_planes(x, count: int) -> jax.Array:
@@ -49,8 +49,8 @@ def by_planes(energy: Energy, count: int) -> Energy:
 
 
 def _by_planes(term: Energy, count: int) -> Energy:
-    if isinstance(term, SpinsAndBaths):
-        return SpinsAndBaths(by_planes(term.spins, count), term.baths, term.size)
+    if isinstance(term, WithBaths):
+        return WithBaths(by_planes(term.body, count), term.baths, term.size, term.dim)
     if isinstance(term, Negative):
         return Negative(by_planes(term.term, count))
     return Rearranged(term, count)
@@ -93,8 +93,8 @@ def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
     """How far the spins are, along each axis of a lattice, that act on one by its energies."""
     found = [(0,) * len(sites)]
     for term in energy.terms:
-        if isinstance(term, SpinsAndBaths):
-            found.append(reach(term.spins, sites))
+        if isinstance(term, WithBaths):
+            found.append(reach(term.body, sites))
         elif isinstance(term, SpinEnergy) and term.sites == sites:
             found.append(term.reach)
     return tuple(max(along) for along in zip(*found, strict=True))

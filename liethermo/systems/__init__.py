@@ -2,6 +2,7 @@
 
 from .attitude import SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
 from .base import System
+from .baths import HeatBaths
 from .chart import ChartSystem
 from .composed.bodies import Copies, Subsystem
 from .composed.system import ComposedSystem
@@ -13,7 +14,7 @@ from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
 from .simple_closed import SimpleClosedSystem
-from .spins import HeatBaths, SpinSystem
+from .spins import SpinSystem
 
 __all__ = [
     "SPATIAL_MOMENTUM",

@@ -12,16 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 
 from ..dissipation.base import Dissipation, portions, total
+from ..dissipation.heating import heated
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, Sum, as_energy
 from ..functions.frames import frame
+from ..functions.of_first import OfFirst
 from ..functions.on_spaces import on_points, on_sites
+from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
+from .baths import BesideBaths, EntropyOfBaths, HeatBaths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 from .kinds import Decided, Kind
 
@@ -78,8 +83,12 @@ class System(Kind):
         The state space, where it is not R^n.
     """
 
-    def _build(self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None) -> None:
+    def _build(
+        self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
+    ) -> None:
         """Shared by the constructors of the subclasses, after they have set what is their own."""
+        if not isinstance(baths, HeatBaths | None):
+            raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
         self.poisson = settled(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = check_scalar(self.on_states(as_energy(energy, "the energy")), dim, "the energy", timed=True)
@@ -106,10 +115,54 @@ class System(Kind):
             dissipation = on_sites(dissipation, self.shape)
             dissipation = traced_energies(dissipation, dim, "a preserved function")
             self.dissipation = self._traced_dissipation(dissipation.prepared(self))
+        if baths is not None:
+            self._heat(baths)
         if self.preserved and not is_traced(self):
             self.preserved_as = self._preserved_names()
         if validate and not is_traced(self):
             self._validate()
+
+    def _heat(self, baths: HeatBaths) -> None:
+        """Put baths beside the body that this system has been so far."""
+        body, n, m = copy(self), self.dim, baths.number
+        self.dissipation = heated(self.dissipation, body, m, self._of_body)
+        if body.space is not None and body.space.dtype.kind == "c":
+            raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
+        self.baths, self.dim = baths, n + m
+        self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
+        self.poisson = BesideBaths(body.poisson, m)
+        self.energy = WithBaths(body.energy, baths.energy, n, self.dim)
+        heat = EntropyOfBaths(m)
+        self.entropy = heat if body.entropy is None else self._of_body(body.entropy) + heat
+        self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
+
+    def without_baths(self) -> System:
+        if self.baths is None:
+            return self
+        assert isinstance(self.poisson, BesideBaths)
+        body = copy(self)
+        parts = {
+            "dim": self.body_dim,
+            "space": None if self.space is None else _first_factors(self.space),
+            "poisson": self.poisson.body,
+            "energy": self.energy.body if isinstance(self.energy, WithBaths) else self.energy,
+            "baths": None,
+        }
+        for name, part in parts.items():
+            object.__setattr__(body, name, part)
+        return body
+
+    def _of_body(self, energy: Energy) -> Energy:
+        """A function of the state of the body, as one of that with baths."""
+        terms = tuple(OfFirst(term, self.body_dim) for term in energy.terms)
+        return terms[0] if len(terms) == 1 else Sum(terms)
+
+    def temperatures(self, x) -> jax.Array:
+        """The temperatures of the baths: states of shape (..., n) give (..., number of baths)."""
+        if self.baths is None:
+            raise InputError("this system has no baths: give it baths=lt.HeatBaths(...)")
+        entropies = jnp.asarray(x)[..., self.body_dim :]
+        return jnp.vectorize(self.baths.energy.gradient, signature="(m)->(m)")(entropies)
 
     def on_states(self, energy: Energy) -> Energy:
         """An energy of states as they are shown, as one of their vectors."""
@@ -161,12 +214,13 @@ class System(Kind):
     def transport(self, x, dH, dS, dL=()) -> jax.Array:
         """The velocity that moves the state, ``x' = Pi(x) transport`` but for torques, for gradients of either kind.
 
-        It is dH and what the dissipations add to it [:meth:`liethermo.Dissipation.velocity`]. On a Lie algebra an
-        attitude follows it, ``g' = g hat(transport)``.
+        It is dH and what the dissipations add to it [:meth:`liethermo.Dissipation.velocity`], of the body without its
+        baths. On a Lie algebra an attitude follows it, ``g' = g hat(transport)``.
         """
+        total = dH[: self.body_dim]
         for sigma in self._velocities(x, dH, dS, dL):
-            dH = dH if sigma is None else dH + sigma
-        return dH
+            total = total if sigma is None else total + sigma
+        return total
 
     @property
     def torque_free(self) -> bool:
@@ -406,6 +460,8 @@ class System(Kind):
             x = self.space.to_vector(x)
         if self.sites and x.shape[-len(self.shape) :] == self.shape:
             x = x.reshape(*x.shape[: -len(self.shape)], self.dim)
+        if self.baths is not None and x.shape[-1:] != (self.dim,):
+            x = self._beside_baths(x)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
@@ -423,6 +479,21 @@ class System(Kind):
         if self.space is not None:
             self.space.point(self.points(numbers))
         return numbers
+
+    def _beside_baths(self, x) -> np.ndarray | jax.Array:
+        """A state of the body alone, with every bath at entropy zero; another array as it is."""
+        body = self.without_baths()
+        shape = body.shape if body.space is None else body.space.shape
+        if shape == (1, 3) and x.shape == (3,):
+            x = x[None]
+        if x.shape[-len(shape) :] == shape:
+            vectors = x.reshape(*x.shape[: -len(shape)], -1) if body.space is None else body.space.to_vector(x)
+        elif x.shape[-1:] == (body.dim,):
+            vectors = x
+        else:
+            return x
+        zeros = np.zeros((*vectors.shape[:-1], self.dim - body.dim))
+        return (jnp if isinstance(x, jax.Array) else np).concatenate([vectors, zeros], axis=-1)
 
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
@@ -469,6 +540,13 @@ class System(Kind):
         if self.entropy is None:
             raise InputError("this system has no entropy")
         return self.entropy
+
+
+def _first_factors(space: mf.Space) -> mf.Space:
+    """A product without its last factor."""
+    assert isinstance(space, mf.Product)
+    first, *others = space.factors[:-1]
+    return mf.Product(first, *others) if others else first
 
 
 def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from manifolds._module import Module
 from ..dissipation.base import Dissipation, Law
 from ..functions.energy import Energy
 from ..functions.spheres import Spheres
+from .baths import HeatBaths
 
 
 class Decided(NamedTuple):
@@ -43,6 +45,8 @@ class Kind(Module):
     """What the functions are called that the dissipation is told to preserve, one after another."""
     decided: Decided | None = eqx.field(static=True, kw_only=True, default=None)
     """What it conserves, where that has been found out near the states of a run."""
+    baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
+    """What takes the heat of the dissipation; the entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
     domain: ClassVar[str] = ""
     """What a state of the system has to have beyond finite components, in words."""
@@ -62,6 +66,16 @@ class Kind(Module):
         """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
         return (*self.sites, self.dim // math.prod(self.sites))
 
+    @property
+    def heating_sites(self) -> tuple[int, ...]:
+        """The sites that may each heat a bath of their own."""
+        return self.sites
+
+    @property
+    def body_dim(self) -> int:
+        """Number of state components, those of baths left out."""
+        return self.dim if self.baths is None else self.dim - self.baths.number
+
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
@@ -76,8 +90,12 @@ class Kind(Module):
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
         if self.space is None:
-            return scale * np.random.default_rng(seed).standard_normal((count, self.dim))
-        return np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+            found = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
+        else:
+            found = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+        if self.baths is not None:
+            found[..., self.body_dim :] *= min(1.0, 1.0 / scale)  # of a temperature exp(y) that is finite
+        return found
 
     def outside(self, x) -> str:
         """Why a state lies outside the domain of the system, in words; empty where it does not."""
@@ -182,6 +200,20 @@ class Kind(Module):
     def isotropic(self, x, w) -> jax.Array:
         """``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
         return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
+
+    @abstractmethod
+    def without_baths(self) -> Kind:
+        """The body alone: the geometry that its dissipation acts in. Itself where there are no baths."""
+
+    def at_sites(self, values, v) -> jax.Array:
+        """A vector, shape (n,), times a number for each site, shape (sites,); or times one number."""
+        if jnp.ndim(values) == 0:
+            return values * v
+        return (values[:, None] * v.reshape(len(values), -1)).ravel()
+
+    def over_sites(self, alpha, v) -> jax.Array:
+        """``alpha . v`` at each site, shape (sites,)."""
+        return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
     def changes(self, x, rows) -> jax.Array:
         """What the divergence of vector fields is the sum of, over the first axis.

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
 from .base import System
+from .baths import HeatBaths
 
 
 class LiePoissonSystem(System):
@@ -45,6 +46,9 @@ class LiePoissonSystem(System):
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
         How; by default so that the spatial momentum of a free body is kept, where the group has such a way, else by
         Cayley's map where that stays in the group. See :class:`liethermo.WithAttitude`.
+    baths : HeatBaths, optional
+        What takes the heat of a dissipation that lowers the energy. A state is then mu, in one row, followed by the
+        entropies of the baths; mu alone stands for one with all of these zero.
 
     Raises
     ------
@@ -70,18 +74,20 @@ class LiePoissonSystem(System):
         validate: bool = True,
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
+        baths: HeatBaths | None = None,
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
-        self._build(mf.LiePoisson(algebra), algebra.dim, energy, entropy, dissipation, momentum_maps, validate)
+        poisson = mf.LiePoisson(algebra)
+        self._build(poisson, algebra.dim, energy, entropy, dissipation, momentum_maps, validate, baths=baths)
         if group is not None and self.is_driven:
             raise InputError("attitudes are reconstructed for energies that do not depend on time: leave out the group")
 
     @property
     def sites(self) -> tuple[int, ...]:
-        return self.algebra.shape[:-1]
+        return () if self.baths is not None else self.algebra.shape[:-1]
 
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
@@ -92,7 +98,8 @@ class LiePoissonSystem(System):
         return action.ad_star(x + self.dissipation.momentum(dH, turned))
 
     def casimirs(self) -> dict[str, Energy]:
-        return _recorded_casimirs(self.algebra, self.algebra.basis_names)
+        found = _recorded_casimirs(self.algebra, self.algebra.basis_names)
+        return found if self.baths is None else {name: self._of_body(C) for name, C in found.items()}
 
     @property
     def has_all_casimirs(self) -> bool:

@@ -12,6 +12,7 @@ import manifolds as mf
 from ..dissipation.base import Dissipation
 from ..errors import InputError
 from .base import System, square_field
+from .baths import HeatBaths
 from .chart import ChartSystem
 
 
@@ -38,6 +39,9 @@ class MetriplecticSystem(System):
         the ambient array: only their action on tangent vectors matters. What is handed to a Poisson structure or to a
         dissipation are flat real arrays, shape (space.size,), as ``space.to_vector`` makes them: a state x, and
         covectors that Pi(x) and K(x) have to take to tangent vectors.
+    baths : HeatBaths, optional
+        What takes the heat of a dissipation that lowers the energy. A state is then x, in one row, followed by the
+        entropies of the baths, and ``dim`` counts x alone; x alone stands for one with all entropies zero.
 
     Raises
     ------
@@ -54,6 +58,7 @@ class MetriplecticSystem(System):
         momentum_maps=(),
         validate: bool = True,
         space: mf.Space | mf.MatrixGroup | None = None,
+        baths: HeatBaths | None = None,
     ):
         if space is not None:
             space = mf.GroupSpace(space) if isinstance(space, mf.MatrixGroup) else space
@@ -80,7 +85,7 @@ class MetriplecticSystem(System):
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         square_field(poisson.tensor, poisson.dim, "the Poisson tensor")
-        self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space)
+        self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
         """Around a state of a manifold, in the coordinates of its exponential map or of its projection."""

@@ -1,4 +1,4 @@
-"""The energy of many spins and of what they heat, as one function: its gradient is made in one piece."""
+"""The energy of a body and of the baths that it heats, as one function: its gradient is made in one piece."""
 
 from __future__ import annotations
 
@@ -15,31 +15,48 @@ from .of_first import OfFirst
 from .path import Path
 
 
-class SpinsAndBaths(Energy):
-    """``H(s) + U(y)`` of a state (s, y): two functions of components that they do not share.
+class WithBaths(Energy):
+    """``H(x) + U(y)`` of a state (x, y): two functions of components that they do not share.
 
     As a sum of two functions of the whole state each would make a vector as long as that, mostly zeros.
 
     Attributes
     ----------
-    spins : Energy
-        Of the first ``size`` components.
+    body : Energy
+        Of the first ``size`` components. It may depend on the time.
     baths : Energy
         Of the components behind.
+    size, dim : int
+        The number of components of the body, and of all.
     """
 
-    spins: Energy
+    body: Energy
     baths: Energy
     size: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+
+    @property
+    def terms(self) -> tuple[Energy, ...]:
+        if not self.depends_on_time:
+            return (self,)
+        of_body = self.body.on(range(self.size)).terms
+        return (*of_body, *self.baths.on(range(self.size, self.dim)).terms)
+
+    @property
+    def depends_on_time(self) -> bool:
+        return self.body.depends_on_time
+
+    def at_time(self, t) -> Energy:
+        return WithBaths(self.body.at_time(t), self.baths, self.size, self.dim)
 
     def value(self, x) -> jax.Array:
-        return self.spins.value(x[: self.size]) + self.baths.value(x[self.size :])
+        return self.body.value(x[: self.size]) + self.baths.value(x[self.size :])
 
     def gradient(self, x) -> jax.Array:
-        return jnp.concatenate([self.spins.gradient(x[: self.size]), self.baths.gradient(x[self.size :])])
+        return jnp.concatenate([self.body.gradient(x[: self.size]), self.baths.gradient(x[self.size :])])
 
     def sensitivity(self, x) -> jax.Array:
-        return self.spins.sensitivity(x[: self.size]) + self.baths.sensitivity(x[self.size :])
+        return self.body.sensitivity(x[: self.size]) + self.baths.sensitivity(x[self.size :])
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         low, n = jnp.zeros_like(x) + low, self.size
@@ -47,32 +64,32 @@ class SpinsAndBaths(Energy):
         def of(energy: Energy, *ends) -> jax.Array:
             return _total(term.discrete_gradient(scheme, *ends) for term in energy.terms)
 
-        if self.spins.is_quadratic:  # at points of whole states, which others look at too
-            by_spins = scheme.quadratic(OfFirst(self.spins, n), x, d, low)[:n]
+        if self.body.is_quadratic:  # at points of whole states, which others look at too
+            by_body = scheme.quadratic(OfFirst(self.body, n), x, d, low)[:n]
         else:
-            by_spins = of(self.spins, x[:n], d[:n], low[:n])
-        return jnp.concatenate([by_spins, of(self.baths, x[n:], d[n:], low[n:])])
+            by_body = of(self.body, x[:n], d[:n], low[:n])
+        return jnp.concatenate([by_body, of(self.baths, x[n:], d[n:], low[n:])])
 
     def stage_gradients(self, scheme, path: Path) -> jax.Array:
         def of(energy: Energy, components: slice) -> jax.Array:
             part = _part(path, components)
             return _total(term.stage_gradients(scheme, part) for term in energy.terms)
 
-        return jnp.concatenate([of(self.spins, slice(None, self.size)), of(self.baths, slice(self.size, None))], axis=1)
+        return jnp.concatenate([of(self.body, slice(None, self.size)), of(self.baths, slice(self.size, None))], axis=1)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        spins, baths = self.spins.couplings(self.size), self.baths.couplings(dim - self.size)
-        if spins is None or baths is None:
+        body, baths = self.body.couplings(self.size), self.baths.couplings(dim - self.size)
+        if body is None or baths is None:
             return None
-        return as_pattern(scipy.sparse.block_diag([spins, baths]))
+        return as_pattern(scipy.sparse.block_diag([body, baths]))
 
     def check_places(self, dim: int, role: str) -> None:
-        for energy, size in ((self.spins, self.size), (self.baths, dim - self.size)):
+        for energy, size in ((self.body, self.size), (self.baths, dim - self.size)):
             for term in energy.terms:
                 term.check_places(size, role)
 
     def __neg__(self) -> Energy:
-        return SpinsAndBaths(-self.spins, -self.baths, self.size)
+        return WithBaths(-self.body, -self.baths, self.size, self.dim)
 
 
 def _part(path: Path, components: slice) -> Path:

@@ -1,0 +1,176 @@
+"""Dissipation that heats: what a body loses of its energy, baths take up with their entropies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds.structures.spins import Planes, dotted, scaled, summed
+
+from ..errors import InputError
+from ..functions.energy import Energy
+from ..functions.indices import Indices
+from .base import Carried, Dissipation, Several
+from .geometry import Geometry
+
+
+class Heating(Carried):
+    """A dissipation ``-K0 dH`` of a body, with baths of entropies y and temperatures ``T = U'(y)`` that it heats.
+
+    It is ``K dS`` on states (x, y) with ``K = B B^T`` and, for ``K0 = B0 B0^T`` and a single bath,
+
+        B = sqrt(T) [B0; -dH^T B0 / T],
+
+    so that ``x' = … - K0 dH`` and ``T y' = dH . K0 dH``. ``K (dH, T) = 0`` and ``K >= 0`` by form, for discrete
+    gradients too: both laws are exact. What K0 keeps of the body is kept, every Casimir by a double bracket. Where each
+    site has its own bath, K0 acts site by site, and so does this.
+
+    With a temperature below zero the sign of T is taken out of K: the entropy grows there too.
+
+    Attributes
+    ----------
+    bath : Indices, of shape () or that of the sites
+        The number of the bath that takes the heat, from 0; of all sites, or of each.
+    """
+
+    bath: Indices = eqx.field(static=True)
+
+    @property
+    def energy_law(self):
+        return "conserved"
+
+    @property
+    def entropy_law(self):
+        return "nondecreasing"
+
+    @property
+    def symmetric(self) -> bool:
+        return True
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    def force(self, system, x, dH, dS, dL):
+        body, n = system.without_baths(), system.body_dim
+        T, e = self._of(dH[n:]), self._of(dS[n:])
+        pull = body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n])
+        force = body.at_sites(_sign(T), self.part.force(body, x[:n], pull, None, tuple(L[:n] for L in dL)))
+        return self._joined(body, force, dH, n)
+
+    def velocity(self, system, x, dH, dS, dL):
+        body, n = system.without_baths(), system.body_dim
+        T, e = self._of(dH[n:]), self._of(dS[n:])
+        pull = body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n])
+        sigma = self.part.velocity(body, x[:n], pull, None, tuple(L[:n] for L in dL))
+        return None if sigma is None else body.at_sites(_sign(T), sigma)
+
+    def factor(self, system, x, dH, dL):
+        body, n = system.without_baths(), system.body_dim
+        B = self.part.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
+        if B is None:
+            return None
+        T = self._of(dH[n:])
+        size = _sign(T) * T
+        root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
+
+        def times(w):
+            return self._joined(body, body.at_sites(root, B.times(w)), dH, n)
+
+        along = B.velocity
+        velocity = None if along is None else lambda w: body.at_sites(root, along(w))
+        return B._replace(times=times, velocity=velocity, solenoidal=False)
+
+    def own_residuals(self, system, x):
+        return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
+
+    def warming(self, force: Planes, dH: Planes, T) -> tuple[Planes, jax.Array]:
+        """The force on spins and that on the baths, from what damps the spins, where the entropy is that of the baths.
+
+        Of vectors on sites by components, which large systems are faster with.
+        """
+        force = scaled(_sign(self._of(T)), force)
+        return force, self._taken(dotted(dH, force) if self.bath.shape else summed(dH, force), T)
+
+    def _of(self, values) -> jax.Array:
+        """Values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
+        return values[np.asarray(self.bath).ravel()] if self.bath.shape else values[int(np.asarray(self.bath))]
+
+    def _joined(self, body: Geometry, v, dH, n: int) -> jax.Array:
+        """What moves the body, shape (n,), and the entropies that take the energy which it loses."""
+        gained = body.over_sites(dH[:n], v) if self.bath.shape else jnp.dot(dH[:n], v)
+        return jnp.concatenate([v, self._taken(gained, dH[n:])])
+
+    def _taken(self, gained, T) -> jax.Array:
+        """What the entropies change by, shape (m,), where the body gains an energy, of shape () or at each site."""
+        if self.bath.shape:
+            return -jax.ops.segment_sum(gained, np.asarray(self.bath).ravel(), len(T)) / T
+        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), -gained / T, 0.0)
+
+
+class BesideBaths(Carried):
+    """A dissipation of a body that makes no heat, beside baths."""
+
+    def force(self, system, x, dH, dS, dL):
+        body, n = system.without_baths(), system.body_dim
+        force = self.part.force(body, x[:n], dH[:n], dS[:n], tuple(L[:n] for L in dL))
+        return jnp.pad(force, (0, len(x) - n))
+
+    def velocity(self, system, x, dH, dS, dL):
+        n = system.body_dim
+        return self.part.velocity(system.without_baths(), x[:n], dH[:n], dS[:n], tuple(L[:n] for L in dL))
+
+    def factor(self, system, x, dH, dL):
+        n = system.body_dim
+        B = self.part.factor(system.without_baths(), x[:n], dH[:n], tuple(L[:n] for L in dL))
+        return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, len(x) - n)))
+
+    def own_residuals(self, system, x):
+        return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
+
+
+def heated(
+    dissipation: Dissipation | None, body: Geometry, number: int, pulled: Callable[[Energy], Energy]
+) -> Dissipation | None:
+    """The dissipation of a body, beside a number of baths that take its heat.
+
+    Raises
+    ------
+    InputError
+        If it makes no heat, or there is no bath of the number that it names.
+    """
+    if dissipation is None:
+        return None
+    parts = dissipation.terms
+    if not any(part.energy_law == "nonincreasing" for part in parts):
+        raise InputError(
+            "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
+            f"{type(parts[0]).__name__} makes none: leave out baths="
+        )
+    carried = tuple(_carried(part, body, number, pulled) for part in parts)
+    return carried[0] if len(carried) == 1 else Several(carried)
+
+
+def _carried(part: Dissipation, body: Geometry, number: int, pulled: Callable[[Energy], Energy]) -> Dissipation:
+    functions = tuple(map(pulled, part.preserve))
+    if part.energy_law != "nonincreasing":
+        return BesideBaths(part, functions)
+    given = getattr(part, "bath", None)
+    bath = Indices(0) if given is None else given
+    numbers = np.asarray(bath)
+    if numbers.shape not in ((), body.heating_sites):
+        there = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
+        raise InputError(f"bath is the number of a bath{there}, not an array of shape {numbers.shape}")
+    if not (numbers.min() >= 0 and numbers.max() < number):
+        outside = int(numbers[(numbers < 0) | (numbers >= number)][0]) if numbers.shape else int(numbers)
+        raise InputError(f"a dissipation heats bath {outside}, but there are {number}, which count from 0")
+    return Heating(part, functions, bath)
+
+
+def _sign(T) -> jax.Array:
+    """A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series."""
+    return jnp.where(T < 0.0, -1.0, 1.0)

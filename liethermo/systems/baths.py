@@ -1,0 +1,110 @@
+"""Heat baths: what takes the heat of a dissipation, and the states that have their entropies behind those of a body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds._arrays import is_traced, real_array
+from manifolds._module import Module
+
+from ..errors import InputError
+from ..functions.each import Each
+from ..functions.energy import Energy
+
+
+class HeatBaths(Module):
+    """Baths, each with an energy that is a function of its own entropy y: by default ``U = C T (exp(y / C) - 1)``.
+
+    That is a constant heat capacity C, and the temperature T at y = 0. A system with baths has the state (x, y), the
+    energy ``H(x) + U(y)``, and an entropy that ``sum y`` belongs to. A dissipation that lowers the energy of its body
+    heats the first bath, or the one that its ``bath`` names: see :class:`liethermo.dissipation.heating.Heating`.
+
+    Parameters
+    ----------
+    capacity, temperature : float > 0, or array, shape (number,)
+        C (energy / temperature) and T, in any consistent units.
+    number : int
+    energy : function from y, a scalar, to a scalar, optional
+        The same for all baths, in place of the two numbers. It has to increase.
+
+    Raises
+    ------
+    InputError
+    """
+
+    parameters: tuple[jax.Array, ...]
+    function: Callable
+    number: int = eqx.field(static=True)
+
+    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
+        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+            raise InputError(f"the number of baths is a positive integer, not {number!r}")
+        given = {"capacity": capacity, "temperature": temperature} if energy is None else {}
+        self.parameters = tuple(_positive(value, what, number) for what, value in given.items())
+        self.function, self.number = _warmth if energy is None else _OfEntropy(energy), number
+
+    @property
+    def energy(self) -> Energy:
+        """Their energy, of their entropies, shape (number,)."""
+        return Each(self.function, np.arange(self.number)[:, None], *self.parameters)
+
+
+def _positive(value, what: str, number: int) -> jax.Array:
+    array = real_array(value)
+    if array.shape not in ((), (number,)):
+        raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
+    if not is_traced(array) and not bool(((array > 0.0) & jnp.isfinite(array)).all()):
+        raise InputError(f"the {what} of a bath must be positive and finite, not {array.tolist()}")
+    return jnp.broadcast_to(array, (number,))
+
+
+def _warmth(y, capacity, temperature):
+    """Relative to y = 0: else the heat of a small body would be lost in the rounding of what a large bath holds."""
+    return capacity * temperature * jnp.expm1(y[0] / capacity)
+
+
+class _OfEntropy(Module):
+    energy: Callable
+
+    def __call__(self, y):
+        return self.energy(y[0])
+
+
+class BesideBaths(mf.PoissonStructure):
+    """The Poisson structure of a body, with entropies behind its state that nothing is conjugate to."""
+
+    body: mf.PoissonStructure
+    number: int = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        assert self.body.dim is not None
+        return self.body.dim + self.number
+
+    def tensor(self, x) -> jax.Array:
+        return jnp.pad(self.body.tensor(x[: -self.number]), ((0, self.number), (0, self.number)))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        return jnp.pad(self.body.sharp(x[: -self.number], alpha[: -self.number]), (0, self.number))
+
+
+class EntropyOfBaths(Energy):
+    """The sum of the last components."""
+
+    number: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return jnp.sum(x[-self.number :])
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.where(jnp.arange(x.size) < x.size - self.number, 0.0, 1.0)
