@@ -60,6 +60,10 @@ class Energy(Module):
         """
         return jax.lax.stop_gradient(with_rounding(self.value, x)[1])
 
+    def hidden(self, x) -> jax.Array:
+        """The size at which a difference of values of one term is rounded; zero where that has a closed form."""
+        return jnp.zeros(()) if self.is_quadratic else self.rounded(x)
+
     @property
     def terms(self) -> tuple[Energy, ...]:
         """The summands, none of them a sum itself."""

@@ -58,6 +58,15 @@ class WithBaths(Energy):
     def sensitivity(self, x) -> jax.Array:
         return self.body.sensitivity(x[: self.size]) + self.baths.sensitivity(x[self.size :])
 
+    def rounded(self, x) -> jax.Array:
+        return self.body.rounded(x[: self.size]) + self.baths.rounded(x[self.size :])
+
+    def hidden(self, x) -> jax.Array:
+        def of(energy: Energy, part) -> jax.Array:
+            return sum((term.hidden(part) for term in energy.terms), jnp.zeros(()))
+
+        return of(self.body, x[: self.size]) + of(self.baths, x[self.size :])
+
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
         low, n = jnp.zeros_like(x) + low, self.size
 

@@ -142,7 +142,7 @@ class ExplicitMethod(OneStepMethod):
         but does not move. Near these the turn that makes up for an error is much larger than the error.
         """
         casimirs = system.casimirs()
-        return system.has_all_casimirs and casimirs.keys() <= set(self.held) and system.dim - len(casimirs) <= 2
+        return system.has_all_casimirs and casimirs.keys() <= set(self.held) and system.body_dim - len(casimirs) <= 2
 
     def on(self, system: System) -> OneStepMethod:
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
@@ -267,9 +267,7 @@ class ExplicitMethod(OneStepMethod):
 
         def hidden() -> jax.Array:
             """What rounding of the values may make of what is missed: nothing where there is a closed form."""
-            return DIFFERENCE * jnp.stack(
-                [sum((t.rounded(x) for t in f.terms if not t.is_quadratic), jnp.zeros(())) for f in functions]
-            )
+            return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
 
         d = landed(d)
         ends = gradients(d)

@@ -96,7 +96,7 @@ class WithAttitude(OneStepMethod):
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
     def unknowns(self, system: AttitudeSystem) -> int:  # type: ignore[override]
-        return 2 * system.body.dim if self.explicit else self.method.unknowns(system.body)
+        return self.method.unknowns(system.body) + (system.body.algebra.dim if self.explicit else 0)
 
     def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
         return self.method.judged(system.body, system.points(x))
@@ -132,7 +132,7 @@ class WithAttitude(OneStepMethod):
             group, theta = system.group, TurningSystem(system, self.order).angles(self.increment(h, k))
             turn = group.exp_map(group.algebra, theta)
             if system.body.torque_free and self.method.transports(system.body):
-                turn = _carrying(group, turn, mu, new)
+                turn = _carrying(group, turn, mu[: group.algebra.dim], new[: group.algebra.dim])
             return system.join(new, group.restore_map(g @ turn)), system.join(new_low, jnp.zeros_like(g))
         xi = h * self.method.velocities(system.body, mu, mu_low, h, k)
         if self.kind == "cayley":

@@ -28,8 +28,8 @@ SPATIAL_MOMENTUM = "momentum in space"
 class AttitudeSystem(System):
     """A Lie-Poisson system for mu, and ``g' = g hat(transport(mu))`` beside it [:doc:`/explanation/exact_laws`].
 
-    A state is mu followed by the entries of g, row by row, their imaginary parts last where there are any. Energy,
-    entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.
+    A state is mu, with the entropies of baths where there are any, followed by the entries of g, row by row, their
+    imaginary parts last where there are any. Energy, entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class AttitudeSystem(System):
         return self.body.unrollable and self._parts == 1 and unrolls
 
     def split(self, x) -> tuple[jax.Array, jax.Array]:
-        """Momentum, shape (..., dim of the algebra), and group element, shape (..., m, m), of a state."""
+        """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
         n, m = self.body.dim, self.group.matrix_size
         parts = x[..., n:].reshape(*x.shape[:-1], self._parts, m, m)
         return x[..., :n], parts[..., 0, :, :] if self._parts == 1 else parts[..., 0, :, :] + 1j * parts[..., 1, :, :]
@@ -92,7 +92,7 @@ class AttitudeSystem(System):
         return self.join(jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:])))
 
     def points(self, x):
-        """The momenta: what functions of the state are functions of."""
+        """The states of the body: what functions of the state are functions of."""
         return x[..., : self.body.dim]
 
     def sizes(self, k):
@@ -136,7 +136,7 @@ class AttitudeSystem(System):
 
     @property
     def blocks(self):
-        return slice(0, self.body.dim), slice(self.body.dim, None)
+        return *self.body.blocks, slice(self.body.dim, None)
 
     def invariants(self):
         return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
@@ -168,7 +168,8 @@ def _distance(system: AttitudeSystem, x) -> jax.Array:
 
 def _in_space(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
     """The momentum in space, and the size of the largest terms in it."""
-    (mu, g), group = system.split(x), system.group
+    (state, g), group = system.split(x), system.group
+    mu = state[: group.algebra.dim]
     action = group.Ad(group.inverse_map(g))
     return mu @ action, jnp.max(jnp.abs(mu) @ jnp.abs(action))
 
@@ -196,7 +197,7 @@ class TurningSystem(System):
 
     def __init__(self, whole: AttitudeSystem, order: int):
         body = whole.body
-        self.whole, self.order, self.dim, self.space = whole, order, 2 * body.dim, None
+        self.whole, self.order, self.dim, self.space = whole, order, body.dim + body.algebra.dim, None
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
@@ -219,8 +220,7 @@ class TurningSystem(System):
 
     def around(self, x) -> jax.Array:
         """The coordinates of a state around its own attitude."""
-        mu = self.whole.points(x)
-        return jnp.concatenate([mu, jnp.zeros_like(mu)])
+        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.body.algebra.dim)])
 
     def angles(self, v) -> jax.Array:
         """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
@@ -234,4 +234,4 @@ class _OnMomentum(Carried):
         body = system.whole.body
         n = body.dim
         dS, dL = None if dS is None else dS[:n], tuple(L[:n] for L in dL)
-        return jnp.pad(self.part.force(body, x[:n], dH[:n], dS, dL), (0, n))
+        return jnp.pad(self.part.force(body, x[:n], dH[:n], dS, dL), (0, len(x) - n))

@@ -16,6 +16,7 @@ from manifolds._module import Module
 from ..errors import InputError
 from ..functions.each import Each
 from ..functions.energy import Energy
+from ..functions.warmth import Warmth
 
 
 class HeatBaths(Module):
@@ -33,26 +34,28 @@ class HeatBaths(Module):
     energy : function from y, a scalar, to a scalar, optional
         The same for all baths, in place of the two numbers. It has to increase.
 
+    Attributes
+    ----------
+    energy : Energy
+        Their energy, of their entropies, shape (number,).
+
     Raises
     ------
     InputError
     """
 
-    parameters: tuple[jax.Array, ...]
-    function: Callable
+    energy: Energy
     number: int = eqx.field(static=True)
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
-        given = {"capacity": capacity, "temperature": temperature} if energy is None else {}
-        self.parameters = tuple(_positive(value, what, number) for what, value in given.items())
-        self.function, self.number = _warmth if energy is None else _OfEntropy(energy), number
-
-    @property
-    def energy(self) -> Energy:
-        """Their energy, of their entropies, shape (number,)."""
-        return Each(self.function, np.arange(self.number)[:, None], *self.parameters)
+        self.number = number
+        if energy is None:
+            given = {"capacity": capacity, "temperature": temperature}
+            self.energy = Warmth(*(_positive(value, what, number) for what, value in given.items()))
+        else:
+            self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
 
 def _positive(value, what: str, number: int) -> jax.Array:
@@ -62,11 +65,6 @@ def _positive(value, what: str, number: int) -> jax.Array:
     if not is_traced(array) and not bool(((array > 0.0) & jnp.isfinite(array)).all()):
         raise InputError(f"the {what} of a bath must be positive and finite, not {array.tolist()}")
     return jnp.broadcast_to(array, (number,))
-
-
-def _warmth(y, capacity, temperature):
-    """Relative to y = 0: else the heat of a small body would be lost in the rounding of what a large bath holds."""
-    return capacity * temperature * jnp.expm1(y[0] / capacity)
 
 
 class _OfEntropy(Module):

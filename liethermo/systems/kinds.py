@@ -170,7 +170,8 @@ class Kind(Module):
     @property
     def blocks(self) -> tuple[slice, ...]:
         """The parts of a state that have sizes of their own, such as a momentum and the attitude beside it."""
-        return (slice(None),)
+        n = self.body_dim
+        return (slice(None),) if self.baths is None else (slice(0, n), slice(n, self.dim))
 
     # -- the metric of the space --------------------------------------------------------------------------------------
 

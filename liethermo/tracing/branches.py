@@ -16,6 +16,11 @@ from .scalarize import Program
 LONG = 32
 """Instructions that are worth a jump."""
 
+CALLS = frozenset("exp exp2 expm1 log log1p pow cbrt sin cos tan asin acos atan atan2".split()) | frozenset(
+    "sinh cosh tanh asinh acosh atanh erf erfc rem".split()
+)
+"""Operations that cost as many as that."""
+
 Guard: TypeAlias = tuple[tuple[str, bool], ...]
 """Branches, one inside another, and the side of each: what has this guard is needed on these sides alone."""
 
@@ -51,7 +56,11 @@ def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
     if not tests:
         return list(program.instructions)
     guards = _guards(program, tests)
-    sizes = Counter(guard[:depth] for guard in guards.values() for depth in range(1, len(guard) + 1))
+    sizes = Counter[Guard]()
+    for instruction in program.instructions:
+        guard = guards[instruction.target]
+        for depth in range(1, len(guard) + 1):
+            sizes[guard[:depth]] += LONG if instruction.op in CALLS else 1
     for target, guard in guards.items():
         while guard and sizes[guard] < least:
             guard = guard[:-1]

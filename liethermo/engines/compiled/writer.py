@@ -12,10 +12,11 @@ from llvmlite import ir
 from ...tracing.branches import Branch, branched
 from ...tracing.builder import Instruction, Scalar
 from ...tracing.scalarize import Program, UnsupportedPrimitive
+from .exponential import exponential
 
 NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
 
-INTRINSICS = {name: name for name in "sqrt exp exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
+INTRINSICS = {name: name for name in "sqrt exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
 """Operations that LLVM has functions for."""
 
 LIBRARY = frozenset("cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc".split())
@@ -86,16 +87,18 @@ class Writer:
             return self._as_number(x)
         if op == "int":
             return build.zext(x, self.whole) if x.type == self.test else x
+        if real and op == "exp":
+            return exponential(self, x)
         if real and op in INTRINSICS:
-            return self._intrinsic(f"llvm.{INTRINSICS[op]}", args, self.number)
+            return self.intrinsic(f"llvm.{INTRINSICS[op]}", args, self.number)
         if real and op in LIBRARY:
-            return self._of_each_lane(op, args)
+            return self.of_each_lane(op, args)
         if real and op == "truncate":  # NaN to 0, and what is too large to the nearest integer
-            return self._intrinsic("llvm.fptosi.sat", args, self.whole)
+            return self.intrinsic("llvm.fptosi.sat", args, self.whole)
         if real and op == "is_finite":
             return build.fcmp_ordered("<", self.operation("abs", args), self.constant(np.inf))
         if real and op == "sign":  # NaN of NaN, a zero of a zero
-            signed = self._intrinsic("llvm.copysign", [self.constant(1.0), x], self.number)
+            signed = self.intrinsic("llvm.copysign", [self.constant(1.0), x], self.number)
             return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed, x)
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
@@ -104,7 +107,7 @@ class Writer:
         (x, y), other = factors, terms[1 - place]
         if op == "sub":
             x, other = (x, self.builder.fneg(other)) if place == 0 else (self.builder.fneg(x), other)
-        return self._intrinsic("llvm.fmuladd", (x, y, other), self.number)
+        return self.intrinsic("llvm.fmuladd", (x, y, other), self.number)
 
     def larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
         """The larger of two numbers without a sign, NaN if either is: their bits are in the order of the numbers."""
@@ -167,13 +170,13 @@ class Writer:
         convert = self.builder.uitofp if value.type == self.test else self.builder.sitofp
         return convert(value, self.number)
 
-    def _intrinsic(self, name: str, args: Sequence[ir.Value], result: ir.Type) -> ir.Value:
+    def intrinsic(self, name: str, args: Sequence[ir.Value], result: ir.Type) -> ir.Value:
         suffix = "" if self.lanes == 1 else f"v{self.lanes}"
         kinds = [f"{suffix}i64"] if result == self.whole else []
         name = ".".join([name, *kinds, f"{suffix}f64"])
         return self.builder.call(self._declared(name, result, args), args)
 
-    def _of_each_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
+    def of_each_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
         if self.lanes == 1:
             return self.builder.call(self._declared(name, NUMBER, args), args)
         result = ir.Constant(self.number, ir.Undefined)

@@ -4,7 +4,9 @@ import gc
 import itertools
 import platform
 
+import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +18,7 @@ from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.machine_code import MachineCode
 from liethermo.engines.compiled.writer import NUMBER, Writer
 from liethermo.tracing.builder import OF_TESTS, OPERATIONS, TESTS, Instruction
-from liethermo.tracing.scalarize import Program, UnsupportedPrimitive
+from liethermo.tracing.scalarize import Program, UnsupportedPrimitive, scalarize
 from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
 from tests.machine_code import compiled, memory_maps
 
@@ -182,3 +184,21 @@ def test_a_module_that_llvm_refuses_is_an_error():
     ir.IRBuilder(function.append_basic_block())  # without an end
     with pytest.raises(RuntimeError):
         MachineCode(module)
+
+
+@pytest.mark.parametrize("lanes", [1, 4, 8])
+def test_the_exponential_is_that_of_the_field(lanes):
+    """To one unit in the last place against many digits, wherever it is a number; infinite, zero and NaN beyond."""
+    of_one = scalarize(jax.make_jaxpr(jnp.exp)(jax.ShapeDtypeStruct((1,), jnp.float64)))
+    function = compiled(of_one, lanes)
+    random = np.random.default_rng(0)
+    ordinary = np.concatenate([random.uniform(-708.0, 709.7, 400), random.uniform(-1.0, 1.0, 400), [0.0, -1e-300]])
+    special = np.array([709.79, -745.2, 1e308, -1e308, np.inf, -np.inf, np.nan, -744.0, 700.0, -700.0])
+    x = np.resize(np.concatenate([ordinary, special]), lanes * 900)
+    rows = x.reshape(-1, lanes)
+    found = np.concatenate([np.ravel(function(row[:, None] if lanes > 1 else row)[0]) for row in rows])
+    for at, value in zip(x[: len(ordinary)], found, strict=False):
+        exact = mpmath.exp(mpmath.mpf(at))
+        assert abs(mpmath.mpf(value) - exact) <= 1.01 * np.spacing(float(exact))
+    with np.errstate(over="ignore", under="ignore"):
+        np.testing.assert_allclose(found, np.exp(x), rtol=5e-16, atol=5e-324)

@@ -1,0 +1,64 @@
+"""The exponential function as instructions, for all lanes at once: that of the C library takes one number at a time."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from llvmlite import ir
+
+if TYPE_CHECKING:
+    from .writer import Writer
+
+INSIDE = 700.0
+"""Arguments below this size have a result that is no subnormal number; of others the C library is asked."""
+
+LOG2_HIGH = float.fromhex("0x1.62e42fee00000p-1")
+"""log(2) but for its last bits, so that a whole number up to 2^11 times it is exact."""
+
+LOG2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
+"""The rest."""
+
+WHOLE = 1.5 * 2.0**52
+"""A number to which another is added as its nearest whole number, in the last bits."""
+
+TERMS = 13
+"""Power up to which the series of a remainder below log(2) / 2 is summed: what is left out is 4e-18."""
+
+
+def exponential(writer: Writer, x: ir.Value) -> ir.Value:
+    """``exp(x)``, to one unit in the last place: ``2^k exp(r)`` with ``x = k log 2 + r`` and ``|r| <= log(2) / 2``."""
+    build = writer.builder
+    usual = build.fcmp_ordered("<", writer.operation("abs", [x]), writer.constant(INSIDE))
+    found = _inside(writer, x)
+    before = build.block
+    with build.if_then(writer.any(build.not_(usual)), likely=False):
+        chosen = build.select(usual, found, writer.of_each_lane("exp", [x]))
+        after = build.block
+    result = build.phi(writer.number)
+    result.add_incoming(found, before)
+    result.add_incoming(chosen, after)
+    return result
+
+
+def _inside(writer: Writer, x: ir.Value) -> ir.Value:
+    build = writer.builder
+
+    def fused(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+        return writer.intrinsic("llvm.fmuladd", (a, b, c), writer.number)
+
+    whole = writer.constant(WHOLE)
+    shifted = fused(x, writer.constant(1.0 / math.log(2.0)), whole)
+    k = build.fsub(shifted, whole)
+    r = fused(k, writer.constant(-LOG2_LOW), fused(k, writer.constant(-LOG2_HIGH), x))
+    # exp(r) = 1 + (r + r^2 q(r)), q by pairs, which do not wait for each other
+    terms = [writer.constant(1.0 / math.factorial(n)) for n in range(2, TERMS + 1)]
+    power = r
+    square = build.fmul(r, r)
+    while len(terms) > 1:
+        pairs = [fused(power, other, one) for one, other in zip(terms[::2], terms[1::2], strict=False)]
+        terms = pairs + terms[2 * len(pairs) :]
+        power = square if power is r else build.fmul(power, power)
+    bits = build.shl(build.bitcast(shifted, writer.whole), writer.constant(52))  # those of k alone are left
+    scale = build.bitcast(build.add(bits, writer.constant(1023 << 52)), writer.number)
+    return build.fmul(scale, build.fadd(writer.constant(1.0), fused(square, terms[0], r)))
