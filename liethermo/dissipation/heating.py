@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds.structures.spins import Planes, dotted, scaled, summed
-
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.indices import Indices
@@ -57,17 +55,12 @@ class Heating(Carried):
 
     def force(self, system, x, dH, dS, dL):
         body, n = system.without_baths(), system.body_dim
-        T, e = self._of(dH[n:]), self._of(dS[n:])
-        pull = body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n])
-        force = body.at_sites(_sign(T), self.part.force(body, x[:n], pull, None, tuple(L[:n] for L in dL)))
+        force = self.part.force(body, x[:n], self._pull(body, dH, dS, n), None, tuple(L[:n] for L in dL))
         return self._joined(body, force, dH, n)
 
     def velocity(self, system, x, dH, dS, dL):
         body, n = system.without_baths(), system.body_dim
-        T, e = self._of(dH[n:]), self._of(dS[n:])
-        pull = body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n])
-        sigma = self.part.velocity(body, x[:n], pull, None, tuple(L[:n] for L in dL))
-        return None if sigma is None else body.at_sites(_sign(T), sigma)
+        return self.part.velocity(body, x[:n], self._pull(body, dH, dS, n), None, tuple(L[:n] for L in dL))
 
     def factor(self, system, x, dH, dL):
         body, n = system.without_baths(), system.body_dim
@@ -75,7 +68,7 @@ class Heating(Carried):
         if B is None:
             return None
         T = self._of(dH[n:])
-        size = _sign(T) * T
+        size = self.sign(dH[n:]) * T
         root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
 
         def times(w):
@@ -88,28 +81,37 @@ class Heating(Carried):
     def own_residuals(self, system, x):
         return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
 
-    def warming(self, force: Planes, dH: Planes, T) -> tuple[Planes, jax.Array]:
-        """The force on spins and that on the baths, from what damps the spins, where the entropy is that of the baths.
+    @property
+    def by_site(self) -> bool:
+        """Whether each site has a bath of its own."""
+        return bool(self.bath.shape)
 
-        Of vectors on sites by components, which large systems are faster with.
+    def sign(self, T) -> jax.Array:
+        """That of the temperatures, at the sites that heat them.
+
+        A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series.
         """
-        force = scaled(_sign(self._of(T)), force)
-        return force, self._taken(dotted(dH, force) if self.bath.shape else summed(dH, force), T)
+        return jnp.where(self._of(T) < 0.0, -1.0, 1.0)
+
+    def warming(self, lost, T) -> jax.Array:
+        """What the entropies grow by, shape (m,), where a body loses an energy, of shape () or at each site."""
+        if self.by_site:
+            return jax.ops.segment_sum(lost, np.asarray(self.bath).ravel(), len(T)) / T
+        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), lost / T, 0.0)
+
+    def _pull(self, body: Geometry, dH, dS, n: int) -> jax.Array:
+        """What takes the place of dH in the force on the body, shape (n,): dH, where the entropy is that of baths."""
+        T, e, sign = self._of(dH[n:]), self._of(dS[n:]), self.sign(dH[n:])
+        return body.at_sites(sign, body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n]))
 
     def _of(self, values) -> jax.Array:
         """Values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
-        return values[np.asarray(self.bath).ravel()] if self.bath.shape else values[int(np.asarray(self.bath))]
+        return values[np.asarray(self.bath).ravel()] if self.by_site else values[int(np.asarray(self.bath))]
 
     def _joined(self, body: Geometry, v, dH, n: int) -> jax.Array:
         """What moves the body, shape (n,), and the entropies that take the energy which it loses."""
-        gained = body.over_sites(dH[:n], v) if self.bath.shape else jnp.dot(dH[:n], v)
-        return jnp.concatenate([v, self._taken(gained, dH[n:])])
-
-    def _taken(self, gained, T) -> jax.Array:
-        """What the entropies change by, shape (m,), where the body gains an energy, of shape () or at each site."""
-        if self.bath.shape:
-            return -jax.ops.segment_sum(gained, np.asarray(self.bath).ravel(), len(T)) / T
-        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), -gained / T, 0.0)
+        gained = body.over_sites(dH[:n], v) if self.by_site else jnp.dot(dH[:n], v)
+        return jnp.concatenate([v, self.warming(-gained, dH[n:])])
 
 
 class BesideBaths(Carried):
@@ -169,8 +171,3 @@ def _carried(part: Dissipation, body: Geometry, number: int, pulled: Callable[[E
         outside = int(numbers[(numbers < 0) | (numbers >= number)][0]) if numbers.shape else int(numbers)
         raise InputError(f"a dissipation heats bath {outside}, but there are {number}, which count from 0")
     return Heating(part, functions, bath)
-
-
-def _sign(T) -> jax.Array:
-    """A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series."""
-    return jnp.where(T < 0.0, -1.0, 1.0)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from manifolds._arrays import real_array
-from manifolds.structures.spins import Planes, Spins, cross_planes, planes, scaled
+from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled, summed
 
 from ..errors import InputError
 from ..functions.indices import Indices
@@ -82,12 +82,19 @@ class LandauLifshitz(Dissipation):
         return self
 
     def force(self, system, x, dH, dS, dL):
-        return system.poisson.joined(self.damped(system.poisson, x, dH), jnp.zeros(0))
+        force, _ = self.damped(system.poisson, x, dH)
+        return system.poisson.joined(force, jnp.zeros(0))
 
-    def damped(self, spins: Spins, x, dH) -> Planes:
-        """The components of the force."""
-        s = spins.spins(x)
-        return scaled(self.rate.reshape(-1), cross_planes(s, cross_planes(s, spins.covectors(dH))))
+    def damped(self, spins: Spins, x, dH, sign=1.0, by_site: bool = False) -> tuple[Planes, jax.Array]:
+        """The components of the force, times a sign; and how fast the energy falls by it, in all or at each site."""
+        s, rate = spins.spins(x), sign * self.rate.reshape(-1)
+        torque = cross_planes(s, spins.covectors(dH))
+        if rate.size == 1 and not by_site:
+            lost = rate[0] * summed(torque, torque)
+        else:
+            lost = rate * dotted(torque, torque)
+            lost = lost if by_site else jnp.sum(lost)
+        return scaled(rate, cross_planes(s, torque)), lost
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson

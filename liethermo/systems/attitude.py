@@ -29,7 +29,8 @@ class AttitudeSystem(System):
     """A Lie-Poisson system for mu, and ``g' = g hat(transport(mu))`` beside it [:doc:`/explanation/exact_laws`].
 
     A state is mu, with the entropies of baths where there are any, followed by the entries of g, row by row, their
-    imaginary parts last where there are any. Energy, entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a system with a group.
+    imaginary parts last where there are any. Energy, entropy and Casimirs are those of mu. Made by
+    :func:`liethermo.integrate` from a system with a group.
 
     Attributes
     ----------

@@ -84,11 +84,13 @@ class SpinSystem(System):
         spins, n = self._spins, self.body_dim
         if damping is None or spins is None:
             return super().field(x, dH, dS, dL)
-        x, of_spins, warmed = x[:n], dH[:n], jnp.zeros(0)
-        damped = damping.damped(spins, x, of_spins)
-        if heating is not None:  # the entropy is that of the baths
-            damped, warmed = heating.warming(damped, spins.covectors(of_spins), dH[n:])
-        return spins.joined(added(spins.turned(x, of_spins), damped), warmed)
+        if heating is None:
+            damped, _ = damping.damped(spins, x, dH)
+            warmed = jnp.zeros(0)
+        else:  # the entropy is that of the baths
+            damped, lost = damping.damped(spins, x, dH, heating.sign(dH[n:]), heating.by_site)
+            warmed = heating.warming(lost, dH[n:])
+        return spins.joined(added(spins.turned(x, dH), damped), warmed)
 
     def at_sites(self, values, v) -> jax.Array:
         spins = self._spins
