@@ -16,7 +16,7 @@ from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import Audit, AuditRow, Tolerances, accuracy_row, coverage_of
 from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, Saved, as_parts, described, from_parts, places
+from .files import ENSEMBLE_FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -359,18 +359,29 @@ class Ensemble(Saved):
         """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
         if len(series["time"]) != int(attributes["times"]):
             raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
-        evidence = Evidence(**json.loads(attributes["evidence"]))
-        arrays: dict[str, Any] = {name: series[name] for name in NEEDED}
-        arrays |= {name: series.get(name) for name in ("x", "entropy", "work")}
-        arrays |= {name: from_parts(series[name]) for name in ("attitude", "attitude0") if name in series}
+        number, times = len(series["x0"]), len(series_of(series, "time", (None,)))
+        each = {name: series_of(series, name, (number,)) for name in NUMBERS}
+        along = {name: series_of(series, name, (number,), (number, times)) for name in SERIES if name in series}
+        states = {name: series[name] for name in ("x0", "x", "attitude0", "attitude") if name in series}
+        for name in states:
+            series_of(series, name, (number, *[None] * max(series[name].ndim - 1, 1)))
+        for name in ("attitude", "attitude0"):
+            if name in states:
+                states[name] = from_parts(states[name])
+        reasons, provenance = (json.loads(attributes[name]) for name in ("reasons", "provenance"))
+        if not isinstance(reasons, dict) or not isinstance(provenance, dict):
+            raise ValueError("what is said of the ensemble is not what this version writes")
+        if not ((each["status"] >= 0) & (each["status"] < len(TEXTS))).all():
+            raise ValueError(f"a trajectory ended in a way that there is not: {int(each['status'].max())}")
+        evidence = checked(Evidence, json.loads(attributes["evidence"]))
         return cls(
             t=series["time"],
-            **arrays,
-            laws=Laws.of(json.loads(attributes["laws"])),
+            **dict.fromkeys(("x", "entropy", "work")) | each | along | states,  # type: ignore[arg-type]
+            laws=checked(Laws, json.loads(attributes["laws"])),
             engine=str(attributes["engine"]),
             wall_time=float(attributes["wall_time"]),
-            reasons={int(i): text for i, text in json.loads(attributes["reasons"]).items()},
-            provenance=json.loads(attributes["provenance"]),
+            reasons={int(i): str(text) for i, text in reasons.items()},
+            provenance=provenance,
             witness=lambda: evidence,
         )
 

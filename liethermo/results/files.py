@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from manifolds.errors import warn
 
+from .. import disk
 from ..errors import FileError, InputError
 from .status import Laws
 
 if TYPE_CHECKING:
     import xarray
+
+T = TypeVar("T")
 
 FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
 ENSEMBLE_FORMAT = "liethermo-ensemble-1"
@@ -31,6 +36,9 @@ ATTRIBUTES = tuple(
 SEAL = b"\nliethermo sha256 "
 """What comes after the end of the NetCDF file, with the digest of all before it."""
 
+
+LARGEST = 2_000
+"""How many times as large as a file its content can be: numbers of one value alone take hardly any place."""
 
 LONG_NAMES = {
     "time": "time",
@@ -107,20 +115,22 @@ class Saved(ABC):
 
 
 def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
-    """Write a NetCDF file; it appears whole or not at all."""
+    """Write a NetCDF file; it appears whole or not at all.
+
+    HDF5 makes it in memory, since it does not survive a disk that is full.
+    """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
+    made = io.BytesIO()
+    dataset.to_netcdf(made, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in numbers})
+    made.seek(0, io.SEEK_END)
+    made.write(SEAL + hashlib.sha256(made.getbuffer()).hexdigest().encode())
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
-        checked = {name: {"fletcher32": True} for name in numbers}
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=checked)
-        _seal(temporary)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        disk.write(path, made.getbuffer())
+    except (OSError, ValueError) as error:  # the latter for what is no path
+        told = disk.why(error) if isinstance(error, OSError) else error
+        raise FileError(f"cannot write {path!s:.200}: {told}. The result itself is as it was") from error
+    disk.sweep(path.parent, path.name)
     return path
 
 
@@ -138,9 +148,14 @@ def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]
         If an earlier version wrote the file, without a checksum: damage may show in nothing.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileError(f"there is no file {path}")
-    _check_seal(path)
+    try:
+        if not path.is_file():
+            raise FileError(f"there is no file {path!s:.200}")
+        _check_seal(path)
+    except OSError as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"cannot read {path!s:.200}: {disk.why(error)}") from error
     try:
         series, attributes = _content(path)
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
@@ -156,13 +171,6 @@ def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]
     elif attributes.get("sha256") != checksum(series, attributes):
         raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     return series, attributes
-
-
-def _seal(path: Path) -> None:
-    """Append the digest of a file to it; readers of HDF5 do not look beyond the end that its header states."""
-    digest = _digest(path, path.stat().st_size)
-    with open(path, "ab") as file:
-        file.write(SEAL + digest)
 
 
 def _check_seal(path: Path) -> None:
@@ -199,7 +207,15 @@ def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
 
     with h5py.File(path) as file:
+        for name in file:  # before anything that they lead to is opened
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"{name!r} is a link to another place")
         found = {name: v for name, v in file.items() if not _is_scale(v)}
+        for name, v in found.items():
+            if not isinstance(v, h5py.Dataset) or v.is_virtual or v.external:
+                raise ValueError(f"{name!r} is not an array of this file")
+            if v.size * max(v.dtype.itemsize, 1) > LARGEST * path.stat().st_size:
+                raise ValueError(f"{name!r} says that it is larger than the file can hold")
         series = {
             name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
         }
@@ -210,6 +226,30 @@ def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def _is_scale(variable) -> bool:
     """Whether a variable is but the length of a dimension."""
     return bytes(variable.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF variable")
+
+
+def checked(kind: type[T], stored: Any) -> T:
+    """An object of a dataclass from the JSON data that it was written as; ValueError where that is something else."""
+    import pydantic
+
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(stored, dict) or not known.issuperset(stored):
+        raise ValueError(f"it has no {kind.__name__.lower()} as this version writes it")
+    try:
+        return pydantic.TypeAdapter(kind).validate_python(stored)
+    except pydantic.ValidationError as error:
+        fault = error.errors()[0]
+        at = ".".join(map(str, fault["loc"]))
+        raise ValueError(f"its {kind.__name__.lower()} cannot be used: {at} {fault['msg']}") from None
+
+
+def series_of(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
+    """An array of a file; ValueError unless it has numbers, in one of these shapes, where None stands for any size."""
+    found = series[name]
+    fits = [len(s) == found.ndim and all(n in (None, m) for n, m in zip(s, found.shape, strict=True)) for s in shapes]
+    if found.dtype.kind not in "fiu" or not any(fits):
+        raise ValueError(f"{name!r} is an array of {found.dtype}, shape {found.shape}, which does not fit the others")
+    return found
 
 
 def as_parts(values: np.ndarray) -> np.ndarray:

@@ -28,5 +28,5 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
         if attributes["format"] == ENSEMBLE_FORMAT:
             return Ensemble.of_file(series, attributes)
         return Solution.of_file(series, attributes)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, Saved, as_parts, described, from_parts, places
+from .files import FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
@@ -175,24 +175,30 @@ class Solution(Saved):
     def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
         """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
         stored = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
-        t, x = series["time"], series["x"]
+        t, x = series_of(series, "time", (None,)), series["x"]
         if len(t) != int(attributes["times"]):
             raise ValueError(f"{len(t)} times of {attributes['times']}")
         names = [str(name) for name in series["invariant_name"]]
-        if stored["stats"]["energy_range"] is not None:
-            stored["stats"]["energy_range"] = tuple(stored["stats"]["energy_range"])
-        evidence = Evidence(**json.loads(attributes.get("evidence", "{}")))
+        entropy = series_of(series, "entropy", (len(t),)) if "entropy" in series else None
+        attitude = None
+        if "attitude" in series:
+            m = series["attitude"].shape[1:2]
+            attitude = from_parts(series_of(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2))))
+        event_time = json.loads(attributes.get("event_time", "null"))
+        if not isinstance(event_time, int | float | None) or not isinstance(stored["provenance"], dict):
+            raise ValueError("what is said of the run is not what this version writes")
+        evidence = checked(Evidence, json.loads(attributes.get("evidence", "{}")))
         return cls(
             t=t,
-            x=x,
-            energy=series["energy"],
-            entropy=series.get("entropy"),
-            casimirs=dict(zip(names, series["invariant"], strict=True)),
-            status=Status(**stored["status"]),
-            stats=Stats(**stored["stats"]),
-            laws=Laws.of(stored["laws"]),
+            x=series_of(series, "x", (len(t), *[None] * max(x.ndim - 1, 1))),
+            energy=series_of(series, "energy", (len(t),)),
+            entropy=entropy,
+            casimirs=dict(zip(names, series_of(series, "invariant", (len(names), len(t))), strict=True)),
+            status=checked(Status, stored["status"]),
+            stats=checked(Stats, stored["stats"]),
+            laws=checked(Laws, stored["laws"]),
             provenance=stored["provenance"],
-            event_time=json.loads(attributes.get("event_time", "null")),
-            attitude=from_parts(series["attitude"]) if "attitude" in series else None,
+            event_time=event_time,
+            attitude=attitude,
             witness=lambda: evidence,
         )

@@ -113,6 +113,11 @@ class Laws:
     mean: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
 
+    def __post_init__(self):
+        for law in (self.energy, self.entropy):
+            if law not in (None, "conserved", "nondecreasing", "nonincreasing"):
+                raise InputError(f"there is no law {law!r:.60}")
+
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Laws:
         """From what is stored in a file, where tuples are lists; what an earlier version did not know is empty."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,8 +11,20 @@ import numpy as np
 
 from ..errors import InputError
 
-RESERVED = ("status", "message", "laws", "quantity")
+RESERVED = ("status", "message", "laws", "quantity", "zarr.json")
 """Names of what every store of a study has."""
+
+LONGEST = 100
+"""Characters of a name, which is that of a folder."""
+
+MOST = 10**9
+"""Points of a study: each is a file's share, and a run."""
+
+
+def is_name(name: Any) -> bool:
+    """Whether an axis, a parameter or a measure can be called so, and a folder of the store with it."""
+    plain = isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST
+    return plain and not name.startswith(("_", ".")) and not {"/", "\\"} & set(name) and name not in RESERVED
 
 
 @dataclass(frozen=True)
@@ -240,10 +253,15 @@ class Axes:
         """From what :class:`Study` is given."""
         if not isinstance(given, Mapping) or not given:
             raise InputError(f'axes are a dict from names to values, such as {{"rate": [0.1, 1.0]}}, not {given!r:.60}')
-        for name in given:
-            if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")) or name in RESERVED:
-                raise InputError(f"an axis cannot be called {name!r}")
-        return cls(tuple(Axis.of(name, values) for name, values in given.items()))
+        for name, values in given.items():
+            for called in (name, *(values.columns if isinstance(values, Zipped) else ())):
+                if not is_name(called):
+                    raise InputError(f"an axis cannot be called {called!r:.120}")
+        found = cls(tuple(Axis.of(name, values) for name, values in given.items()))
+        if found.size > MOST:
+            shape = " x ".join(map(str, found.shape))
+            raise InputError(f"a study has at most {MOST:.0e} points, and these axes have {shape}: sample them instead")
+        return found
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -255,7 +273,7 @@ class Axes:
 
     @property
     def size(self) -> int:
-        return int(np.prod(self.shape))
+        return math.prod(self.shape)
 
     def points(self, places: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
         """The parameters at some points, whose places along each axis are given."""

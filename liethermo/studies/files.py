@@ -8,17 +8,16 @@ reads a chunk that is missing as one of fill values. What is written is plain Za
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import json
 import math
 import os
 import shutil
 import socket
+import stat
 import struct
 import tempfile
 import time
-import uuid
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -27,10 +26,14 @@ from typing import Any
 
 import numpy as np
 
+from .. import disk
 from ..errors import FileError
 
-PART = ".part"
-"""How the name of a file ends that is being written."""
+DTYPES = ("int8", "int64", "float64", "complex128", "bool", "string")
+"""Types of Zarr that a store has."""
+
+LARGEST = 2**27
+"""Numbers of a chunk."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +87,16 @@ class Array:
 
     @classmethod
     def of(cls, name: str, metadata: dict[str, Any]) -> Array:
-        """From its metadata."""
-        chunks = metadata["chunk_grid"]["configuration"]["chunk_shape"]
-        dims, shape = tuple(metadata["dimension_names"]), tuple(metadata["shape"])
-        return cls(name, dims, shape, tuple(chunks), metadata["data_type"], metadata["attributes"])
+        """From its metadata; ValueError, KeyError or TypeError where these are of another thing."""
+        chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
+        dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
+        sizes = [*shape, *chunks]
+        whole = all(type(n) is int and 0 <= n < 2**48 for n in sizes) and all(n > 0 for n in chunks)
+        if not (whole and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= LARGEST):
+            raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
+        if dtype not in DTYPES or not isinstance(attributes, dict) or not all(isinstance(d, str) for d in dims):
+            raise ValueError(f"the array {name!r} is none that a study writes")
+        return cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
 
     def path(self, index: Sequence[int]) -> str:
         """The path of a chunk within the store."""
@@ -109,7 +118,7 @@ class Array:
         return data + struct.pack("<I", google_crc32c.value(data))
 
     def decoded(self, data: bytes) -> np.ndarray:
-        """A chunk from its file; ValueError where it is damaged."""
+        """A chunk from its file; ValueError or ``struct.error`` where it is damaged."""
         import google_crc32c
 
         content = data[:-4]
@@ -132,6 +141,8 @@ def _texts(values: np.ndarray) -> bytes:
 
 def _from_texts(data: bytes) -> Iterator[str]:
     (count,), place = struct.unpack_from("<I", data), 4
+    if count > len(data) // 4:
+        raise ValueError(f"it says that it has {count} texts")
     for _ in range(count):
         (length,) = struct.unpack_from("<I", data, place)
         yield data[place + 4 : place + 4 + length].decode()
@@ -149,25 +160,11 @@ def write(path: Path, data: bytes) -> None:
     FileError
         If it cannot be written.
     """
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
     try:
-        try:
-            part.write_bytes(data)
-        except FileNotFoundError:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(data)
-        os.replace(part, path)
+        disk.write(path, data)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
         kept = "What is done is kept; run the study again to go on"
-        raise FileError(f"cannot write {path}: {_why(error)}. {kept}") from error
-
-
-def _why(error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"the disk is full ({error.strerror})"
-    return str(error.strerror or error)
+        raise FileError(f"cannot write {path}: {disk.why(error)}. {kept}") from error
 
 
 class TemporaryFolder:
@@ -179,7 +176,7 @@ class TemporaryFolder:
 
 
 def read(path: Path) -> bytes:
-    """The content of a file.
+    """The content of a file, which is no link and nothing but a file.
 
     Raises
     ------
@@ -187,9 +184,36 @@ def read(path: Path) -> bytes:
         If it cannot be read.
     """
     try:
-        return path.read_bytes()
+        with open(path, "rb", opener=_plainly) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise FileError(f"{path} is no file")
+            return file.read()
+    except FileError:
+        raise
     except OSError as error:
-        raise FileError(f"cannot read {path}: {_why(error)}") from error
+        raise FileError(f"cannot read {path}: {disk.why(error)}") from error
+
+
+def _plainly(path: str, flags: int) -> int:
+    """Open no link, and wait for nobody at the other end of a pipe."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+
+
+def check_links(root: Path) -> None:
+    """Raise FileError where a store has a link in it: it might lead anywhere."""
+    folders = [os.fspath(root)]
+    while folders:
+        try:
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    if entry.is_symlink():
+                        raise FileError(f"{entry.path} is a link, and nothing in the store of a study is")
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(entry.path)
+        except FileError:
+            raise
+        except OSError as error:
+            raise FileError(f"cannot read {root}: {disk.why(error)}") from error
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -197,10 +221,10 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Remove what runs that were killed have left half written."""
+    """Remove what runs that were killed have left half written: nobody else works on the store."""
     for folder, _, files in os.walk(root):
         for name in files:
-            if name.endswith(PART) and name.startswith("."):
+            if name.endswith(disk.PART) and name.startswith("."):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(folder, name))
 
@@ -222,9 +246,9 @@ def locked(root: Path) -> Iterator[Callable[[int], None]]:
         If another run does.
     """
     try:
-        file = open(root / LOCK, "a+")  # noqa: SIM115  (what follows has errors of its own)
+        file = open(root / LOCK, "a+", opener=_plainly)  # noqa: SIM115  (what follows has errors of its own)
     except OSError as error:
-        raise FileError(f"cannot write into {root}: {_why(error)}") from error
+        raise FileError(f"cannot write into {root}: {disk.why(error)}") from error
     with file:
         try:
             if not _held(file):
@@ -232,7 +256,8 @@ def locked(root: Path) -> Iterator[Callable[[int], None]]:
         except OSError as error:
             if isinstance(error, FileError):
                 raise
-            raise FileError(f"{root} cannot be locked ({_why(error)}): two runs at once could not be told") from error
+            told = disk.why(error)
+            raise FileError(f"{root} cannot be locked ({told}): two runs at once could not be told") from error
 
         def tell(done: int) -> None:
             now = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": done}
@@ -264,7 +289,7 @@ def holder(root: Path) -> str:
 def running(root: Path) -> dict[str, Any] | None:
     """The run that works on a store now, as it has told; None where there is none."""
     try:
-        with open(root / LOCK) as file:
+        with open(root / LOCK, opener=_plainly) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..results.ensemble import Ensemble
 from ..runs.events import Relaxed
-from .axes import RESERVED
+from .axes import is_name
 
 FIELDS = {
     "final": "state at the end",
@@ -210,8 +210,8 @@ def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure
                 raise InputError(f"the measure {name!r} ends each run at {measure}, but {until!r} is to end it too")
             until = measure
     for name, measure in given.items():
-        if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")) or name in RESERVED:
-            raise InputError(f"a measure cannot be called {name!r}")
+        if not is_name(name):
+            raise InputError(f"a measure cannot be called {name!r:.120}")
         if isinstance(measure, Relaxed):
             found[name] = EventTime(f"relaxation, to a rate below {measure.tol:g}")
         elif isinstance(measure, At):

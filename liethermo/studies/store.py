@@ -5,12 +5,14 @@ Each chunk of points has a file in each array. The file in ``status`` is written
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import itertools
 import json
 import math
 import os
 import shutil
-import uuid
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,13 +20,18 @@ from typing import Any
 
 import numpy as np
 
+from .. import disk
 from ..errors import FileError, InputError
+from ..results.status import Laws
 from . import files
-from .axes import Axes, Axis
+from .axes import MOST, Axes, Axis, is_name
 from .files import Array
 from .solve import GOOD, MISSING, STATUSES, SUMMARY
 
 FORMAT = "liethermo-study-1"
+
+MOST_CHUNKS = 10**7
+"""Of a store: each is a file in each array."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +96,8 @@ class Store:
             Of the group.
         """
         chunks = _block(axes.shape, chunk)
+        if (number := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MOST_CHUNKS:
+            raise InputError(f"{axes.size} points in chunks of {chunk} are {number} files: give a larger chunk")
 
         def array(name: str, more: Sequence[tuple[str, int]], dtype: str) -> Array:
             dims, sizes = (tuple(part) for part in zip(*more, strict=True)) if more else ((), ())
@@ -102,7 +111,7 @@ class Store:
         arrays.append(Array("quantity", ("quantity",), (len(SUMMARY),), (len(SUMMARY),), "string"))
         coordinates = [array for array, _ in _coordinates(axes, about)]
         store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
-        part = root.with_name(f".{root.name}.{uuid.uuid4().hex}{files.PART}")
+        part = root.with_name(disk.part_name(root.name))
         try:
             part.mkdir(parents=True)
             made = replace(store, root=part)
@@ -113,7 +122,9 @@ class Store:
             shutil.rmtree(part, ignore_errors=True)
             if isinstance(error, FileError):
                 raise
-            raise FileError(f"cannot make the store {root}: {error.strerror}") from error
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another run was faster
+                return cls.open(root)
+            raise FileError(f"cannot make the store {root}: {disk.why(error)}") from error
         return store
 
     @classmethod
@@ -126,16 +137,54 @@ class Store:
             If there is none, or the folder is another thing.
         """
         if not root.exists():
-            raise FileError(f"there is no store {root}")
+            raise FileError(f"there is no store {root!s:.200}")
+        kind = "folder" if root.is_dir() else "file"
         try:
-            content = json.loads((root / "zarr.json").read_bytes())
+            content = json.loads(files.read(root / "zarr.json"))
             assert content["attributes"]["format"] == FORMAT
+        except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
+            raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
+        try:
             listed = content["consolidated_metadata"]["metadata"]
-            arrays = {name: Array.of(name, metadata) for name, metadata in listed.items()}
-        except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
-            what = "folder" if root.is_dir() else "file"
-            raise FileError(f"{root} is a {what}, but not the store of a study; take another name") from error
-        return cls(root, arrays, content["attributes"])
+            store = cls(root, {name: Array.of(name, said) for name, said in listed.items()}, content["attributes"])
+            store._check()
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FileError(f"{root} is the store of a study, but damaged or changed: {error}") from error
+        files.check_links(root)
+        return store
+
+    def _check(self) -> None:
+        """Raise ValueError, KeyError or TypeError unless it has the arrays that a study writes, and no others."""
+        study, measures, axes = self.study, self.attributes["measures"], self.attributes["axes"]
+        if not (isinstance(study, dict) and isinstance(measures, list) and list(study["measures"]) == measures):
+            raise ValueError("its measures are not those of its study")
+        Laws.of(self.attributes["laws"])
+        columns = [name for axis in axes.values() for name in axis]
+        for name in (*measures, *axes, *columns):
+            if not is_name(name):
+                raise ValueError(f"nothing in it can be called {name!r:.120}")
+        states = {f"{name}_state" for name in axes} & set(self.arrays)
+        expected = {*measures, *axes, *columns, *states, "status", "message", "laws", "quantity"}
+        if set(self.arrays) != expected:
+            raise ValueError(f"it has the arrays {sorted(self.arrays)}, and should have {sorted(expected)}")
+        shape, chunks = self.shape, self.arrays["status"].chunks
+        if len(shape) != len(axes) or math.prod(shape) > MOST or math.prod(self.grid) > MOST_CHUNKS:
+            raise ValueError(f"no study has points in shape {shape} and chunks {chunks}")
+        for name in self.chunked:
+            array = self.arrays[name]
+            if array.shape[: len(shape)] != shape or array.chunks != chunks + array.shape[len(shape) :]:
+                raise ValueError(f"{name!r} has shape {array.shape} in chunks {array.chunks}")
+        for (name, along), length in zip(axes.items(), shape, strict=True):
+            for own in (name, *along, *({f"{name}_state"} & states)):
+                if self.arrays[own].shape[:1] != (length,):
+                    raise ValueError(f"{own!r} has {self.arrays[own].shape} values, and its axis {length}")
+        kinds = {"status": "int8", "message": "string", "laws": "float64"}
+        if any(self.arrays[name].dtype != kind for name, kind in kinds.items()):
+            raise ValueError("how its points ended is not told in numbers of this version")
+        place = study["place"]
+        inside = [type(i) is int and 0 <= i < n for i, n in zip(place, shape, strict=True)]
+        if not all(inside):
+            raise ValueError(f"its example is at {place!r:.60}")
 
     @property
     def study(self) -> dict[str, Any]:
@@ -160,8 +209,27 @@ class Store:
         store._describe(axes)
         return store
 
+    def mended(self, axes: Axes) -> Axes:
+        """The axes of the store; where a file of its coordinates is lost or damaged, it is written again from these.
+
+        Raises
+        ------
+        FileError
+            If these are not in the order of the store: what was lost is not known then.
+        """
+        try:
+            return self.axes()
+        except FileError as error:
+            if self.attributes.get("coordinates") != _digest(axes) or axes.shape != self.shape:
+                raise FileError(
+                    f"{error}. A study with the axes that the store was made with, in their order, writes it again"
+                ) from error
+        self._describe(axes)
+        return self.axes()
+
     def _describe(self, axes: Axes) -> None:
         """Write the coordinates, then the metadata; those of the group last, which readers look at first."""
+        self.attributes["coordinates"] = _digest(axes)
         for array, values in _coordinates(axes, {}):
             whole = self.arrays[array.name]
             for index in np.ndindex(*_grid(whole)):
@@ -251,7 +319,7 @@ class Store:
         return block[inside]
 
     def _has(self, name: str, index: Sequence[int]) -> bool:
-        return (self.root / self.arrays[name].path(self._index_of(name, index))).exists()
+        return os.path.lexists(self.root / self.arrays[name].path(self._index_of(name, index)))
 
     def _index_of(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
         """The index of the chunk of an array that has more dimensions than the axes."""
@@ -260,8 +328,11 @@ class Store:
     def _chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
         path = self.root / self.arrays[name].path(self._index_of(name, index))
         try:
-            return self.arrays[name].decoded(files.read(path))
-        except ValueError as error:
+            block = self.arrays[name].decoded(files.read(path))
+            if name == "status" and not np.isin(block, (*STATUSES.values(), MISSING)).all():
+                raise ValueError("it has a status that there is not")
+            return block
+        except (ValueError, struct.error) as error:
             raise FileError(
                 f"{path} is damaged: {error}. Run the study again: what is damaged is done again"
             ) from error
@@ -327,6 +398,14 @@ class Store:
             for code, count in zip(*np.unique(status, return_counts=True), strict=True):
                 found[names[int(code)]] = found.get(names[int(code)], 0) + int(count)
         return found
+
+
+def _digest(axes: Axes) -> str:
+    """Of the coordinates, in their order."""
+    found = hashlib.sha256()
+    for array, values in _coordinates(axes, {}):
+        found.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
+    return found.hexdigest()
 
 
 def _dim(name: str, k: int, shape: tuple[int, ...]) -> str:

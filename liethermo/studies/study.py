@@ -305,10 +305,11 @@ class Study:
                 name: (values.shape[1:], "complex128" if values.dtype.kind == "c" else "float64")
                 for name, values in columns.measures.items()
             }
-            return Store.create(self.store, self._axes, self._points(solver), shapes, about, attributes), self._axes
-        store = Store.open(self.store)
+            store = Store.create(self.store, self._axes, self._points(solver), shapes, about, attributes)
+        else:
+            store = Store.open(self.store)
         try:
-            axes = matched(self._axes, store.axes())
+            axes = matched(self._axes, store.mended(self._axes))
             solver, columns, x0 = self._prepared(axes, tuple(store.study["place"]))
             lines = identity.differences(identity.description(solver, columns, x0), store.study)
         except InputError as error:

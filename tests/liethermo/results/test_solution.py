@@ -131,20 +131,6 @@ def test_other_files(tmp_path):
     assert issubclass(lt.FileError, OSError)
 
 
-def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
-    path = solution.save(tmp_path / "run.nc")
-    before = path.read_bytes()
-
-    def full(*args, **kwargs):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("xarray.Dataset.to_netcdf", full)
-    with pytest.raises(lt.FileError, match="No space left"):
-        solution.save(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]
-
-
 def test_save_to_writes_on_failure_and_on_the_way(tmp_path, monkeypatch):
     monkeypatch.setattr("liethermo.runs.run.CHECKPOINT_SECONDS", 0.0)
     saved = []

@@ -15,6 +15,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo import disk
 from liethermo.studies import files
 from liethermo.studies.running import here
 
@@ -139,7 +140,7 @@ def test_damaged_and_missing_files_are_noticed_and_made_again(done, tmp_path):
     flipped = store / "status/c/3/0"
     flipped.write_bytes(bytes([flipped.read_bytes()[0] ^ 1]) + flipped.read_bytes()[1:])
     (store / "message/c/6/0").unlink()
-    half_written = store / "tau/c" / f".0.abc{files.PART}"
+    half_written = store / "tau/c" / f".0.abc{disk.PART}"
     half_written.write_bytes(b"half")
     status = study(store).run()
     assert set(status.damaged) == {
@@ -318,17 +319,16 @@ def test_folders_that_are_no_stores_and_folders_that_cannot_be_written(tmp_path,
 
 
 def test_a_full_disk_is_said_and_loses_nothing(done, tmp_path, monkeypatch):
-    store, write, left = tmp_path / "s.zarr", Path.write_bytes, [40]
+    store, write, left = tmp_path / "s.zarr", disk.write, [40]
 
-    def short(self, data):
+    def short(path, data):
         left[0] -= 1
         if left[0] < 0:
-            write(self, data[: len(data) // 2])
             raise OSError(28, "No space left on device")
-        return write(self, data)
+        write(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", short)
+        patch.setattr(disk, "write", short)
         with pytest.raises(lt.FileError, match=r"the disk is full .*What is done is kept"):
             study(store).run()
     status = study(store).status()

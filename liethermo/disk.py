@@ -1,0 +1,91 @@
+"""Files that appear whole or not at all, however a process ends and whoever else writes there."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import re
+import secrets
+import socket
+import time
+from pathlib import Path
+
+PART = ".part"
+"""How the name of a file ends that is being written."""
+
+OLD = 86_400.0
+"""Seconds after which a part that another machine has left is taken for that of a dead process."""
+
+NAMED = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
+"""Names of parts: what they are to become, the machine and the process that write them, and a random number."""
+
+WRITING = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+
+
+def write(path: Path, data: bytes | memoryview) -> None:
+    """Write a file whole: under a random name that is nobody else's, then renamed. The last of several writers wins.
+
+    Parts that dead processes have left of the same file are removed.
+
+    Raises
+    ------
+    OSError
+        With nothing left behind.
+    """
+    part = path.with_name(part_name(path.name))
+    try:
+        try:
+            handle = os.open(part, WRITING, 0o666)
+        except FileNotFoundError:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(part, WRITING, 0o666)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.replace(part, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+
+
+def part_name(name: str) -> str:
+    """A name for a part of a file or folder of this name."""
+    return f".{_short(name, 12)}.{_short(socket.gethostname(), 8)}.{os.getpid()}.{secrets.token_hex(8)}{PART}"
+
+
+def sweep(folder: Path, name: str) -> None:
+    """Remove the parts of a file or folder of this name that dead processes have left."""
+    with contextlib.suppress(OSError):
+        for entry in folder.glob(f".{_short(name, 12)}.*{PART}"):
+            if is_dead(entry):
+                with contextlib.suppress(OSError):
+                    entry.unlink()
+
+
+def is_dead(part: Path) -> bool:
+    """Whether nobody writes this part any more."""
+    named = NAMED.fullmatch(part.name)
+    if named is None:
+        return False
+    if named[1] != _short(socket.gethostname(), 8):
+        return time.time() - part.lstat().st_mtime > OLD
+    try:
+        os.kill(int(named[2]), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):  # somebody else's
+        return False
+    return False
+
+
+def why(error: OSError) -> str:
+    """What went wrong, in words."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk is full ({error.strerror})"
+    return str(error.strerror or error)
+
+
+def _short(name: str, digits: int) -> str:
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:digits]

@@ -1,0 +1,214 @@
+"""Files of results: written whole or not at all, by however many at once, and refused where they are not what was
+written."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import liethermo as lt
+from liethermo import disk
+from liethermo.results import files
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 2.0), 0.1)
+
+
+def rewritten(path: Path, change) -> Path:
+    """A file that somebody has changed who knows how it is sealed."""
+    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    with h5py.File(path, "r+") as file:
+        change(file)
+    series, said = files._content(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["sha256"] = files.checksum(series, said)
+    return path
+
+
+FULL = """
+import resource, signal, sys
+import liethermo as lt
+solution = lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 200.0), 0.1)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for size in (0, 100, 5000, 20000, 60000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    try:
+        solution.save(sys.argv[1])
+        raise SystemExit("it was written")
+    except lt.FileError as error:
+        assert "cannot write" in str(error) and "\\n" not in str(error), error
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+assert solution.save(sys.argv[1]).exists() and (lt.load(sys.argv[1]).x == solution.x).all()
+"""
+
+
+def test_a_full_disk_is_an_error_and_no_crash(tmp_path):
+    path = tmp_path / "run.nc"
+    done = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert os.listdir(tmp_path) == ["run.nc"]
+
+
+def test_a_disk_without_room(tmp_path):
+    folder = tmp_path / "small"
+    folder.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=16k", "none", folder], check=False, capture_output=True
+    ).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        solution = lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 200.0), 0.1)
+        with pytest.raises(lt.FileError, match="the disk is full"):
+            solution.save(folder / "run.nc")
+        assert os.listdir(folder) == []
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
+    path = solution.save(tmp_path / "run.nc")
+    before = path.read_bytes()
+
+    def full(*ends):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(disk.os, "replace", full)
+    with pytest.raises(lt.FileError, match="the disk is full .*The result itself is as it was"):
+        solution.save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["run.nc"]
+
+
+def test_many_write_to_one_path(solution, tmp_path):
+    path, failed = tmp_path / "run.nc", []
+
+    def save():
+        try:
+            for _ in range(5):
+                solution.save(path)
+        except Exception as error:  # told below
+            failed.append(error)
+
+    threads = [threading.Thread(target=save) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert np.array_equal(lt.load(path).x, solution.x)
+    assert os.listdir(tmp_path) == ["run.nc"]
+
+
+def test_a_planted_link_is_not_written_through(solution, tmp_path, monkeypatch):
+    other = tmp_path / "precious"
+    other.write_text("mine")
+    part = disk.part_name("run.nc")
+    monkeypatch.setattr(disk, "part_name", lambda name: part)
+    (tmp_path / part).symlink_to(other)
+    with pytest.raises(lt.FileError, match="cannot write"):
+        solution.save(tmp_path / "run.nc")
+    assert other.read_text() == "mine"
+
+
+def test_parts_of_dead_processes_are_swept(solution, tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    mine, theirs = disk.part_name("run.nc"), disk.part_name("run.nc").replace(f".{os.getpid()}.", f".{dead.pid}.")
+    of_other = disk.part_name("other.nc").replace(f".{os.getpid()}.", f".{dead.pid}.")
+    for name in (mine, theirs, of_other):
+        (tmp_path / name).write_bytes(b"half")
+    solution.save(tmp_path / "run.nc")
+    assert set(os.listdir(tmp_path)) == {"run.nc", mine, of_other}
+
+
+def _said(name, value):
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def _replaced(name, values):
+    def change(file):
+        del file[name]
+        file[name] = values
+
+    return change
+
+
+def _linked(link):
+    def change(file):
+        file["energy2"] = link
+
+    return change
+
+
+CHANGES = {
+    "deep JSON": _said("provenance", "[" * 20_000 + "]" * 20_000),
+    "a number for the provenance": _said("provenance", "5"),
+    "a list for the stats": _said("stats", "[1]"),
+    "more than the stats": _said("stats", json.dumps({"steps": 1, "more": 2})),
+    "steps in words": _said("stats", json.dumps({"steps": "many"})),
+    "no such status": _said("status", json.dumps({"code": "fine", "message": "", "step": 1, "time": 1.0})),
+    "a law that there is not": _said("laws", json.dumps({"energy": "maybe"})),
+    "a time of an event in words": _said("event_time", '"noon"'),
+    "states of another number": _replaced("x", np.zeros((3, 3))),
+    "states in one row": _replaced("x", np.zeros(21)),
+    "states in words": _replaced("x", np.array([[b"a"] * 3] * 21)),
+    "an energy of another number": _replaced("energy", np.zeros(4)),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_what_is_no_result_is_refused(what, solution, tmp_path):
+    path = rewritten(solution.save(tmp_path / "run.nc"), CHANGES[what])
+    with pytest.raises(lt.FileError) as refused:
+        lt.load(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("other.nc", "/x"), h5py.SoftLink("/x")])
+def test_links_are_not_followed(link, solution, tmp_path):
+    path = solution.save(tmp_path / "run.nc")
+    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    with h5py.File(path, "r+") as file:
+        file["more"] = link
+    with pytest.raises(lt.FileError, match="is a link to another place"):
+        lt.load(path)
+
+
+def test_an_array_that_the_file_cannot_hold_is_not_made(solution, tmp_path):
+    path = solution.save(tmp_path / "run.nc")
+    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("more", shape=(10**6, 10**6), chunks=(1000, 1000), dtype="f8")
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    with pytest.raises(lt.FileError, match="larger than the file can hold"):
+        lt.load(path)
+    assert resource.getrlimit(resource.RLIMIT_AS) == limits
+
+
+def test_an_ensemble_that_was_changed_is_refused(tmp_path):
+    ensemble = lt.ensemble(lt.models.rigid_body(), [[0.1, 1.0, 0.1], [0.2, 1.0, 0.1]], (0.0, 1.0), 0.1)
+    for change in (
+        _replaced("status", np.array([0, 77], dtype=np.int8)),
+        _said("reasons", "3"),
+        _said("provenance", "3"),
+    ):
+        path = rewritten(ensemble.save(tmp_path / "many.nc"), change)
+        with pytest.raises(lt.FileError):
+            lt.load(path)
+
+
+@pytest.mark.parametrize("path", ["a\0b.nc", "x" * 300 + ".nc"])
+def test_what_is_no_path(path, solution, tmp_path):
+    with pytest.raises(lt.FileError, match="cannot write"):
+        solution.save(tmp_path / path)
+    with pytest.raises(lt.FileError):
+        lt.load(tmp_path / path)
