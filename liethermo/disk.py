@@ -24,7 +24,7 @@ NAMED = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
 WRITING = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
-def write(path: Path, data: bytes | memoryview) -> None:
+def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
     """Write a file whole: under a random name that is nobody else's, then renamed. The last of several writers wins.
 
     Parts that dead processes have left of the same file are removed.
@@ -37,10 +37,10 @@ def write(path: Path, data: bytes | memoryview) -> None:
     part = path.with_name(part_name(path.name))
     try:
         try:
-            handle = os.open(part, WRITING, 0o666)
+            handle = os.open(part, WRITING, mode)
         except FileNotFoundError:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(part, WRITING, 0o666)
+            handle = os.open(part, WRITING, mode)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         os.replace(part, path)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes.util
 import functools
 import hashlib
 import os
-import tempfile
+import struct
 import threading
-from pathlib import Path
 
 import llvmlite.binding as llvm
 from llvmlite import ir
+
+from . import kept
 
 
 class MachineCode:
@@ -22,12 +22,13 @@ class MachineCode:
         text = str(module)
         with _lock:
             name = hashlib.sha256(f"{_this_machine()[-1]}\n{text}".encode()).hexdigest()[:32]
-            found = _read(name)
+            found = _object(kept.read(name))
             if found is None:
-                found = _compile(text)
-                _write(name, found)
+                code = _compile(text)
+                kept.write(name, code)
+                found = _object(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-            self._engine.add_object_file(llvm.ObjectFileRef.from_data(found))
+            self._engine.add_object_file(found)
             self._engine.finalize_object()
 
     def address(self, name: str) -> int:
@@ -63,6 +64,39 @@ def _machine() -> llvm.TargetMachine:
     return target.create_target_machine(cpu, features, opt=3, jit=True, reloc="pic")
 
 
+def _object(code: bytes | None) -> llvm.ObjectFileRef | None:
+    """Code for the linker; None where there is none, or it is something else, which LLVM does not survive."""
+    if code is None or not (code.startswith(OTHERS) or _is_elf(code)):
+        return None
+    try:
+        return llvm.ObjectFileRef.from_data(code)
+    except RuntimeError:
+        return None
+
+
+OTHERS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
+"""How objects of macOS and of Windows begin."""
+
+
+def _is_elf(code: bytes) -> bool:
+    """Whether these bytes are a relocatable object of Linux whose parts all lie within them."""
+    if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
+        return False
+    (start,) = struct.unpack_from("<Q", code, 40)
+    size, count, names = struct.unpack_from("<HHH", code, 58)
+    if size != 64 or not 0 < names < count or start + size * count > len(code):
+        return False
+    for i in range(count):
+        kind, _, _, place, length = struct.unpack_from("<4xIQQQQ", code, start + size * i)
+        if kind != NO_BITS and place + length > len(code):
+            return False
+    return True
+
+
+NO_BITS = 8
+"""The kind of a section that takes no place in its file."""
+
+
 def _compile(text: str) -> bytes:
     module, target = llvm.parse_assembly(text), _machine()
     module.verify()
@@ -71,40 +105,3 @@ def _compile(text: str) -> bytes:
     builder = llvm.create_pass_builder(target, options)
     builder.getModulePassManager().run(module, builder)
     return target.emit_object(module)
-
-
-# -- on disk ----------------------------------------------------------------------------------------------------------
-
-
-def cache_folder() -> Path:
-    """Where machine code is kept: ``$LIETHERMO_CACHE``, or a folder under the user's cache directory."""
-    named = os.environ.get("LIETHERMO_CACHE")
-    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "liethermo"
-
-
-def _read(name: str) -> bytes | None:
-    """What was written under a name; None where there is nothing, or it is damaged."""
-    try:
-        whole = (cache_folder() / f"{name}.o").read_bytes()
-    except OSError:
-        return None
-    seal, found = whole[:SEAL], whole[SEAL:]
-    return found if seal == hashlib.sha256(found).digest() else None
-
-
-def _write(name: str, code: bytes) -> None:
-    """Write a file, which appears whole or not at all; nothing where the folder cannot be written."""
-    folder = cache_folder()
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(code).digest() + code)
-            os.replace(temporary, folder / f"{name}.o")
-        finally:
-            Path(temporary).unlink(missing_ok=True)
-
-
-SEAL = 32
-"""Bytes of a file before the code: its checksum."""

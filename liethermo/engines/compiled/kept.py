@@ -1,0 +1,109 @@
+"""Machine code on disk. It is run as it is found, so it is taken from folders and files of this user alone."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+from manifolds.errors import warn
+
+from ... import disk
+
+
+class CacheWarning(UserWarning):
+    """Machine code is compiled anew in every process, since it cannot be kept safely."""
+
+
+SEAL = 32
+"""Bytes of a file before the code: its checksum, for a file that was cut short."""
+
+LARGEST = 2**28
+"""Bytes of a file."""
+
+PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Flags that open no link, and wait for nobody at the other end of a pipe."""
+
+
+def cache_folder() -> Path | None:
+    """Where machine code is kept: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None without."""
+    if named := os.environ.get("LIETHERMO_CACHE"):
+        return Path(named)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "liethermo"
+    except RuntimeError:  # there is no HOME, and nobody knows the user
+        return None
+
+
+def read(name: str) -> bytes | None:
+    """What was written under a name; None where there is nothing, it is damaged, or it may be somebody else's."""
+    folder = _trusted()
+    if folder is None:
+        return None
+    try:
+        with open(folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | PLAINLY)) as file:
+            said = os.fstat(file.fileno())
+            if not stat.S_ISREG(said.st_mode) or said.st_size > LARGEST:
+                return None
+            if fault := _fault(said):
+                _distrusted(str(folder / f"{name}.o"), fault)
+                return None
+            whole = file.read()
+    except (OSError, ValueError):
+        return None
+    seal, found = whole[:SEAL], whole[SEAL:]
+    return found if found and seal == hashlib.sha256(found).digest() else None
+
+
+def write(name: str, code: bytes) -> None:
+    """Keep machine code under a name; nothing where there is no folder for it."""
+    folder = _trusted()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            disk.write(folder / f"{name}.o", hashlib.sha256(code).digest() + code, mode=0o600)
+            disk.sweep(folder, f"{name}.o")
+
+
+def _trusted() -> Path | None:
+    """The folder, made where there is none; None where it cannot be used, or others might write to it."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        said = os.lstat(folder)
+    except (OSError, ValueError):
+        return None
+    if stat.S_ISLNK(said.st_mode):
+        _distrusted(str(folder), "it is a link")
+    elif not stat.S_ISDIR(said.st_mode):
+        _distrusted(str(folder), "it is no folder")
+    elif fault := _fault(said):
+        _distrusted(str(folder), fault)
+    else:
+        return folder
+    return None
+
+
+def _fault(said: os.stat_result) -> str:
+    """Why what is found on disk may be somebody else's, in words; empty where it is this user's alone."""
+    if not hasattr(os, "geteuid"):
+        return ""
+    if said.st_uid != os.geteuid():
+        return "it belongs to another user"
+    return "others may write to it" if said.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+
+
+@functools.cache
+def _distrusted(path: str, fault: str) -> None:
+    """Say so once."""
+    warn(
+        f"machine code is not kept in {path}: {fault}, and it could run anything as you. It is compiled in memory; "
+        "give LIETHERMO_CACHE a folder of your own (chmod 700)",
+        CacheWarning,
+    )
