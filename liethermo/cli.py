@@ -55,6 +55,10 @@ Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="In place of what the spec says, for example run.step=0.01."),
 ]
+Allowed = Annotated[
+    list[str] | None,
+    typer.Option("--allow", metavar="MODULE", help="A module that the spec may name though it is not beside it."),
+]
 StoreFolder = Annotated[Path, typer.Argument(metavar="STORE.zarr", help="A result of `liethermo study`.")]
 SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, described in TOML.")]
 
@@ -81,12 +85,13 @@ def run(
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; by default named after the spec, here.")
     ] = None,
     change: Changes = None,
+    allow: Allowed = None,
 ) -> None:
     """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
     from .runs.integrate import integrate
     from .spec import read
 
-    plan = read(spec, change or ())
+    plan = read(spec, change or (), allow or ())
     system = plan.system()
     folder = _folder(spec, Path(spec.stem) if out is None else out)
     start, end = plan.run.t_span
@@ -124,12 +129,13 @@ def study(
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.")
     ] = None,
     change: Changes = None,
+    allow: Allowed = None,
 ) -> None:
     """Run the study of a spec file, or what of it is not done yet; audit the laws, and draw a measure."""
     from .spec import read
     from .spec.study import study_of
 
-    plan = read(spec, change or ())
+    plan = read(spec, change or (), allow or ())
     store = Path(f"{spec.stem}.zarr") if out is None else out
     found = study_of(plan, store)
     typer.echo(plan.told)
@@ -164,11 +170,11 @@ def plot(
 
 @app.command()
 @_told()
-def check(spec: SpecFile, change: Changes = None) -> None:
+def check(spec: SpecFile, change: Changes = None, allow: Allowed = None) -> None:
     """Validate a spec file and test the axioms of its system at random points, without running it."""
     from .spec import read
 
-    plan = read(spec, change or ())
+    plan = read(spec, change or (), allow or (), lambda what: typer.echo(f"{spec}: {what}"))
     if plan.study is not None:
         from .spec.study import study_of
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
 import os
 import re
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from ..systems import System
 from .checking import arguments, checked
 from .messages import given, raised, shown, suggestion
 from .schema import SECTIONS, AdaptiveStep, File, Method, Model, Outputs, Run, StudyOfFile
+from .trust import imported
 
 
 @dataclass(frozen=True)
@@ -115,12 +114,23 @@ class Spec:
         return SpecError(self.path, [f"{given('model', self.table['model'])}: {why}"])
 
 
-def read(path: str | os.PathLike, changes: Sequence[str] = ()) -> Spec:
+def read(
+    path: str | os.PathLike,
+    changes: Sequence[str] = (),
+    allow: Sequence[str] = (),
+    tell: Callable[[str], object] | None = None,
+) -> Spec:
     """Read a spec file and check everything but the system, which is left to :meth:`Spec.system`.
 
-    ``changes`` are texts "section.key=value" that take the place of what the file says, values as in TOML.
-
-    For ``function = "module:function"``, the folder of the file and the current one become importable.
+    Parameters
+    ----------
+    path : path
+    changes : sequence of str
+        Texts "section.key=value" that take the place of what the file says, values as in TOML.
+    allow : sequence of str
+        Modules that the file may name besides those beside it: see :mod:`.trust`.
+    tell : function, optional
+        Told what will be imported, before it is.
 
     Raises
     ------
@@ -138,7 +148,7 @@ def read(path: str | os.PathLike, changes: Sequence[str] = ()) -> Spec:
     needed = [name for name in SECTIONS if name != "study" or "study" in table]
     found = {name: checked(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in needed}
     model, run, method, outputs = (found[name] for name in ("model", "run", "method", "outputs"))
-    build: Any = model and _builder(model, path.resolve().parent, problems)
+    build: Any = model and _builder(model, path.resolve().parent, allow, tell, problems)
     parameters: Any = build and arguments("model.parameters", build, model.parameters, problems)
     integrator = method and _integrator(method, problems)
     if problems:
@@ -146,14 +156,41 @@ def read(path: str | os.PathLike, changes: Sequence[str] = ()) -> Spec:
     return Spec(path, table, build, parameters, integrator, run, outputs, found.get("study"))
 
 
+LARGEST = 2**20
+"""Bytes of a spec file."""
+
+DEEPEST = 100
+"""Parts of a key."""
+
+
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        with open(path, "rb") as file:
+            content = file.read(LARGEST + 1)
+        if len(content) > LARGEST:
+            raise SpecError(path, [f"it is larger than the {LARGEST // 2**20} MB that a spec file has at most"])
+        return _table(content.decode("utf-8"))
     except OSError as error:
-        raise FileError(f"cannot read the spec file {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"cannot read the spec file {path!s:.200}: {error.strerror}") from error
+    except SpecError:
+        raise
+    except ValueError as error:
+        if "\0" in str(path):
+            raise FileError(f"cannot read the spec file {str(path)!r:.200}: it is no path") from error
         raise SpecError(path, [f"it is not valid TOML: {error}"]) from error
-    return json.loads(json.dumps(table, default=str))  # dates and times, which no key takes, become text
+
+
+def _table(text: str) -> dict[str, Any]:
+    """TOML as JSON data; ValueError where it is not valid, or has parts inside parts without end."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.partition("=")[0].count(".") > DEEPEST and not line.lstrip().startswith("#"):
+            raise ValueError(f"a key of more than {DEEPEST} parts (at line {number})")
+    try:
+        return json.loads(json.dumps(tomllib.loads(text), default=str))  # dates and times, which no key takes: texts
+    except RecursionError:
+        raise ValueError("it has lists or tables inside each other, too many") from None
 
 
 def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
@@ -163,9 +200,12 @@ def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
     if not equals or not all(parts):
         problems.append(f"--set {change}: must be section.key=value, such as run.step=0.01")
         return
+    if len(parts) > DEEPEST:
+        problems.append(f"--set {change:.60}...: a key of more than {DEEPEST} parts")
+        return
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = _table(f"value = {text}")["value"]
+    except (ValueError, KeyError):
         value = text.strip()  # a text without quotes, which a shell takes away
     for part in parts[:-1]:
         table = table.setdefault(part, {})
@@ -175,39 +215,21 @@ def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
     table[parts[-1]] = value
 
 
-def _builder(model: Model, folder: Path, problems: list[str]) -> Callable[..., System] | None:
+def _builder(
+    model: Model, folder: Path, allow: Sequence[str], tell: Callable[[str], object] | None, problems: list[str]
+) -> Callable[..., System] | None:
     """The function that the section ``[model]`` names."""
     if model.name is not None and model.function is None:
         return getattr(models, model.name)
     if model.function is not None and model.name is None:
         try:
-            return _imported(model.function, folder)
+            return imported(model.function, folder, allow, tell)
         except InputError as error:
             problems.append(f"model.function = {shown(model.function)}: {error}")
             return None
     names = ", ".join(map(shown, models.__all__))
     problems.append(f'model: give either name (one of {names}) or function = "module:function", not both')
     return None
-
-
-def _imported(target: str, folder: Path) -> Callable[..., System]:
-    if not re.fullmatch(r"[\w.]+:\w+", target):
-        raise InputError('must be "module:function", such as "mysystem:build" for the function build in mysystem.py')
-    module_name, name = target.split(":")
-    for place in (str(Path.cwd()), str(folder)):
-        if place not in sys.path:
-            sys.path.insert(0, place)
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and error.name and f"{module_name}.".startswith(f"{error.name}."):
-            raise InputError(f"no module {error.name!r} in {folder}, in the current folder or installed") from error
-        raise InputError(f"importing {module_name!r} failed with {type(error).__name__}: {error}") from error
-    function = getattr(module, name, None)
-    if not callable(function):
-        own = [key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__]
-        raise InputError(f"{module.__file__} has no function {name!r}{suggestion(name, own)}")
-    return function
 
 
 def _integrator(method: Method, problems: list[str]):

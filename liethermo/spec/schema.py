@@ -16,6 +16,10 @@ FIGURES = ("momentum_sphere", "laws")
 FORMATS = ("png", "pdf", "svg")
 
 
+LONGEST = 10**7
+"""Values of an axis."""
+
+
 def one_of(options: Iterable[str]) -> BeforeValidator:
     allowed = list(options)
 
@@ -60,7 +64,8 @@ class Model(Section):
         None, description="a model of the library; `liethermo models` lists them"
     )
     function: str | None = Field(
-        None, description='in its place `"module:function"`, looked for beside the file and in the current folder'
+        None,
+        description='in its place `"module:function"`, of a module beside the file, or of one that is allowed',
     )
     parameters: dict[str, Any] = Field({}, description="the arguments of the model or the function")
 
@@ -127,7 +132,7 @@ class Points(Section):
 
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
-    points: int = Field(ge=1, description="how many")
+    points: int = Field(ge=1, le=LONGEST, description="how many")
     scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
 
 
@@ -135,8 +140,10 @@ class Sample(Section):
     """Several parameters that vary together along an axis."""
 
     zip: dict[str, list[FiniteFloat]] | None = Field(None, description="equally many values of each parameter")
-    latin_hypercube: int | None = Field(None, ge=1, description="points of a Latin hypercube, with `ranges`")
-    sobol: int | None = Field(None, ge=1, description="points of a Sobol sequence, with `ranges`")
+    latin_hypercube: int | None = Field(
+        None, ge=1, le=LONGEST, description="points of a Latin hypercube, with `ranges`"
+    )
+    sobol: int | None = Field(None, ge=1, le=LONGEST, description="points of a Sobol sequence, with `ranges`")
     ranges: dict[str, list[FiniteFloat | str]] | None = Field(
         None, description='of each parameter [low, high], or [low, high, "log"]'
     )

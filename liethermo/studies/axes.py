@@ -169,6 +169,8 @@ def _count(count) -> int:
 def _column(name: str, values) -> np.ndarray:
     """Numbers or texts, shape (m,), m > 0."""
     array = np.asarray(values)
+    if array.dtype.kind == "U" and not all(isinstance(value, str) for value in np.asarray(values, dtype=object).flat):
+        raise InputError(f"the values of {name!r} are numbers or texts, not both")
     if array.ndim != 1 or array.dtype.kind not in "fiubU" or not len(array):
         raise InputError(
             f"the values of {name!r} are a list of numbers or texts, not {array.dtype} of shape {array.shape}; "

@@ -1,0 +1,113 @@
+"""The functions that a spec file may name: those defined in a module beside it, or in one that its user allows.
+
+A spec file comes from anywhere. It cannot make a function of the standard library or of an installed package run, such
+as ``os:system`` with a command as its parameter: who writes one has to put code beside it, where its user can see it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ..errors import InputError
+from .messages import suggestion
+
+
+def imported(
+    target: str, folder: Path, allow: Sequence[str] = (), tell: Callable[[str], object] | None = None
+) -> Callable[..., Any]:
+    """The function that ``module:function`` names.
+
+    Parameters
+    ----------
+    folder : Path
+        That of the spec file.
+    allow : sequence of str
+        Names of modules that may be found elsewhere.
+    tell : function, optional
+        Told what will be imported, before it is.
+
+    Raises
+    ------
+    InputError
+        If there is no such module or function, or it is not one that may be named.
+    """
+    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", target, re.ASCII):
+        raise InputError('must be "module:function", such as "mysystem:build" for the function build in mysystem.py')
+    name, function = target.split(":")
+    beside = folder.joinpath(*name.split("."))
+    file = next((path for path in (beside.with_suffix(".py"), beside / "__init__.py") if path.is_file()), None)
+    if file is None and name not in allow:
+        raise InputError(
+            f"there is no {name.replace('.', '/')}.py beside the spec file, and what is elsewhere is imported only if "
+            f"you allow it by name: --allow {name}"
+        )
+    if tell is not None:
+        tell(f"imports {name}{'' if file is None else f' from {file}'}")
+    try:
+        module = _found(name, folder) if file is None else _loaded(name, file, folder)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"importing {name!r} failed with {type(error).__name__}: {error}") from error
+    own = [key for key, value in vars(module).items() if _is_own(value, module)]
+    if function not in own:
+        where = "is only imported there" if hasattr(module, function) else "is not there"
+        raise InputError(f"{name} defines no function {function!r}: it {where}{suggestion(function, own)}")
+    return getattr(module, function)
+
+
+def _is_own(value: Any, module: ModuleType) -> bool:
+    """Whether a module defines a function, and has it not from elsewhere."""
+    return (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == module.__name__
+
+
+def _found(name: str, folder: Path) -> ModuleType:
+    with _importable(Path.cwd(), folder):
+        return importlib.import_module(name)
+
+
+def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
+    """The module in a file, which is no other than that of this name."""
+    known = sys.modules.get(name)
+    if known is not None and getattr(known, "__file__", None) == str(file):
+        return known
+    if known is not None and name not in _ours:
+        raise InputError(f"there is another module {name!r}: call {file.name} something else")
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with _importable(folder):
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    _ours.add(name)
+    return module
+
+
+_ours: set[str] = set()
+"""Names of the modules that were beside spec files."""
+
+
+@contextlib.contextmanager
+def _importable(*folders: Path) -> Iterator[None]:
+    """For the time of an import, and behind all that is installed: a file beside a spec shadows nothing."""
+    before = list(sys.path)
+    sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path[:] = before
