@@ -6,7 +6,7 @@ round them away.
 
 import importlib
 
-from . import _precision, testing  # noqa: F401
+from . import _fork, _precision, testing  # noqa: F401
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
@@ -20,11 +20,13 @@ from .errors import (
     ClosureError,
     ComponentError,
     DomainError,
+    ForkError,
     JacobiError,
     LieAlgebraError,
     ManifoldsError,
     OffManifoldError,
     ParameterError,
+    PrecisionError,
     RepresentationError,
     ShapeError,
     SizeError,
@@ -95,6 +97,7 @@ __all__ = [
     "Euclidean",
     "EuclideanRetraction",
     "ExtendedPhaseSpace",
+    "ForkError",
     "GeomstatsSpace",
     "GroupRetraction",
     "GroupSpace",
@@ -120,6 +123,7 @@ __all__ = [
     "PoissonTensor",
     "Polynomial",
     "Power",
+    "PrecisionError",
     "Product",
     "ProjectionRetraction",
     "RepresentationError",

@@ -22,6 +22,14 @@ class ParameterError(ManifoldsError, ValueError):
     """A catalogue entry asked for with a parameter outside its range."""
 
 
+class ForkError(ManifoldsError, RuntimeError):
+    """A process that was forked after JAX had run is to compile a program, which it cannot."""
+
+
+class PrecisionError(ManifoldsError, RuntimeError):
+    """JAX has been set to single precision, in which no law holds to rounding."""
+
+
 class SizeError(ParameterError):
     """Something that would not fit into the memory of this machine, refused before it is tried."""
 

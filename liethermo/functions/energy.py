@@ -19,6 +19,7 @@ import scipy
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 from manifolds._module import Module
+from manifolds._precision import by_own_settings
 
 from ..errors import FunctionError, InputError
 from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
@@ -128,6 +129,7 @@ class Energy(Module):
         """The same as a function of the state with the time behind it, shape (n + 1,): of one that depends on both."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
+    @by_own_settings
     def __call__(self, x, t=None) -> jax.Array:
         x = jnp.asarray(x, dtype=jnp.float64)
         if t is None:

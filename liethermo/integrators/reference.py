@@ -38,25 +38,34 @@ class Reference:
         if self.scheme not in ("DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"):
             raise InputError(f"no SciPy scheme {self.scheme!r}; take DOP853, RK45, RK23, Radau, BDF or LSODA")
 
-    def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str]:
-        """States at the times reached, shape (reached, n), the number of field evaluations, a message on failure."""
-        from scipy.integrate import solve_ivp
+    def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
+        """States at the times reached, shape (reached, n), the number of field evaluations, a message on failure.
 
-        atol = self.rtol * 1e-2 if self.atol is None else self.atol
-        result = solve_ivp(
-            lambda _, x: np.asarray(_field(system, x)),
-            (times[0], times[-1]),
-            x0,
-            method=self.scheme,
-            t_eval=times,
-            rtol=max(self.rtol, 3e-14),
-            atol=atol,
-        )
-        states = result.y.T
+        And whether the user has stopped it.
+        """
+        import scipy.integrate
+
+        rtol, atol = max(self.rtol, 3e-14), self.rtol * 1e-2 if self.atol is None else self.atol
+        solver, sign = getattr(scipy.integrate, self.scheme), 1.0 if times[-1] >= times[0] else -1.0
+        found, message, interrupted = [np.asarray(x0)[None]], "", False
+        reached = 1
+        try:
+            run = solver(
+                lambda _, x: np.asarray(_field(system, x)), times[0], np.asarray(x0), times[-1], rtol=rtol, atol=atol
+            )
+            while run.status == "running" and reached < len(times):
+                message = run.step() or ""
+                last = int(np.searchsorted(sign * times, sign * run.t, side="right"))
+                if run.status != "failed" and last > reached:
+                    found.append(run.dense_output()(times[reached:last]).T)
+                    reached = last
+        except KeyboardInterrupt:
+            interrupted = True
+        states = np.concatenate(found)
         finite = np.isfinite(states).all(axis=1)
-        reached = len(states) if finite.all() else int(finite.argmin())
-        message = "" if result.success and reached == len(times) else (result.message if not result.success else "NaN")
-        return states[:reached], int(result.nfev), message
+        if not finite.all():
+            states, message = states[: int(finite.argmin())], message or "NaN"
+        return states, int(run.nfev), message, interrupted
 
     def __str__(self) -> str:
         return f"Reference(rtol={self.rtol:g}, scheme={self.scheme})"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from manifolds._precision import by_own_settings
 from manifolds._tables import html_grid
 
 from ..engines.codes import TEXTS, Code
@@ -273,6 +274,7 @@ class Ensemble(Saved):
         drift = f"largest relative energy drift {np.max(self.energy_drift, initial=0.0):.1e}"
         return html_grid((f"{len(self)} trajectories to t = {self.t[-1]:g}", ""), counts, drift)
 
+    @by_own_settings
     def audit(
         self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
     ) -> Audit:

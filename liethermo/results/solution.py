@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from manifolds._precision import by_own_settings
 from manifolds._tables import html_grid
 
 from ..errors import InputError
@@ -73,6 +74,7 @@ class Solution(Saved):
     def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
         return {**vars(self), "evidence": self.evidence, "witness": None}
 
+    @by_own_settings
     def __call__(self, t) -> np.ndarray:
         """States at any times, shape (..., n): each is where a step ends that begins at the last state before.
 
@@ -93,6 +95,7 @@ class Solution(Saved):
         """The energy less the work done from outside, shape (times,): what the first law keeps of a driven system."""
         return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
+    @by_own_settings
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held and the steps resolve the motion, as a table.
 

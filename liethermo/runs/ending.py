@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -124,11 +125,24 @@ def about_many(x: np.ndarray, x0: np.ndarray, speed: np.ndarray, elapsed: float,
     return ""
 
 
-def status_of(engine: Chosen, state, now: float, h: float, interrupted: bool) -> Status:
+STOPPED = (KeyboardInterrupt, MemoryError, jax.errors.JaxRuntimeError)
+"""What stops a run without a fault of the system: what there is so far is kept."""
+
+
+def stopped_by(error: BaseException) -> str:
+    """What stopped a run, in words; raised again where it is something else."""
+    if isinstance(error, KeyboardInterrupt):
+        return "by the user"
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return "as there is no memory left (save_every keeps fewer states)"
+    raise error
+
+
+def status_of(engine: Chosen, state, now: float, h: float, stopped: str) -> Status:
     """How fixed steps of size h ended, or a step that could not be taken."""
     code, step, residual = int(state.status), int(state.step), float(state.residual)
-    if interrupted:
-        return Status(Code.INTERRUPTED, f"stopped by the user after step {step}, t = {now:g}", step, now)
+    if stopped:
+        return Status(Code.INTERRUPTED, f"stopped {stopped} after step {step}, t = {now:g}", step, now)
     if code == Code.COMPLETED:
         return Status(Code.COMPLETED, f"reached t = {now:g} in {step} steps", step, now, residual)
     where = f"step {step + 1}, from t = {now:g} with h = {h:g}"

@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from manifolds._precision import by_own_settings
+
 from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
@@ -33,6 +35,7 @@ FOLLOWED = 256
 """Steps that an audit takes again of a trajectory by the array engine, whose steps are slow."""
 
 
+@by_own_settings
 def ensemble(
     system: System | Callable[[Any], System] | Family,
     x0s,

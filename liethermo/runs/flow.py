@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._precision import by_own_settings
+
 from ..engines import implicit
 from ..engines.stages import explicit, newton_steps, noise_of, scale_of, solve_stages
 from ..engines.stepping import finish, holds_energy, shifted, steering
@@ -17,6 +19,7 @@ from ..tracing.programs import program
 from .timetable import Timetable
 
 
+@by_own_settings
 def flow(
     system: System,
     x0,

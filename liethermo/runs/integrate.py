@@ -9,6 +9,8 @@ from typing import Literal
 import jax
 import numpy as np
 
+from manifolds._precision import by_own_settings
+
 from ..engines.codes import Code
 from ..errors import ConvergenceError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
@@ -26,6 +28,7 @@ from .watch import Watch
 UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
 
 
+@by_own_settings
 def integrate(
     system: System,
     x0,

@@ -17,7 +17,7 @@ from ..results.solution import Solution
 from ..results.status import Stats, Status
 from ..tracing.interpret import at_points
 from .adaptive import Adaptive
-from .ending import given_up, stats_of, status_of
+from .ending import STOPPED, given_up, stats_of, status_of, stopped_by
 from .events import Event
 from .fluctuations import Fluctuations, Path
 from .presented import Again, presented, provenance_of
@@ -62,7 +62,7 @@ class Run:
 
     def by_steps(self, bar) -> None:
         """Drive the engine call by call, to the end, a failure or Ctrl-C."""
-        state, interrupted = None, False
+        state, stopped = None, ""
         try:
             state = self.engine.begin(self.states[0][0])
             self.values = [np.array([[float(state.energy), float(state.entropy)]])]
@@ -72,15 +72,15 @@ class Run:
                 if int(state.status) != Code.COMPLETED:
                     break
                 self._checkpoint(state)
-        except KeyboardInterrupt:
-            interrupted = True
+        except STOPPED as error:
+            stopped = stopped_by(error)
         if state is None:
             self.values = [self._energies(self.states[0])]
-            self.status = Status(Code.INTERRUPTED, "stopped by the user before the first step", 0, self.table.start)
+            self.status = Status(Code.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.table.start)
             return
         step = int(state.step)
         now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
-        self.stats, self.status = stats_of(state), status_of(self.engine, state, now, h, interrupted)
+        self.stats, self.status = stats_of(state), status_of(self.engine, state, now, h, stopped)
 
     def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
         """Look at every step: adaptive ones, events, outputs at given times, dense output."""
@@ -105,9 +105,9 @@ class Run:
         state = None
         try:
             state = self.engine.begin(self.states[0][0])
-        except KeyboardInterrupt:
+        except STOPPED as error:
             self.values = [self._energies(self.states[0])]
-            self.status = Status(Code.INTERRUPTED, "stopped by the user before the first step", 0, start)
+            self.status = Status(Code.INTERRUPTED, f"stopped {stopped_by(error)} before the first step", 0, start)
             return
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
         numbers = self.system.dim * ((1 if save_at is None else 0) / every + (1 if dense else 0))
@@ -141,7 +141,7 @@ class Run:
             self.status = Status(Code.EVENT, text, steps, now, float(state.residual))
         else:
             h = step if isinstance(step, float) else float("nan")
-            self.status = status_of(self.engine, state, now, h, outcome.interrupted)
+            self.status = status_of(self.engine, state, now, h, outcome.stopped)
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 if outcome.jumps:
@@ -150,9 +150,11 @@ class Run:
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:
-        self.times.append(steps.t[1:][kept])
-        self.states.append(steps.x[kept])
-        self.values.append(np.column_stack([steps.energy, steps.entropy])[kept])
+        values = np.column_stack([steps.energy, steps.entropy])[kept]
+        times, states = steps.t[1:][kept], steps.x[kept]  # before any is kept: there may be no memory left
+        self.times.append(times)
+        self.states.append(states)
+        self.values.append(values)
 
     def _advance(self, state, h, saves, every):
         before = int(state.step)
@@ -174,17 +176,16 @@ class Run:
         """One call of the reference solver, its output at the times a fixed step would have."""
         times = self.table.times
         self.values = [self._energies(self.states[0])]
-        try:
-            x, evaluations, message = self.method.trajectory(self.system, self.states[0][0], times)
-        except KeyboardInterrupt:
-            self.status = Status(Code.INTERRUPTED, "stopped by the user before SciPy returned anything", 0, times[0])
-            return
+        x, evaluations, message, interrupted = self.method.trajectory(self.system, self.states[0][0], times)
         self.times, self.states = [times[: len(x)]], [x]
         self.values = [self._energies(x)]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
         now = self.now
         bar.update(now)
-        if message:
+        if interrupted:
+            text = f"stopped by the user after t = {now:g}"
+            self.status = Status(Code.INTERRUPTED, text, len(x) - 1, now)
+        elif message:
             text = f"SciPy's {self.method.scheme} stopped after t = {now:g}: {message}"
             self.status = Status(Code.REFERENCE_FAILED, text, len(x) - 1, now)
         else:

@@ -19,6 +19,7 @@ from ..engines.pacing import FINISHED, TOLD
 from ..engines.stepping import State
 from ..errors import InputError
 from .adaptive import Adaptive, pacing_of
+from .ending import STOPPED, stopped_by
 from .events import Event
 from .timetable import Timetable
 from .watch import Watch
@@ -38,7 +39,7 @@ class Outcome:
     rejected: int = 0
     event_time: float | None = None
     underflow: float | None = None
-    interrupted: bool = False
+    stopped: str = ""
     jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
     limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
 
@@ -104,8 +105,8 @@ def run(
             _paced(engine, outcome, span, step, stops, event, keep, most_kept, watch)
         else:
             _fixed(engine, outcome, span, step, stops, keep)
-    except KeyboardInterrupt:
-        outcome.interrupted = True
+    except STOPPED as error:
+        outcome.stopped = stopped_by(error)
     return outcome
 
 

@@ -9,6 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from manifolds._precision import by_own_settings
+
 from ..engines.choice import Chosen
 from ..engines.pacing import DEADBAND, rate_of
 from ..errors import InputError, LiethermoError
@@ -18,6 +20,7 @@ from .adaptive import Adaptive
 from .stepwise import Outcome, Steps, run
 
 
+@by_own_settings
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
     """A step size for fixed steps as accurate as those of ``lt.Adaptive(rtol)``, near x0.
 
@@ -93,6 +96,7 @@ class MethodSuggestion:
 CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), MetriplecticTaylor(), *map(MetriplecticGauss, (1, 2, 3, 4)))
 
 
+@by_own_settings
 def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
     """The method, of those that hold both laws, that reaches an accuracy with least work near x0.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from manifolds._precision import by_own_settings
 from manifolds.errors import warn
 
 from ..engines.codes import Code
@@ -98,6 +99,7 @@ class Study:
         If an argument cannot be used.
     """
 
+    @by_own_settings
     def __init__(
         self,
         build: System | Callable[[dict], System],
@@ -175,6 +177,7 @@ class Study:
 
     # -- running --------------------------------------------------------------------------------------------------
 
+    @by_own_settings
     def run(self, client: object = None, *, progress: bool | None = None) -> StudyStatus:
         """Do what is not done, and keep it: nothing is done twice.
 

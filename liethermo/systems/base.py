@@ -14,6 +14,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
+from manifolds._precision import by_own_settings
 
 from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
@@ -83,6 +84,7 @@ class System(Kind):
         The state space, where it is not R^n.
     """
 
+    @by_own_settings
     def _build(
         self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
     ) -> None:
@@ -157,6 +159,7 @@ class System(Kind):
         terms = tuple(OfFirst(term, self.body_dim) for term in energy.terms)
         return terms[0] if len(terms) == 1 else Sum(terms)
 
+    @by_own_settings
     def temperatures(self, x) -> jax.Array:
         """The temperatures of the baths: states of shape (..., n) give (..., number of baths)."""
         if self.baths is None:
@@ -199,6 +202,7 @@ class System(Kind):
 
         return self.evaluated(fall, x, t, "()")
 
+    @by_own_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
         """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
 
@@ -250,6 +254,7 @@ class System(Kind):
         """The system whose energy is for ever what it is at a time; itself where that does not depend on time."""
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
+    @by_own_settings
     def evaluated(self, function: Callable, x, t, result: str) -> jax.Array:
         """``function(system, x)`` for each state of a batch, the system as it is at the time t, or at each of several.
 
@@ -338,6 +343,7 @@ class System(Kind):
             names.append(same or (given if usable else fallback))
         return tuple(names[len(known) :])
 
+    @by_own_settings
     def first_integrals(self) -> frozenset[str]:
         """The names of those of :meth:`functions` that the system conserves.
 
@@ -348,6 +354,7 @@ class System(Kind):
         """
         return self._found().constant
 
+    @by_own_settings
     def undecided(self) -> frozenset[str]:
         """The names of those of :meth:`functions` of which it is not found out whether the system conserves them.
 
@@ -495,6 +502,7 @@ class System(Kind):
         zeros = np.zeros((*vectors.shape[:-1], self.dim - body.dim))
         return (jnp if isinstance(x, jax.Array) else np).concatenate([vectors, zeros], axis=-1)
 
+    @by_own_settings
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
 

@@ -8,6 +8,7 @@ operations. Tracers that a function closes over are leaves too, where they can b
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -20,6 +21,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from manifolds._module import Module
+from manifolds._precision import users_settings
 
 from ..errors import FunctionError
 from .keys import key
@@ -157,7 +159,9 @@ def _forwards(function: Callable) -> Callable:
 
 def traced(function: Callable, *arguments) -> Traced:
     """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
-    closed, found = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    ours = _module(function).split(".")[0] in ("liethermo", "manifolds")
+    with contextlib.nullcontext() if ours else users_settings():
+        closed, found = jax.make_jaxpr(function, return_shape=True)(*arguments)
     lifting = Lifting()
     jaxpr, constants, numbers = lifting.whole(closed)
     structure = jax.tree_util.tree_structure(found)
@@ -168,6 +172,11 @@ def traced(function: Callable, *arguments) -> Traced:
         if content is None:
             content = _contents[found_by] = Content(ClosedJaxpr(jaxpr, constants), structure, avals, lifting.loops)
     return Traced(numbers, content, _Label(getattr(function, "__name__", type(function).__name__)))
+
+
+def _module(function: Callable) -> str:
+    """Where a function, or the class of one, is defined."""
+    return getattr(function, "__module__", None) or type(function).__module__
 
 
 def is_plain(leaf) -> bool:

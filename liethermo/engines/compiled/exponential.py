@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 from llvmlite import ir
-
-if TYPE_CHECKING:
-    from .writer import Writer
 
 INSIDE = 700.0
 """Arguments below this size have a result that is no subnormal number; of others the C library is asked."""
@@ -26,8 +23,13 @@ TERMS = 13
 """Power up to which the series of a remainder below log(2) / 2 is summed: what is left out is 4e-18."""
 
 
-def exponential(writer: Writer, x: ir.Value) -> ir.Value:
-    """``exp(x)``, to one unit in the last place: ``2^k exp(r)`` with ``x = k log 2 + r`` and ``|r| <= log(2) / 2``."""
+def exponential(writer: Any, x: ir.Value) -> ir.Value:
+    """``exp(x)``, to one unit in the last place: ``2^k exp(r)`` with ``x = k log 2 + r`` and ``|r| <= log(2) / 2``.
+
+    Parameters
+    ----------
+    writer : Writer
+    """
     build = writer.builder
     usual = build.fcmp_ordered("<", writer.operation("abs", [x]), writer.constant(INSIDE))
     found = _inside(writer, x)
@@ -41,7 +43,7 @@ def exponential(writer: Writer, x: ir.Value) -> ir.Value:
     return result
 
 
-def _inside(writer: Writer, x: ir.Value) -> ir.Value:
+def _inside(writer: Any, x: ir.Value) -> ir.Value:
     build = writer.builder
 
     def fused(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:

@@ -1,0 +1,129 @@
+"""What stops a run from outside: what there is so far is kept, and the status says why it ended."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines.choice import Chosen
+from liethermo.integrators import reference
+
+BODY, X0 = lt.models.rigid_body(), np.array([0.1, 1.0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (KeyboardInterrupt(), "by the user"),
+        (MemoryError(), "no memory left"),
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory"), "no memory left"),
+    ],
+)
+def test_fixed_steps(monkeypatch, error, why):
+    advance, calls = Chosen.advance, []
+
+    def stopped(self, *arguments):
+        calls.append(1)
+        if len(calls) == 3:
+            raise error
+        return advance(self, *arguments)
+
+    monkeypatch.setattr(Chosen, "advance", stopped)
+    monkeypatch.setattr(Chosen, "portion", property(lambda self: 10))
+    whole = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
+    assert whole.status.code == "interrupted"
+    assert why in whole.status.message
+    assert len(whole.t) == len(whole.x) == len(whole.energy) == 21
+    monkeypatch.undo()
+    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole.x)
+
+
+def test_adaptive_steps(monkeypatch):
+    from liethermo.runs.run import Run
+
+    append, calls = Run._append, []
+
+    def stopped(self, *arguments):
+        calls.append(1)
+        if len(calls) == 2:
+            raise MemoryError
+        return append(self, *arguments)
+
+    monkeypatch.setattr(Run, "_append", stopped)
+    found = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
+    assert "no memory left" in found.status.message
+    assert 1 < len(found.t) == len(found.x) == len(found.energy)
+
+
+def test_another_error_is_not_hidden(monkeypatch):
+    def broken(self, *arguments):
+        raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+    monkeypatch.setattr(Chosen, "advance", broken)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
+        lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
+
+
+def test_the_reference_solver(monkeypatch):
+    field, calls = reference._field, []
+
+    def stopped(*arguments):
+        calls.append(1)
+        if len(calls) == 200:
+            raise KeyboardInterrupt
+        return field(*arguments)
+
+    monkeypatch.setattr(reference, "_field", stopped)
+    found = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert found.status.code == "interrupted"
+    assert "stopped by the user after t =" in found.status.message
+    assert 2 < len(found.t) == len(found.x) < 501
+    monkeypatch.undo()
+    whole = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert np.array_equal(whole.x[: len(found.x)], found.x)
+
+
+# -- processes that are forked ----------------------------------------------------------------------------------------
+
+
+FORKED = """
+import multiprocessing, os, signal, sys
+import liethermo as lt
+body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
+lt.integrate(body, x0, (0.0, 1.0), 0.1)
+child = os.fork()
+if child == 0:
+    signal.alarm(60)
+    lt.integrate(body, x0, (0.0, 2.0), 0.1)  # a program that there is
+    try:
+        lt.integrate(body, x0, (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).audit()
+    except RuntimeError as error:
+        print(type(error).__name__, error)
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_process_does_not_wait_for_ever():
+    run = [sys.executable, "-W", "ignore", "-c", FORKED]
+    done = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("ForkError this process was forked after JAX had run")
+    assert 'get_context("spawn")' in done.stdout
+    assert issubclass(mf.ForkError, RuntimeError)
+
+
+def _of_child(rate: float) -> float:
+    return float(lt.integrate(lt.models.rigid_body(rate=rate), X0, (0.0, 1.0), 0.1).entropy[-1])
+
+
+def test_processes_of_their_own_are_no_fork():
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(_of_child, [0.5]) == [_of_child(0.5)]
