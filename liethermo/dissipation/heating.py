@@ -138,7 +138,7 @@ class BesideBaths(Carried):
 def heated(
     dissipation: Dissipation | None, body: Geometry, number: int, pulled: Callable[[Energy], Energy]
 ) -> Dissipation | None:
-    """The dissipation of a body, beside a number of baths that take its heat.
+    """The dissipation of a body, beside baths that take its heat.
 
     Raises
     ------

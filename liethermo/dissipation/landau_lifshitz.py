@@ -86,7 +86,10 @@ class LandauLifshitz(Dissipation):
         return system.poisson.joined(force, jnp.zeros(0))
 
     def damped(self, spins: Spins, x, dH, sign=1.0, by_site: bool = False) -> tuple[Planes, jax.Array]:
-        """The components of the force, times a sign; and how fast the energy falls by it, in all or at each site."""
+        """The components of the force on ``spins``, times a sign, and how fast the energy falls by it.
+
+        The energy of all sites together, or with ``by_site`` at each.
+        """
         s, rate = spins.spins(x), sign * self.rate.reshape(-1)
         torque = cross_planes(s, spins.covectors(dH))
         if rate.size == 1 and not by_site:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
@@ -82,6 +83,10 @@ class Evidence:
     error_time: float | None = None
     looked: int | None = None
     inconsistency: float | None = None
+
+    def __post_init__(self):
+        if (self.local_error is None) != (self.error_time is None):
+            raise InputError("the largest local error of a step is known with its time, or not at all")
 
 
 class Replay(Protocol):

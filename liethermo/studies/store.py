@@ -31,7 +31,7 @@ from .solve import GOOD, MISSING, STATUSES, SUMMARY
 FORMAT = "liethermo-study-1"
 
 MOST_CHUNKS = 10**7
-"""Of a store: each is a file in each array."""
+"""The most that a store has: each is a file in each array."""
 
 
 @dataclass(frozen=True)
@@ -401,7 +401,7 @@ class Store:
 
 
 def _digest(axes: Axes) -> str:
-    """Of the coordinates, in their order."""
+    """A checksum of the coordinates, which their order belongs to."""
     found = hashlib.sha256()
     for array, values in _coordinates(axes, {}):
         found.update(json.dumps([array.name, values.shape, values.tolist()]).encode())

@@ -93,6 +93,7 @@ class SpinSystem(System):
         return spins.joined(added(spins.turned(x, dH), damped), warmed)
 
     def at_sites(self, values, v) -> jax.Array:
+        """A vector v times ``values``: a number for each site, or one."""
         spins = self._spins
         assert spins is not None
         return spins.joined(scaled(values, spins.covectors(v)), jnp.zeros(0)) if jnp.ndim(values) else values * v

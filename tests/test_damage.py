@@ -1,0 +1,180 @@
+"""Files that chance has damaged: whatever is read is what was written, or an error of the library, and soon."""
+
+import json
+import os
+import shutil
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import liethermo as lt
+from liethermo.spec import read
+from liethermo.spec.study import study_of
+from liethermo.studies.stored import audit, status
+from tests.liethermo.results.test_files import rewritten
+
+REFUSED = (lt.LiethermoError, lt.FileError)
+SOON = 20.0
+"""Seconds that none may take; a hundredth of it is usual."""
+
+BODY, X0 = lt.models.rigid_body, np.array([0.1, 1.0, 0.1])
+sizes = pytest.mark.parametrize("count", [60, pytest.param(6000, marks=pytest.mark.slow)])
+
+
+def damaged(content: bytes, random: np.random.Generator) -> bytes:
+    """A file with a part changed, lost, moved or added."""
+    where, length = int(random.integers(len(content))), int(random.integers(1, 64))
+    rest = content[where + length :]
+    match int(random.integers(6)):
+        case 0:
+            return content[:where] + bytes([content[where] ^ (1 << int(random.integers(8)))]) + content[where + 1 :]
+        case 1:
+            return content[:where]
+        case 2:
+            return content[:where] + random.bytes(length) + rest
+        case 3:
+            return content[:where] + rest
+        case 4:
+            return content[:where] + random.bytes(length) + content[where:]
+        case _:
+            return content[:where] + bytes(len(content[where : where + length])) + rest
+
+
+@pytest.mark.parametrize("kind", ["solution", "ensemble"])
+@sizes
+def test_results(tmp_path, kind, count):
+    if kind == "solution":
+        whole = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1)
+    else:
+        whole = lt.ensemble(BODY(), [X0, 2 * X0], (0.0, 1.0), 0.1, outputs="trajectory")
+    content = whole.save(tmp_path / "whole.nc").read_bytes()
+    random, path, refused = np.random.default_rng(1), tmp_path / "damaged.nc", 0
+    for _ in range(count // 2):
+        path.write_bytes(damaged(content, random))
+        start = time.perf_counter()
+        try:
+            found = lt.load(path)
+            assert np.array_equal(found.x, whole.x)
+            assert np.array_equal(found.energy, whole.energy)
+        except lt.FileError:
+            refused += 1
+        assert time.perf_counter() - start < SOON
+    assert refused > 0.7 * (count // 2)  # some changes are none
+
+
+WORDS = [None, True, 5, -1, 1e999, "", "x", [], {}, [[]], "[" * 5000, {"a": {"b": []}}, 10**400]
+
+
+@sizes
+def test_what_is_said_in_results(tmp_path, count):
+    """Files that are whole, with their checksums right, of which somebody has changed what they say."""
+    solution, random = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1), np.random.default_rng(2)
+    whole = solution.save(tmp_path / "whole.nc")
+    said = ("status", "stats", "laws", "provenance", "evidence", "event_time", "times")
+    for _ in range(count // 10):
+        path, name = Path(shutil.copy(whole, tmp_path / "changed.nc")), said[random.integers(len(said))]
+        word = WORDS[random.integers(len(WORDS))]
+
+        def change(file, name=name, word=word):
+            given = json.loads(str(file.attrs[name]))
+            if isinstance(given, dict) and given and random.random() < 0.8:
+                given[list(given)[random.integers(len(given))]] = word
+                word = given
+            file.attrs[name] = json.dumps(word)
+
+        try:
+            found = lt.load(rewritten(path, change))
+            assert np.array_equal(found.x, solution.x)
+            str(found.audit())
+        except lt.FileError:
+            pass
+
+
+@sizes
+def test_stores(tmp_path, count):
+    store = tmp_path / "store.zarr"
+    study = lt.Study(
+        lambda p: BODY(rate=p["rate"]),
+        {"rate": [0.5, 1.0, 2.0, 4.0]},
+        x0=X0,
+        t_span=(0.0, 1.0),
+        step=0.1,
+        measure={"tau": "relaxation_time"},
+        store=store,
+        chunk=2,
+    )
+    study.run()
+    points, judged = status(store).points, audit(store).passed
+    files = sorted(path for path in store.rglob("*") if path.is_file() and path.name != ".lock")
+    random, told = np.random.default_rng(3), []
+    for _ in range(count // 4):
+        path = files[random.integers(len(files))]
+        content = path.read_bytes()
+        path.write_bytes(damaged(content, random))
+        start = time.perf_counter()
+        try:
+            found = status(store)
+            assert found.points == points
+            assert audit(store).passed == judged or found.done < points
+        except lt.FileError as error:
+            told.append(str(error))
+        assert time.perf_counter() - start < SOON
+        path.write_bytes(content)
+    assert status(store).complete
+    assert told
+    assert not any("\n" in text for text in told)
+
+
+SPEC = Path(__file__).parent.parent / "examples" / "relaxed_rigid_body.toml"
+TOKENS = [
+    "[",
+    "]",
+    "{",
+    "}",
+    '"',
+    "=",
+    ".",
+    ",",
+    "\n",
+    "nan",
+    "inf",
+    "-",
+    "1e999",
+    "true",
+    "''",
+    "os:system",
+    "0x",
+    "\0",
+    "é",
+]
+
+
+@sizes
+def test_specs(tmp_path, count, monkeypatch):
+    text = (
+        SPEC.read_text() + '\n[study.axes]\nrate = [0.5, 1.0]\n"initial[0]" = {first = 0.1, last = 0.2, points = 3}\n'
+    )
+    random, path, told = np.random.default_rng(4), tmp_path / "spec.toml", []
+    monkeypatch.setattr(os, "system", lambda command: pytest.fail(f"it ran {command}"))
+    path.write_text(text)
+    study_of(read(path), tmp_path / "unused.zarr")
+    for _ in range(count // 2):
+        where, length = int(random.integers(len(text))), int(random.integers(0, 12))
+        token = TOKENS[random.integers(len(TOKENS))]
+        path.write_text(text[:where] + token + text[where + length :])
+        start = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                plan = read(path)
+                plan.system()
+                if plan.study is not None:
+                    study_of(plan, tmp_path / "unused.zarr")
+            except REFUSED as error:
+                told.append(str(error))
+        assert time.perf_counter() - start < SOON
+    assert told
+    assert max(map(len, told)) < 20_000
