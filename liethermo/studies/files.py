@@ -199,17 +199,18 @@ def _plainly(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
 
 
-def check_links(root: Path) -> None:
-    """Raise FileError where a store has a link in it: it might lead anywhere."""
+def check_plain(root: Path) -> None:
+    """Raise FileError unless all in a store are files and folders: a link leads anywhere, and a pipe keeps waiting."""
     folders = [os.fspath(root)]
     while folders:
         try:
             with os.scandir(folders.pop()) as entries:
                 for entry in entries:
-                    if entry.is_symlink():
-                        raise FileError(f"{entry.path} is a link, and nothing in the store of a study is")
                     if entry.is_dir(follow_symlinks=False):
                         folders.append(entry.path)
+                    elif not entry.is_file(follow_symlinks=False):
+                        kind = "a link" if entry.is_symlink() else "no file"
+                        raise FileError(f"{entry.path} is {kind}, and all in the store of a study are plain files")
         except FileError:
             raise
         except OSError as error:
@@ -293,7 +294,7 @@ def running(root: Path) -> dict[str, Any] | None:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                with contextlib.suppress(ValueError):
+                with contextlib.suppress(ValueError, TypeError, RecursionError):
                     return dict(json.loads(file.read()))
                 return {}
     except OSError:

@@ -150,6 +150,10 @@ def spread(task: Task, store: Store, axes: Axes, survey: Survey, bar: Bar, clien
         for future in running:
             try:
                 points, seconds = future.result()
+            except ImportError as error:
+                raise LiethermoError(
+                    f"a worker cannot import what builds the systems ({error}): install it where the workers run"
+                ) from error
             except KilledWorker as error:
                 raise LiethermoError(
                     f"the workers that took the same {chunks[future.key]} chunks died, one after another: they may "

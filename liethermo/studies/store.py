@@ -22,16 +22,15 @@ import numpy as np
 
 from .. import disk
 from ..errors import FileError, InputError
-from ..results.status import Laws
 from . import files
-from .axes import MOST, Axes, Axis, is_name
+from .axes import Axes, Axis
+from .checked import MOST_CHUNKS, arrays_of, sealed
 from .files import Array
 from .solve import GOOD, MISSING, STATUSES, SUMMARY
 
 FORMAT = "liethermo-study-1"
 
-MOST_CHUNKS = 10**7
-"""The most that a store has: each is a file in each array."""
+AGAIN = "Run the study again: what is damaged is done again"
 
 
 @dataclass(frozen=True)
@@ -115,13 +114,12 @@ class Store:
         try:
             part.mkdir(parents=True)
             made = replace(store, root=part)
-            made._write_chunk("quantity", (0,), np.array(SUMMARY, dtype=object))
             made._describe(axes)
             os.rename(part, root)
         except OSError as error:
             shutil.rmtree(part, ignore_errors=True)
-            if isinstance(error, FileError):
-                raise
+            if isinstance(error.__cause__, OSError):  # of a file in it
+                error = error.__cause__
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another run was faster
                 return cls.open(root)
             raise FileError(f"cannot make the store {root}: {disk.why(error)}") from error
@@ -145,46 +143,11 @@ class Store:
         except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
             raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
         try:
-            listed = content["consolidated_metadata"]["metadata"]
-            store = cls(root, {name: Array.of(name, said) for name, said in listed.items()}, content["attributes"])
-            store._check()
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            store = cls(root, *arrays_of(root, content))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise FileError(f"{root} is the store of a study, but damaged or changed: {error}") from error
-        files.check_links(root)
+        files.check_plain(root)
         return store
-
-    def _check(self) -> None:
-        """Raise ValueError, KeyError or TypeError unless it has the arrays that a study writes, and no others."""
-        study, measures, axes = self.study, self.attributes["measures"], self.attributes["axes"]
-        if not (isinstance(study, dict) and isinstance(measures, list) and list(study["measures"]) == measures):
-            raise ValueError("its measures are not those of its study")
-        Laws.of(self.attributes["laws"])
-        columns = [name for axis in axes.values() for name in axis]
-        for name in (*measures, *axes, *columns):
-            if not is_name(name):
-                raise ValueError(f"nothing in it can be called {name!r:.120}")
-        states = {f"{name}_state" for name in axes} & set(self.arrays)
-        expected = {*measures, *axes, *columns, *states, "status", "message", "laws", "quantity"}
-        if set(self.arrays) != expected:
-            raise ValueError(f"it has the arrays {sorted(self.arrays)}, and should have {sorted(expected)}")
-        shape, chunks = self.shape, self.arrays["status"].chunks
-        if len(shape) != len(axes) or math.prod(shape) > MOST or math.prod(self.grid) > MOST_CHUNKS:
-            raise ValueError(f"no study has points in shape {shape} and chunks {chunks}")
-        for name in self.chunked:
-            array = self.arrays[name]
-            if array.shape[: len(shape)] != shape or array.chunks != chunks + array.shape[len(shape) :]:
-                raise ValueError(f"{name!r} has shape {array.shape} in chunks {array.chunks}")
-        for (name, along), length in zip(axes.items(), shape, strict=True):
-            for own in (name, *along, *({f"{name}_state"} & states)):
-                if self.arrays[own].shape[:1] != (length,):
-                    raise ValueError(f"{own!r} has {self.arrays[own].shape} values, and its axis {length}")
-        kinds = {"status": "int8", "message": "string", "laws": "float64"}
-        if any(self.arrays[name].dtype != kind for name, kind in kinds.items()):
-            raise ValueError("how its points ended is not told in numbers of this version")
-        place = study["place"]
-        inside = [type(i) is int and 0 <= i < n for i, n in zip(place, shape, strict=True)]
-        if not all(inside):
-            raise ValueError(f"its example is at {place!r:.60}")
 
     @property
     def study(self) -> dict[str, Any]:
@@ -218,6 +181,7 @@ class Store:
             If these are not in the order of the store: what was lost is not known then.
         """
         try:
+            self._whole("quantity")
             return self.axes()
         except FileError as error:
             if self.attributes.get("coordinates") != _digest(axes) or axes.shape != self.shape:
@@ -230,6 +194,7 @@ class Store:
     def _describe(self, axes: Axes) -> None:
         """Write the coordinates, then the metadata; those of the group last, which readers look at first."""
         self.attributes["coordinates"] = _digest(axes)
+        self._write_chunk("quantity", (0,), np.array(SUMMARY, dtype=object))
         for array, values in _coordinates(axes, {}):
             whole = self.arrays[array.name]
             for index in np.ndindex(*_grid(whole)):
@@ -242,7 +207,7 @@ class Store:
             files.write_json(self.root / name / "zarr.json", content)
         every = {"kind": "inline", "must_understand": False, "metadata": metadata}
         group = {"zarr_format": 3, "node_type": "group", "attributes": self.attributes, "consolidated_metadata": every}
-        files.write_json(self.root / "zarr.json", group)
+        files.write_json(self.root / "zarr.json", sealed(group))
 
     def axes(self) -> Axes:
         """The axes, with the values that they have."""
@@ -332,10 +297,16 @@ class Store:
             if name == "status" and not np.isin(block, (*STATUSES.values(), MISSING)).all():
                 raise ValueError("it has a status that there is not")
             return block
+        except FileError as error:
+            raise FileError(f"{error}. {AGAIN}") from error
         except (ValueError, struct.error) as error:
-            raise FileError(
-                f"{path} is damaged: {error}. Run the study again: what is damaged is done again"
-            ) from error
+            raise FileError(f"{path} is damaged: {error}. {AGAIN}") from error
+
+    def check_chunk(self, name: str, index: tuple[int, ...]) -> None:
+        """Raise FileError where a chunk is damaged, or missing though the mark of its points is there."""
+        marked = name not in self.chunked or (name != "message" and self._has("status", index[: len(self.shape)]))
+        if (marked and name != "status") or self._has(name, index):
+            self._chunk(name, index)
 
     def _write_chunk(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
         files.write(self.root / self.arrays[name].path(self._index_of(name, index)), self.arrays[name].encoded(block))

@@ -40,7 +40,7 @@ def load_study(path: Any) -> xarray.Dataset:
     Raises
     ------
     FileError
-        If there is no store.
+        If there is no store, or it was changed; later, where a file is missing or damaged that is looked at.
     """
     return held_results(Path(path), None)
 
@@ -49,12 +49,13 @@ def held_results(path: Path, owner: object) -> xarray.Dataset:
     """The results in a store; whatever is taken from them, and not read yet, holds the owner of the files."""
     store = Store.open(path)
     import xarray
-    import zarr
+
+    from .reader import Reader
 
     try:
-        source = zarr.storage.LocalStore(store.root, read_only=True)
-        vars(source)["owner"] = owner
-        found = xarray.open_zarr(source, consolidated=True, chunks=None)
+        found = xarray.open_zarr(Reader(store, owner), consolidated=True, chunks=None)
+    except FileError:
+        raise
     except Exception as error:  # of a dozen kinds
         raise FileError(f"{path} cannot be read: {error}") from error
     return found.set_coords([name for name in store.arrays if name not in store.chunked])
