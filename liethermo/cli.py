@@ -139,7 +139,7 @@ def study(
     store = Path(f"{spec.stem}.zarr") if out is None else out
     found = study_of(plan, store)
     typer.echo(plan.told)
-    with _client(cluster) as client:
+    with _client(cluster, spec.resolve().parent) as client:
         reached = found.run(client)
     typer.echo(str(reached))
     passed = _print_rows(found.audit())
@@ -287,20 +287,21 @@ def _print_rows(audit: Audit) -> bool:
 
 
 @contextlib.contextmanager
-def _client(address: str | None) -> Iterator[Any]:
-    """A client of a Dask cluster; None where no address was given."""
+def _client(address: str | None, folder: Path) -> Iterator[Any]:
+    """A client of a Dask cluster, which is sent what is defined in a folder; None where no address was given."""
     if address is None:
         yield None
         return
     from distributed import Client
 
     from .errors import FileError
+    from .spec.trust import sent
 
     try:
         client = Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise FileError(f"there is no Dask scheduler at {address}: {error}") from error
-    with client:
+    with client, sent(folder):
         yield client
 
 

@@ -1,5 +1,6 @@
 """Spec files of strangers: what they can make run, and what they can make wait."""
 
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 import liethermo as lt
 from liethermo.cli import app
 from liethermo.spec import read
+from liethermo.spec.trust import sent
 
 RUN = "[run]\ninitial = [0.1, 1.0, 0.1]\nt_span = [0.0, 1.0]\nstep = 0.1\n"
 MINE = """
@@ -98,6 +100,49 @@ def test_a_file_beside_the_spec_shadows_nothing(folder):
     assert "there is another module 'xarray'" in refused.stderr
 
 
+SHADOWING = """
+import sys
+from pathlib import Path
+import liethermo as lt
+from liethermo.spec import read
+from liethermo.spec.trust import sent
+assert "xarray" not in sys.modules
+try:
+    read(Path(sys.argv[1]))
+except lt.SpecError as error:
+    print(error)
+import xarray
+print(xarray.__version__)
+"""
+
+
+def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
+    """Nor where the other has not been imported yet: afterwards it would be the one beside the spec."""
+    (folder / "xarray.py").write_text("def build(): return 5")
+    path = spec(folder, model("xarray:build"))
+    command = [sys.executable, "-P", "-c", SHADOWING, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "there is another module 'xarray'" in done.stdout
+
+
+def test_what_is_beside_the_spec_is_sent_to_workers(folder):
+    """As it is, with what it imports from beside it: a worker has other folders."""
+    import cloudpickle
+
+    build, packed = read(spec(folder, model("mine_of_trust:build"))).build, folder / "build.pickle"
+    packed.write_bytes(cloudpickle.dumps(build))
+    unpack = f"import pickle; print(type(pickle.load(open({str(packed)!r}, 'rb'))(2.0)).__name__)"
+    command = [sys.executable, "-P", "-c", unpack]
+    assert (
+        "No module named 'mine_of_trust'" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    )
+    with sent(folder):
+        packed.write_bytes(cloudpickle.dumps(build))
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "LiePoissonSystem", done.stderr
+
+
 STUDY = f"[model]\nname='rigid_body'\n{RUN}[study.axes]\n"
 
 BAD = {
@@ -115,6 +160,9 @@ BAD = {
     "a word": STUDY + "rate=['fast', 'slow']",
     "a word in the state": STUDY + "'initial[0]'=['fast', 'slow']",
     "not text": "\x00\x01",
+    "an entry of 5000 digits": STUDY + f"'initial[{'9' * 5000}]'=[1.0]",
+    "a seed below zero": STUDY + "p={sobol=4, ranges={rate=[1.0, 2.0]}, seed=-1}",
+    "too many faults": f"{RUN}" + "".join(f"k{i}=1\n" for i in range(20_000)),
 }
 
 
@@ -126,6 +174,7 @@ def test_what_is_no_spec_is_refused_soon(folder, what):
     assert isinstance(result.exception, SystemExit)
     assert result.stderr.startswith("liethermo: ")
     assert all(len(line) < 600 for line in result.stderr.splitlines())
+    assert len(result.stderr.splitlines()) < 500
     assert time.perf_counter() - start < 20.0
 
 

@@ -18,12 +18,18 @@ from .schema import AdaptiveStep, MeasureOfFile, Points, Sample
 ALTERNATIVES: dict[str, type] = {"table": AdaptiveStep, "points": Points, "sample": Sample, "measure": MeasureOfFile}
 
 
+MOST_TOLD = 100
+"""Faults of a section that are told one by one."""
+
+
 def checked(key: str, schema: type, table, problems: list[str], taker: str) -> Any:
     """The table in the types of the schema; or None, after noting what is wrong with it."""
     try:
         return TypeAdapter(schema).validate_json(json.dumps(table), strict=True)
     except ValidationError as error:
-        problems += [_problem(key, found, schema, taker) for found in error.errors()]
+        found = error.errors()
+        problems += [_problem(key, one, schema, taker) for one in found[:MOST_TOLD]]
+        problems += [f"{key or 'the file'} has {len(found) - MOST_TOLD} faults more"] * (len(found) > MOST_TOLD)
         return None
 
 

@@ -147,7 +147,7 @@ class Sample(Section):
     ranges: dict[str, list[FiniteFloat | str]] | None = Field(
         None, description='of each parameter [low, high], or [low, high, "log"]'
     )
-    seed: int = Field(0, description="of the sample")
+    seed: int = Field(0, ge=0, description="of the sample")
 
 
 def _sort(value: Any) -> str:

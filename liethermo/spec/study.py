@@ -155,7 +155,7 @@ def _measure(key: str, given: Any, problems: list[str]) -> Any:
 
 def _check_name(name: str, plan: Spec, problems: list[str]) -> None:
     """Whether a parameter of an axis can be set."""
-    if not re.fullmatch(r"\w+(\[\d+\])*", name):
+    if not re.fullmatch(r"\w+(\[\d{1,9}\])*", name):
         problems.append(f"study.axes: {shown(name)} must be the name of a parameter, or an entry such as inertia[0]")
         return
     whole, *index = _parts(name)

@@ -80,7 +80,7 @@ def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__file__", None) == str(file):
         return known
-    if known is not None and name not in _ours:
+    if name not in _ours and (known is not None or _is_installed(name.partition(".")[0], folder)):
         raise InputError(f"there is another module {name!r}: call {file.name} something else")
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None
@@ -95,6 +95,39 @@ def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
         raise
     _ours.add(name)
     return module
+
+
+def _is_installed(name: str, folder: Path) -> bool:
+    """Whether there is a module of this name elsewhere: one beside the spec would be taken for it from then on."""
+    before = list(sys.path)
+    sys.path[:] = [path for path in before if Path(path or ".").resolve() not in (folder, Path.cwd())]
+    try:
+        found = importlib.util.find_spec(name)
+    except ValueError:  # of a module without a specification
+        return True
+    finally:
+        sys.path[:] = before
+    return found is not None and not (found.origin and Path(found.origin).resolve().is_relative_to(folder))
+
+
+@contextlib.contextmanager
+def sent(folder: Path) -> Iterator[None]:
+    """What is defined beside a spec is sent to the workers of a cluster as it is: they cannot import it."""
+    import cloudpickle
+
+    own = [m for name, m in list(sys.modules.items()) if name in _ours or _folder_of(m) == folder]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        yield
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def _folder_of(module: ModuleType) -> Path | None:
+    file = getattr(module, "__file__", None)
+    return Path(file).parent if file else None
 
 
 _ours: set[str] = set()
