@@ -35,6 +35,8 @@ def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
         With nothing left behind.
     """
     part = path.with_name(part_name(path.name))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EEXIST, "what is there is no plain file")
     try:
         try:
             handle = os.open(part, WRITING, mode)
@@ -80,8 +82,10 @@ def is_dead(part: Path) -> bool:
     return False
 
 
-def why(error: OSError) -> str:
-    """What went wrong, in words."""
+def why(error: OSError | ValueError) -> str:
+    """What went wrong, in words; ValueErrors are of what is no path."""
+    if not isinstance(error, OSError):
+        return str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"the disk is full ({error.strerror})"
     return str(error.strerror or error)

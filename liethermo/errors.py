@@ -37,7 +37,17 @@ class IndefiniteError(AxiomError):
 
 
 class FileError(LiethermoError, OSError):
-    """A result file that is missing, cut short or not one of this library's."""
+    """A result file that is missing, cut short or not one of this library's, or that cannot be written.
+
+    Attributes
+    ----------
+    solution : Solution or None
+        The run that :func:`integrate` could not write.
+    """
+
+    def __init__(self, message: str, solution=None):
+        super().__init__(message)
+        self.solution = solution
 
 
 class IntegrationError(LiethermoError, ArithmeticError):

@@ -13,7 +13,7 @@ import pytest
 import liethermo as lt
 from liethermo.spec import read
 from liethermo.spec.study import study_of
-from liethermo.studies.stored import audit, status
+from liethermo.studies.stored import audit, load_study, status
 from tests.liethermo.results.test_files import rewritten
 
 REFUSED = (lt.LiethermoError, lt.FileError)
@@ -107,7 +107,7 @@ def test_stores(tmp_path, count):
         chunk=2,
     )
     study.run()
-    points, judged = status(store).points, audit(store).passed
+    points, judged, whole = status(store).points, audit(store).passed, load_study(store).load()
     files = sorted(path for path in store.rglob("*") if path.is_file() and path.name != ".lock")
     random, told = np.random.default_rng(3), []
     for _ in range(count // 4):
@@ -119,6 +119,7 @@ def test_stores(tmp_path, count):
             found = status(store)
             assert found.points == points
             assert audit(store).passed == judged or found.done < points
+            assert load_study(store).load().identical(whole) or found.done < points
         except lt.FileError as error:
             told.append(str(error))
         assert time.perf_counter() - start < SOON

@@ -21,7 +21,8 @@ import sympy
 
 import manifolds as mf
 
-from ..errors import InputError
+from .. import disk
+from ..errors import FileError, InputError
 from ..integrators import MetriplecticGauss, Reference
 from ..runs.integrate import integrate
 from ..systems import LiePoissonSystem, System
@@ -222,9 +223,19 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
 
 
 def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
-    """Write what :func:`describe` returns as a JSON file."""
+    """Write what :func:`describe` returns as a JSON file.
+
+    Raises
+    ------
+    FileError
+        If it cannot be written.
+    """
     path = Path(path)
-    path.write_text(json.dumps(problem, indent=2, ensure_ascii=False) + "\n")
+    text = json.dumps(problem, indent=2, ensure_ascii=False) + "\n"
+    try:
+        disk.write(path, text.encode())
+    except (OSError, ValueError) as error:
+        raise FileError(f"cannot write {path}: {disk.why(error)}") from error
     return path
 
 

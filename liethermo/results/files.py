@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
 import os
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -122,16 +124,28 @@ def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     path = Path(path)
     numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
     made = io.BytesIO()
-    dataset.to_netcdf(made, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in numbers})
+    with _alone():
+        dataset.to_netcdf(made, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in numbers})
     made.seek(0, io.SEEK_END)
     made.write(SEAL + hashlib.sha256(made.getbuffer()).hexdigest().encode())
     try:
         disk.write(path, made.getbuffer())
     except (OSError, ValueError) as error:  # the latter for what is no path
-        told = disk.why(error) if isinstance(error, OSError) else error
-        raise FileError(f"cannot write {path!s:.200}: {told}. The result itself is as it was") from error
+        raise FileError(f"cannot write {path!s:.200}: {disk.why(error)}. The result itself is as it was") from error
     disk.sweep(path.parent, path.name)
     return path
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """Let xarray ask no scheduler of Dask for a lock: where there is a client, it might be one that is gone."""
+    if "dask" not in sys.modules:
+        yield
+        return
+    import dask
+
+    with dask.config.set(scheduler="synchronous"):
+        yield
 
 
 def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -12,7 +12,7 @@ import numpy as np
 from manifolds._precision import by_own_settings
 
 from ..engines.codes import Code
-from ..errors import ConvergenceError, InputError, NonFiniteError
+from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, DrivenSystem, System
@@ -104,6 +104,8 @@ def integrate(
         If an argument cannot be used.
     ConvergenceError, NonFiniteError
         If a step fails and ``on_failure`` is "raise".
+    FileError
+        If ``save_to`` cannot be written at the end, with the run as ``.solution``; before that it is a warning.
     """
     check_noise(noise)
     default = DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE
@@ -149,7 +151,10 @@ def integrate(
             (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
     solution = run.solution()
     if save_to is not None:
-        solution.save(save_to)
+        try:
+            solution.save(save_to)
+        except FileError as error:
+            raise FileError(f"{error}. It is the exception's .solution", solution) from error
     if on_failure == "raise" and solution.status.code in UNSOLVED:
         raise ConvergenceError(solution.status.message, solution)
     if on_failure == "raise" and not solution.status.ok and solution.status.code != Code.INTERRUPTED.text:

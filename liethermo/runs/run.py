@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from manifolds.errors import warn
+
 from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.stepping import values
+from ..errors import FileError
 from ..integrators import Reference
 from ..results.dense import Dense
 from ..results.solution import Solution
@@ -226,7 +229,10 @@ class Run:
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.written > CHECKPOINT_SECONDS:
             self.stats = stats_of(state)
-            self.solution().save(self.save_to)
+            try:
+                self.solution().save(self.save_to)
+            except FileError as error:  # there may be room at the end
+                warn(f"{error}. The run goes on")
             self.written = time.perf_counter()
 
     def _provenance(self) -> dict[str, Any]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
+from ... import disk
 from ...errors import FileError, InputError
 
 SUFFIXES = (".pdf", ".png", ".svg")
@@ -27,11 +29,13 @@ def writable(path: str | os.PathLike | None) -> Path | None:
 def finished(figure: Figure, path: Path | None) -> Figure:
     """The figure, written to the path and closed if there is one."""
     if path is not None:
+        drawn = io.BytesIO()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path)
-        except OSError as error:
-            raise FileError(f"cannot write {path}: {error}") from error
+            figure.savefig(drawn, format=path.suffix[1:].lower())
         finally:
             plt.close(figure)
+        try:
+            disk.write(path, drawn.getbuffer())
+        except (OSError, ValueError) as error:  # the latter for what is no path
+            raise FileError(f"cannot write {path}: {disk.why(error)}") from error
     return figure

@@ -16,6 +16,7 @@ import pytest
 import liethermo as lt
 from liethermo import disk
 from liethermo.results import files
+from liethermo.runs import run
 
 
 @pytest.fixture(scope="module")
@@ -212,3 +213,57 @@ def test_what_is_no_path(path, solution, tmp_path):
         solution.save(tmp_path / path)
     with pytest.raises(lt.FileError):
         lt.load(tmp_path / path)
+
+
+def full(*arguments):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-6)])
+def test_a_run_that_cannot_be_kept_is_not_lost(tmp_path, monkeypatch, step):
+    monkeypatch.setattr(disk.os, "replace", full)
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
+    goes_on = pytest.warns(UserWarning, match="the disk is full .*The run goes on")
+    with goes_on, pytest.raises(lt.FileError, match=r"the disk is full .*It is the exception's \.solution") as told:
+        lt.integrate(body, x0, (0.0, 2.0), step, save_to=tmp_path / "run.nc")
+    monkeypatch.undo()
+    whole = lt.integrate(body, x0, (0.0, 2.0), step)
+    assert np.array_equal(told.value.solution.x, whole.x)
+    assert told.value.solution.status.ok
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_pictures_appear_whole_or_not_at_all(solution, tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"laws.{suffix}"
+    lt.plot.laws(solution, path=path)
+    before = path.read_bytes()
+    monkeypatch.setattr(disk.os, "replace", full)
+    with pytest.raises(lt.FileError, match="the disk is full"):
+        lt.plot.laws(solution, path=path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == [path.name]
+
+
+def test_a_pipe_or_a_device_is_not_replaced(solution, tmp_path):
+    os.mkfifo(tmp_path / "pipe.nc")
+    for path in (tmp_path / "pipe.nc", tmp_path):
+        with pytest.raises(lt.FileError, match="no plain file"):
+            solution.save(path)
+    assert (tmp_path / "pipe.nc").is_fifo()
+    with pytest.raises(lt.FileError, match="there is no file"):  # and is not waited for
+        lt.load(tmp_path / "pipe.nc")
+
+
+def test_no_scheduler_is_asked_whether_a_file_may_be_written(solution, tmp_path, monkeypatch):
+    """xarray asks that of Dask for a lock where there is a client, which fails where it is gone."""
+    import distributed
+
+    def gone(*arguments, **named):
+        raise OSError("the scheduler is gone")
+
+    with distributed.Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None):
+        monkeypatch.setattr(distributed.Lock, "acquire", gone)
+        solution.save(tmp_path / "run.nc")
+    assert np.array_equal(lt.load(tmp_path / "run.nc").x, solution.x)
