@@ -108,7 +108,7 @@ class AuditRow:
         return Row(f"{label}{self.law}", self.value, self.tolerance, self.passed, self.note)
 
 
-ACCURACY, CONSISTENCY, TAKEN = "accuracy", "consistency", "steps taken"
+ACCURACY, CONSISTENCY, TAKEN, FAILED = "accuracy", "consistency", "steps taken", "trajectories that failed"
 """The rows that are not about laws."""
 
 LAW_FAILS = "A LAW FAILS"
@@ -160,10 +160,12 @@ class Audit:
     def verdict(self) -> str:
         """The whole in one line."""
         failing = {row.law for row in self.rows if row.passed is False}
-        if failing - {ACCURACY, CONSISTENCY, TAKEN}:
+        if failing - {ACCURACY, CONSISTENCY, TAKEN, FAILED}:
             return LAW_FAILS
         if TAKEN in failing:
             return "THE RUN STOPPED before its end; the laws hold until there"
+        if FAILED in failing:
+            return "SOME TRAJECTORIES STOPPED before their end; the laws hold until there"
         if CONSISTENCY in failing:
             return "the laws hold, but THIS IS NOT THE MOTION of the system"
         if self.resolved is None:

@@ -15,7 +15,7 @@ from manifolds._tables import html_grid
 
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
-from .audit import Audit, AuditRow, Tolerances, accuracy_row, coverage_of
+from .audit import FAILED, Audit, AuditRow, Tolerances, accuracy_row, coverage_of
 from .evidence import Evidence
 from .files import ENSEMBLE_FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
 from .many import laws_of_many
@@ -302,7 +302,7 @@ class Ensemble(Saved):
         if self.witness is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, accepted))
         failed = int((~self.ok & (self.status != Code.INTERRUPTED)).sum())
-        rows.append(AuditRow("trajectories that failed", float(failed), 0.0, failed == 0))
+        rows.append(AuditRow(FAILED, float(failed), 0.0, failed == 0))
         least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
         drift, residual = (float(a.max(initial=0.0, where=moved)) for a in (self.energy_drift, self.residual))
         coverage = coverage_of(self.evidence, int(self.steps.sum()))

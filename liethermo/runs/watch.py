@@ -81,8 +81,6 @@ class Watch:
 
     def _zeros(self, j: int, step: _Step, start: float, end: float) -> list[float]:
         """The shares of a step at which a function is zero: the looks tell where a part of the step is to be tried."""
-        from scipy.optimize import brentq
-
         shares = [0.0, *step.looks, 1.0]
         between = [
             float(self.functions[j](step.time(share), y, *self.args))
@@ -104,12 +102,31 @@ class Watch:
             if values[i + 1] == 0.0:
                 found.append(shares[i + 1])
                 continue
-            root = brentq(
-                lambda share: self._value(j, step, share), shares[i], shares[i + 1], xtol=EPS**2, rtol=4.0 * EPS
-            )
-            if not np.isnan(self._value(j, step, root)):
+            root = self._zero(j, step, shares[i], shares[i + 1])
+            if root is not None:
                 found.append(root)
         return found
+
+    def _zero(self, j: int, step: _Step, low: float, high: float) -> float | None:
+        """The share of a step at which a function changes its sign between two; None where it is no number on the way."""
+        from scipy.optimize import brentq
+
+        def value(share: float) -> float:
+            found = self._value(j, step, share)
+            if np.isnan(found):
+                raise _NotANumber
+            return found
+
+        try:
+            root = brentq(value, low, high, xtol=EPS**2, rtol=4.0 * EPS)
+            value(root)
+        except _NotANumber:  # brentq itself says so in an error, or returns, as its version has it
+            return None
+        return root
+
+
+class _NotANumber(Exception):
+    """A function of an event cannot be evaluated."""
 
 
 class _Step:

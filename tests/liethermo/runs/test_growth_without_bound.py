@@ -70,6 +70,7 @@ def test_ensembles_that_overflow_raise_no_warnings(engine, tmp_path):
     assert list(many.ok) == [False, False, True]  # the last stays on the top
     assert not audit.passed
     assert [row.law for row in audit.rows if row.passed is False] == ["trajectories that failed"]
+    assert audit.verdict == "SOME TRAJECTORIES STOPPED before their end; the laws hold until there"
     assert text.count("grows without bound: |x| = ") == 2
     assert "smaller step" not in text
     assert loaded.message(0) == many.message(0)
