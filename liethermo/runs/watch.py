@@ -108,7 +108,7 @@ class Watch:
         return found
 
     def _zero(self, j: int, step: _Step, low: float, high: float) -> float | None:
-        """The share of a step at which a function changes its sign between two; None where it is no number on the way."""
+        """The share of a step, between two, at which a function changes its sign; None if it is NaN on the way."""
         from scipy.optimize import brentq
 
         def value(share: float) -> float:
