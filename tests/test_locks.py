@@ -1,0 +1,37 @@
+"""What the set-up commands install: a run needs few packages, and tests, pages and studies bring their own."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+MOST = 60
+"""Packages of a run: more would make the first demo wait."""
+
+BESIDE = {
+    "studies": {"dask", "distributed", "zarr"},
+    "test": {"pytest", "hypothesis", "ruff", "mypy"},
+    "docs": {"sphinx"},
+    "bench": {"diffrax"},
+}
+
+
+def _packages(lock: str) -> dict[str, str]:
+    """Names and versions of a lock."""
+    lines = (ROOT / lock).read_text().splitlines()
+    return {
+        name.lower(): version for name, version in (line.split("==") for line in lines if re.match(r"\w.*==", line))
+    }
+
+
+def test_a_run_needs_few_packages():
+    run = _packages("requirements.lock")
+    assert {"jax", "numpy", "llvmlite"} <= run.keys()
+    assert len(run) <= MOST
+
+
+def test_each_extra_locks_what_it_needs_beside():
+    run = _packages("requirements.lock")
+    for extra, named in BESIDE.items():
+        found = _packages(f"requirements-{extra}.lock").keys()
+        assert named <= found, extra
+        assert not found & run.keys(), extra
