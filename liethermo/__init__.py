@@ -10,7 +10,7 @@ import importlib.metadata
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 
-from . import models, testing
+from . import bodies, models, testing
 from .dissipation.base import Dissipation
 from .dissipation.double_bracket import DoubleBracket
 from .dissipation.factor import Factor
@@ -181,6 +181,7 @@ __all__ = [
     "VariationalIntegrator",
     "WithAttitude",
     "Zipped",
+    "bodies",
     "ensemble",
     "flow",
     "integrate",

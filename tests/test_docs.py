@@ -323,7 +323,7 @@ INSIDE = re.compile(
 )
 KEPT = re.compile(r"(?:keeps|constant|cannot change|takes nothing from)\s+(?:\w+\s+){0,2}energy|energy is\s+constant")
 CONTROLLED = re.compile(r"\brigid_body\b|KillingDissipation\(")
-LEFT_ALONE = re.compile(r"DoubleBracket|body_with_wheels")
+LEFT_ALONE = re.compile(r"DoubleBracket|body_with_wheels|tumbling_body")
 
 
 def _wrong_bodies(text: str) -> list[str]:

@@ -16,6 +16,7 @@ from .rigid_body import free_rigid_body, rigid_body
 from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
+from .tumbling_body import tumbling_body
 from .zeitlin import zeitlin
 
 __all__ = [
@@ -34,5 +35,6 @@ __all__ = [
     "thermo_particles",
     "thermo_springs",
     "thermoelastic_chain",
+    "tumbling_body",
     "zeitlin",
 ]

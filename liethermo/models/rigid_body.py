@@ -35,7 +35,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     Omega, so H is constant, and S grows: from almost every state it tends to ``max(I) * H``.
 
     It is a model on so(3)*, of a body that is controlled from outside. A body left to itself, with friction between
-    its parts, keeps |Pi| and loses kinetic energy to heat: see :func:`body_with_wheels`.
+    its parts, keeps |Pi| and loses kinetic energy to heat: see :func:`tumbling_body`.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     """
     return LiePoissonSystem(
         mf.so(3),
-        energy=Quadratic(1.0 / _inertia(inertia)),
+        energy=Quadratic(1.0 / checked_inertia(inertia)),
         entropy=Quadratic(np.ones(3)),
         dissipation=KillingDissipation(0.5 * checked_rate(rate)),
     )
@@ -65,10 +65,10 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
     The default inertias are those of a published check, which no body has: see :func:`rigid_body`.
     """
-    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / _inertia(inertia)), entropy=Quadratic(np.ones(3)))
+    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / checked_inertia(inertia)), entropy=Quadratic(np.ones(3)))
 
 
-def _inertia(inertia) -> np.ndarray | jax.Array:
+def checked_inertia(inertia) -> np.ndarray | jax.Array:
     moments = jnp.asarray(inertia, dtype=jnp.float64) if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
     if moments.shape != (3,):
         raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")

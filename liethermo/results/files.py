@@ -53,6 +53,10 @@ LONG_NAMES = {
     "status": "how the run ended, as a number",
     "status_text": "how the run ended",
     "attitude": "element of the Lie group of the system, real part and, where it has one, imaginary part",
+    "quaternion": "unit quaternion of the attitude, scalar last",
+    "nutation": "angle from the axis of greatest inertia to the angular momentum",
+    "precession": "angle by which that axis has turned about the angular momentum in space",
+    "spin": "angle by which the body has turned about that axis",
     "invariant_name": "names of the recorded functions",
     "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
 }

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from .dense import Dense
 from .files import FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
+from .orientation import angles
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
@@ -121,7 +122,8 @@ class Solution(Saved):
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """An ``xarray.Dataset`` with coordinate ``time`` and all series; the rest as attributes (JSON).
 
-        Each variable says its long name, energy and entropy the law that the system promises of them.
+        Each variable says its long name, energy and entropy the law that the system promises of them. A body with
+        attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`].
 
         Parameters
         ----------
@@ -139,6 +141,8 @@ class Solution(Saved):
         variables: dict[str, Any] = {"x": (("time", *places(self.x.ndim - 1)), self.x), **series}
         if self.attitude is not None:
             variables["attitude"] = (("time", "row", "column", "part"), as_parts(self.attitude))
+            for name, values in angles(self).items():
+                variables[name] = (("time", "quaternion_component")[: values.ndim], values)
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),

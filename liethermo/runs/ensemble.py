@@ -129,6 +129,7 @@ def ensemble(
         run = np.setdiff1d(run, list(reasons))
         family, states = family.select(run), states[run]
     told = member = decided(family.representative, states)
+    one_body = _same_inertia(family, member)
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
     if isinstance(member, AttitudeSystem):
@@ -179,6 +180,7 @@ def ensemble(
             **provenance_of(
                 told, method, step if isinstance(step, Adaptive) else course.h, (course.start, course.end), course.every
             ),
+            **({} if one_body else {"inertia": None}),
             "engine": chosen,
             "noise": None if noise is None else noise.listed(),
         },
@@ -209,6 +211,15 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
     if len(reasons) == size:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
+
+
+def _same_inertia(family: Family, member: System) -> bool:
+    """Whether all members have the inertia of this one, by those with the smallest and largest parameters."""
+    inertia = member.inertia
+    if inertia is None or family.alike is not None:
+        return True
+    others = (family.member(i).inertia for i in family.extremes())
+    return all(other is not None and np.array_equal(other, inertia) for other in others)
 
 
 def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:

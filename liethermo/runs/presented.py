@@ -75,7 +75,7 @@ def provenance_of(
     system: System, method: Any, step: float | Adaptive, span: tuple[float, float], every: int | None
 ) -> dict[str, Any]:
     """Where a run comes from: JSON data."""
-    algebra = getattr(system, "algebra", None)
+    algebra, group, inertia = getattr(system, "algebra", None), getattr(system, "group", None), system.inertia
     return {
         "library": f"liethermo {_version()}",
         "jax": jax.__version__,
@@ -86,6 +86,8 @@ def provenance_of(
         "save_every": every,
         "system": type(system).__name__,
         "algebra": None if algebra is None else algebra.name,
+        "group": None if group is None else group.name,
+        "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
     }
 

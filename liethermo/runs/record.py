@@ -230,7 +230,8 @@ class Alone:
             provenance=plain.provenance,
             event_time=plain.event_time,
         )
-        return replace(found, provenance=plain.provenance)
+        inertia = None if system.inertia is None else system.inertia.tolist()
+        return replace(found, provenance={**plain.provenance, "inertia": inertia})
 
 
 class Followed:

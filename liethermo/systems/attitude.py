@@ -114,7 +114,6 @@ class AttitudeSystem(System):
         ).with_provenance(
             system=type(self.body).__name__,
             algebra=self.body.algebra.name,
-            group=self.group.name,
             x0=np.asarray(mu[0]).tolist(),
         )
 
@@ -130,6 +129,10 @@ class AttitudeSystem(System):
         found, sizes = _at_states(_in_space, self, x)
         size = float(np.max(sizes))
         return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
+
+    @property
+    def inertia(self):
+        return self.body.inertia
 
     @property
     def constants(self):

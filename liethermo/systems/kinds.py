@@ -76,6 +76,14 @@ class Kind(Module):
         """Number of state components, those of baths left out."""
         return self.dim if self.baths is None else self.dim - self.baths.number
 
+    @property
+    def inertia(self) -> np.ndarray | None:
+        """The tensor of inertia, shape (3, 3), of a rigid body whose state begins with its angular momentum.
+
+        That with all parts inside held fast; None where the system is no such body, or the tensor is not known.
+        """
+        return None
+
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:

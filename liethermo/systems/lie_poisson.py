@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
@@ -97,6 +98,19 @@ class LiePoissonSystem(System):
         turned = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
         return action.ad_star(x + self.dissipation.momentum(dH, turned))
 
+    @property
+    def inertia(self) -> np.ndarray | None:
+        if not _of_a_body(self.algebra) or is_traced(self.energy) or self.is_driven:
+            return None
+        energy = self.without_baths().energy
+        if not energy.is_quadratic:
+            return None
+        still = jnp.zeros(self.algebra.dim)
+        squares = np.asarray(jax.jacfwd(energy.gradient)(still))  # its inverse is that of the parts moving freely
+        if np.linalg.eigvalsh(squares)[0] <= 0.0 or np.asarray(energy.gradient(still)).any():
+            return None
+        return np.linalg.inv(squares)[:3, :3]
+
     def casimirs(self) -> dict[str, Energy]:
         found = _recorded_casimirs(self.algebra, self.algebra.basis_names)
         return found if self.baths is None else {name: self._of_body(C) for name, C in found.items()}
@@ -136,6 +150,20 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
     if group.cayley_is_adjoint():
         return "cayley"
     return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._stays(map_))
+
+
+@functools.lru_cache(maxsize=64)
+def _of_a_body(algebra: mf.LieAlgebra) -> bool:
+    """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body."""
+    if not 3 <= algebra.dim <= LARGEST_BODY or len(algebra.shape) != 1:
+        return False
+    rest = np.zeros((algebra.dim,) * 3)
+    rest[:3, :3, :3] = mf.so(3).structure_constants
+    return np.array_equal(algebra.structure_constants, rest)
+
+
+LARGEST_BODY = 64
+"""Components of the momentum of a body with parts inside, at most."""
 
 
 @functools.lru_cache(maxsize=64)

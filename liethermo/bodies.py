@@ -1,0 +1,11 @@
+"""Rigid bodies: how they are turned along a run, the periods of their free motion, and how fast they come to a spin.
+
+Units are SI or any others that are consistent; angles are in radians.
+"""
+
+from __future__ import annotations
+
+from .models.free_motion import Periods, damping_time, periods, rate_of
+from .results.orientation import nutation, precession, quaternions, spin
+
+__all__ = ["Periods", "damping_time", "nutation", "periods", "precession", "quaternions", "rate_of", "spin"]

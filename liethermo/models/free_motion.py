@@ -1,0 +1,193 @@
+"""Closed forms of a body left to itself: the periods of its motion, and how fast friction inside damps its nutation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from ..errors import InputError
+from ..functions.conditions import require
+
+
+class Periods(NamedTuple):
+    """The periods of a free body, arrays of one shape.
+
+    Attributes
+    ----------
+    rotation : ndarray
+        After which the angular velocity in body axes is what it was (time): infinite on the separatrix. Near the axis
+        of greatest inertia of a body with ``I_1 = I_2`` it is ``2 pi I_1 I_3 / (L_3 (I_3 - I_1))``.
+    precession : ndarray
+        The mean time (time) in which the axis that the body circles about turns once about the angular momentum in
+        space. It is ``2 pi I_1 / L`` of a body with two equal moments.
+    axis : ndarray of int
+        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2.
+    """
+
+    rotation: np.ndarray
+    precession: np.ndarray
+    axis: np.ndarray
+
+
+def periods(inertia, momentum, energy=None) -> Periods:
+    """The periods of a free body by elliptic integrals [Landau & Lifshitz, Mechanics §37; Samarasinha & A'Hearn 1991].
+
+    With ``I_1 <= I_2 <= I_3`` and ``L**2 > 2 E I_2`` the angular momentum circles about the axis of ``I_3`` in body
+    axes (short-axis mode), with ``L**2 < 2 E I_2`` about that of ``I_1`` (long-axis mode).
+
+    Parameters
+    ----------
+    inertia : array, shape (..., 3), > 0
+        Principal moments (mass * length**2), in any order.
+    momentum : array, shape (..., 3), or (...) beside an energy
+        Angular momentum in body axes, or its size L (mass * length**2 / time).
+    energy : array, shape (...), optional
+        Kinetic energy E (mass * length**2 / time**2); by default that of the momentum.
+
+    Returns
+    -------
+    Periods
+        Of shape (...); both periods are those of a steady spin in the limit of small circles.
+
+    Raises
+    ------
+    InputError
+        If no motion of the body has such an energy and momentum: ``L**2 / (2 I_3) <= E <= L**2 / (2 I_1)``.
+    """
+    moments, L = _moments(inertia), np.asarray(momentum, dtype=float)
+    if energy is None:
+        if L.shape[-1:] != (3,):
+            raise InputError(f"a momentum without an energy has shape (..., 3), not {L.shape}")
+        E, L = 0.5 * np.sum(L**2 / moments, axis=-1), np.linalg.norm(L, axis=-1)
+    else:
+        E = np.asarray(energy, dtype=float)
+    order = np.argsort(moments, axis=-1, kind="stable")
+    shape = np.broadcast_shapes(L.shape, E.shape, moments.shape[:-1])
+    I1, I2, I3 = (np.broadcast_to(np.take_along_axis(moments, order, -1)[..., i], shape) for i in range(3))
+    L, E = np.broadcast_to(L, shape), np.broadcast_to(E, shape)
+    square, rounding = L**2, 8 * np.finfo(float).eps
+    least, most = square / (2 * I3), square / (2 * I1)
+    fits = (least > 0.0) & (least * (1 - rounding) <= E) & (most * (1 + rounding) >= E)
+    if not fits.all():
+        i = np.unravel_index(int(np.argmin(fits)), shape)
+        raise InputError(
+            f"a free body with the momentum {L[i]:g} and these moments of inertia has an energy from L**2 / (2 I_3) = "
+            f"{least[i]:g} to L**2 / (2 I_1) = {most[i]:g}, not {E[i]:g}"
+        )
+    short = square >= 2 * E * I2
+    a, c = np.where(short, I1, I3), np.where(short, I3, I1)  # c is that of the axis which is circled
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pace = (c - I2) * (square - 2 * E * a)
+        m = np.clip((I2 - a) * (2 * E * c - square) / pace, 0.0, 1.0)
+        K = scipy.special.ellipk(m)
+        rotation = 4 * K * np.sqrt(a * I2 * c / pace)
+        n = -c * (I2 - a) / (a * (c - I2))
+        mean = 1 / c + (1 / a - 1 / c) * _third(n, m) / K
+    still = (pace <= 0.0) | np.isinf(K)  # a spin about an axis that is circled by none, or the way to one
+    rotation, mean = np.where(still, np.inf, rotation), np.where(still, 1 / I2, mean)
+    axis = np.where(short, order[..., 2], order[..., 0])
+    return Periods(rotation, 2 * np.pi / (L * mean), axis)
+
+
+def _third(n, m) -> np.ndarray:
+    """The complete elliptic integral of the third kind, by Carlson's forms [DLMF 19.25.2]."""
+    RF, RJ = scipy.special.elliprf, scipy.special.elliprj
+    return RF(0.0, 1.0 - m, 1.0) + n / 3.0 * RJ(0.0, 1.0 - m, 1.0, 1.0 - n)
+
+
+def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
+    """The rate of friction inside a body whose small nutations fall by e in the relaxation time.
+
+    ``1 / tau = rate L**2 / 2 ((1/I_1 - 1/I_3) + (1/I_2 - 1/I_3))`` near the spin about the axis of the greatest moment
+    ``I_3``, for ``x' = Pi dH + rate Pi Pi dH``: exact in the linear equations, where friction is so weak that
+    they oscillate. Large nutations of a body with ``I_1 = I_2`` obey it too:
+    ``tan theta = tan theta_0 exp(-t / tau)``.
+
+    Parameters
+    ----------
+    relaxation_time : float or array, > 0
+        tau (time).
+    inertia : array, shape (..., 3), > 0
+        Principal moments (mass * length**2), in any order, one of them the greatest.
+    momentum : float or array, > 0
+        The size L of the angular momentum (mass * length**2 / time).
+
+    Returns
+    -------
+    array
+        Rate (time / (mass * length**2)).
+
+    Raises
+    ------
+    InputError
+    """
+    moments = jnp.asarray(inertia, dtype=jnp.float64)
+    if moments.shape[-1:] != (3,):
+        raise InputError(f"inertia has shape (..., 3), not {moments.shape}")
+    tau, L = (jnp.asarray(value, dtype=jnp.float64) for value in (relaxation_time, momentum))
+    for value, what in ((moments, "moments of inertia"), (tau, "a relaxation time"), (L, "the size of a momentum")):
+        require(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
+    above = jnp.sum(1.0 / moments, axis=-1) - 3.0 / jnp.max(moments, axis=-1)
+    unequal = jnp.min(moments, axis=-1) < jnp.max(moments, axis=-1)
+    require(unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
+    return 2.0 / (tau * L**2 * above)
+
+
+def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -> np.ndarray:
+    """The time in which inelastic friction damps the nutation of a solid body, ``A mu Q / (rho R**2 omega**3)``.
+
+    The form is agreed upon, and follows from dimensions. The constant A depends on the shape and on who computed it:
+    Burns & Safronov (1973) have about 100 for bodies that are nearly round and less for long ones; Efroimsky & Lazarian
+    (2000) argue for friction stronger by one to two orders of magnitude, since stresses at twice the frequency of
+    precession were left out; Sharma, Burns & Hui (2005) solve the elastic problem for ellipsoids of revolution
+    and find a few hundred, so slower damping; Breiter, Rozek & Vokrouhlicky (2012) correct both and find
+    that they then differ little. So a time is known to a factor of about ten, beside what is not known of mu Q.
+
+    Parameters
+    ----------
+    rigidity : float or array, > 0
+        mu (pressure; Pa).
+    quality : float or array, > 0
+        Q, by which strain energy is divided for the loss in a radian.
+    density : float or array, > 0
+        rho (mass / length**3; kg / m**3).
+    radius : float or array, > 0
+        Mean radius R (length; m).
+    spin : float or array, > 0
+        omega, 2 pi over the period of rotation (1 / time; rad / s).
+    shape_factor : float or array, > 0
+        A.
+
+    Returns
+    -------
+    ndarray
+        Time (s, of SI units).
+
+    Raises
+    ------
+    InputError
+    """
+    given = {
+        "rigidity": rigidity,
+        "quality": quality,
+        "density": density,
+        "radius": radius,
+        "spin": spin,
+        "shape_factor": shape_factor,
+    }
+    mu, Q, rho, R, omega, A = (np.asarray(value, dtype=float) for value in given.values())
+    for name, value in given.items():
+        require(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
+    return A * mu * Q / (rho * R**2 * omega**3)
+
+
+def _moments(inertia) -> np.ndarray:
+    moments = np.asarray(inertia, dtype=float)
+    if moments.shape[-1:] != (3,):
+        raise InputError(f"inertia has shape (..., 3), not {moments.shape}")
+    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia are positive and finite, not {value}")
+    return moments

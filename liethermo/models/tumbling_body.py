@@ -1,0 +1,86 @@
+"""A rigid body left to itself, with friction inside: it tumbles, warms, and ends in a spin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+import manifolds as mf
+
+from ..dissipation.double_bracket import DoubleBracket
+from ..errors import InputError
+from ..functions.energy import Quadratic
+from ..systems import HeatBaths, LiePoissonSystem
+from .free_motion import rate_of
+from .rigid_body import checked_inertia
+
+
+def tumbling_body(
+    inertia: Sequence[float],
+    relaxation_time: float | None = None,
+    momentum: float | Sequence[float] | None = None,
+    rate: float | None = None,
+    capacity: float = 1.0,
+    temperature: float = 1.0,
+    attitude: bool = True,
+) -> LiePoissonSystem:
+    """A body left to itself, with friction inside that heats it: an asteroid, or a satellite without thrusters.
+
+    ``mu' = mu × (xi + sigma)``, ``xi_i = mu_i / I_i``, ``sigma = rate mu × xi``, and ``T y' = rate |mu × xi|**2`` for
+    the entropy y, of a body of heat capacity C and temperature ``T = T_0 exp(y / C)``. The energy
+    ``sum mu_i**2 / (2 I_i) + C (T - T_0)`` and ``|mu|`` are constant, the entropy grows, and the kinetic energy falls
+    to ``|mu|**2 / (2 max(I))``, of a spin about the axis of greatest inertia. The attitude follows
+    ``g' = g hat(xi + sigma)``, so the angular momentum in space, ``g mu``, is constant. See :mod:`liethermo.bodies`.
+
+    Everything is in SI units, or in any other consistent ones. The state is (mu, y), and mu alone stands for y = 0.
+
+    Parameters
+    ----------
+    inertia : three positive numbers
+        Principal moments of inertia (kg m**2), of which none is more than the sum of the others.
+    relaxation_time : float, > 0
+        In which small nutations fall by e (s), of a body with the angular momentum given beside it: see
+        :func:`liethermo.bodies.rate_of`.
+    momentum : float, > 0, or three numbers
+        The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
+        time, which falls as ``1 / |mu|**2``. What the body starts with is the state that a run is given.
+    rate : float, >= 0
+        Of the friction (s / (kg m**2)), in place of the relaxation time and the momentum.
+    capacity : float, > 0
+        C (J / K).
+    temperature : float, > 0
+        T_0 (K), at y = 0.
+    attitude : bool
+        Whether runs have attitudes, elements of SO(3) that take body axes to those of space.
+
+    Raises
+    ------
+    InputError
+        If there is neither a relaxation time with its momentum nor a rate, or both.
+
+    Warns
+    -----
+    InertiaWarning
+        Where no body has the inertias.
+    """
+    moments = checked_inertia(inertia)
+    if (rate is None) == (relaxation_time is None) or (momentum is None) != (relaxation_time is None):
+        given = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
+        names = ", ".join(name for name, value in given.items() if value is not None) or "none of them"
+        raise InputError(f"give relaxation_time= with the momentum= that it belongs to, or rate=, not {names}")
+    friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _size(momentum))
+    return LiePoissonSystem(
+        mf.so(3),
+        energy=Quadratic(1.0 / moments),
+        dissipation=DoubleBracket(friction),
+        group=mf.SO(3) if attitude else None,
+        baths=HeatBaths(capacity, temperature),
+    )
+
+
+def _size(momentum):
+    """The size of a momentum that is given as such, or as a vector."""
+    if np.shape(momentum) not in ((), (3,)):
+        raise InputError(f"momentum is one number, or three, not an array of shape {np.shape(momentum)}")
+    return momentum if np.shape(momentum) == () else np.linalg.norm(momentum)
