@@ -86,11 +86,13 @@ def semidefinite(form, what: str) -> jax.Array:
         require(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE}")
         return matrix
     numbers = np.asarray(matrix)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{what} must be finite, not {numbers.tolist()}")
     scale = float(np.abs(numbers).max())
     asymmetry = float(np.abs(numbers - numbers.T).max())
     if not asymmetry <= 1e-12 * scale:
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
-    lowest = float(np.linalg.eigvalsh(numbers)[0]) if np.isfinite(numbers).all() else -np.inf
+    lowest = float(np.linalg.eigvalsh(numbers)[0])
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
             f"{what} {NEGATIVE}".format(value=lowest),

@@ -25,8 +25,8 @@ class DoubleBracket(Dissipation):
     ----------
     rate : float, >= 0
     metric : array, shape (n, n), optional
-        The positive definite form ^♯; by default the identity, or on a manifold the metric of the space. On copies of
-        an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
+        The positive semidefinite form ^♯; by default the identity, or on a manifold the metric of the space. On copies
+        of an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
     """

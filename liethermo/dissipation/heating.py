@@ -137,7 +137,7 @@ class BesideBaths(Carried):
 
 def heated(
     dissipation: Dissipation | None, body: Geometry, number: int, pulled: Callable[[Energy], Energy]
-) -> Dissipation | None:
+) -> Dissipation:
     """The dissipation of a body, beside baths that take its heat.
 
     Raises
@@ -145,13 +145,12 @@ def heated(
     InputError
         If it makes no heat, or there is no bath of the number that it names.
     """
-    if dissipation is None:
-        return None
-    parts = dissipation.terms
+    parts = () if dissipation is None else dissipation.terms
     if not any(part.energy_law == "nonincreasing" for part in parts):
+        found = f"{type(parts[0]).__name__} makes none" if parts else "there is none"
         raise InputError(
             "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
-            f"{type(parts[0]).__name__} makes none: leave out baths="
+            f"{found}: leave out baths="
         )
     carried = tuple(_carried(part, body, number, pulled) for part in parts)
     return carried[0] if len(carried) == 1 else Several(carried)

@@ -76,18 +76,20 @@ def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None)
     return found
 
 
-def towards(directions: Sequence[jax.Array], products: jax.Array) -> jax.Array:
+def towards(directions: Sequence[jax.Array], products: jax.Array, passes: int = 1) -> jax.Array:
     """The vector in the span of some whose inner products with them are these, shape (n,).
 
     As ``frame(directions).with_products(products)``, in one pass and without roots: for an iteration that corrects what
-    rounding leaves. One that depends on those before it, as at an equilibrium, is left out.
+    rounding leaves. One that depends on those before it, as at an equilibrium, is left out. A second pass is for
+    directions that are nearly parallel, as in units of which one is much larger than another.
     """
     found = jnp.zeros_like(directions[0])
     units: list[tuple[jax.Array, jax.Array]] = []
     for v, product in zip(directions, products, strict=True):
         own = v
-        for unit, square in units:
-            own = own - (jnp.dot(v, unit) / square) * unit
+        for made in range(passes):
+            for unit, square in units:
+                own = own - (jnp.dot(own if made else v, unit) / square) * unit
         square = jnp.dot(own, own)
         use = square > jnp.maximum(DEPENDENT * jnp.dot(v, v), VANISHED)
         square = jnp.where(use, square, 1.0)

@@ -222,7 +222,7 @@ class ExplicitMethod(OneStepMethod):
     def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
         """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
         change, spheres = Gonzalez(NOISY), system.spheres
-        functions = [law.function for law in laws]
+        functions, blocks = [law.function for law in laws], system.blocks
         before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
 
         def landed(d):
@@ -245,12 +245,22 @@ class ExplicitMethod(OneStepMethod):
             return found if spheres is None else [spheres.along(end, v) for v in found]
 
         def corrected(made: int, d, ends, found) -> tuple:
-            """The displacement at last, what it misses of the levels, and the squares of the directions."""
-            missed, squares = misses(d, ends), jnp.stack([jnp.dot(v, v) for v in found])
+            """The displacement at last, what it misses of the levels, and the squares of the directions.
+
+            These are lengths by which what is missed becomes one like d: where parts of a state have units of their
+            own, as entropies beside a momentum, those by which a function changes most in d.
+            """
+            missed = misses(d, ends)
+            if len(blocks) == 1:
+                squares = jnp.stack([jnp.dot(v, v) for v in found])
+            else:
+                moved = jnp.sum(d * d)
+                most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
+                squares = jnp.stack(most) ** 2 / jnp.where(moved > 0.0, moved, 1.0)
 
             def again() -> tuple:
                 better = directions(d, ends) if 0 < made < 3 else found  # the last time they are as good as they get
-                nearer = landed(d + towards(better, missed))
+                nearer = landed(d + towards(better, missed, passes=min(len(blocks), 2)))
                 return corrected(made + 1, nearer, gradients(nearer), better)
 
             if made >= self.corrections:

@@ -13,6 +13,7 @@ from .mass_spring_gas import mass_spring_gas
 from .oscillator import damped_oscillator
 from .quantised_sphere import QuantisedSphere
 from .rigid_body import free_rigid_body, rigid_body
+from .rotors import damper_wheel, dual_spin, ring_damper
 from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
@@ -24,12 +25,15 @@ __all__ = [
     "body_with_wheels",
     "cylinder",
     "damped_oscillator",
+    "damper_wheel",
+    "dual_spin",
     "free_rigid_body",
     "gas_piston",
     "heat_grid",
     "mass_spring_gas",
     "moving_thermo_particles",
     "rigid_body",
+    "ring_damper",
     "single_spin",
     "spin_lattice",
     "thermo_particles",

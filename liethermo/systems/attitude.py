@@ -149,7 +149,7 @@ class AttitudeSystem(System):
         (mu, g), body = self.split(x), self.body
         dS = None if body.entropy is None else body.entropy.gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
-        return self.join(body._vector_field(mu), g @ body.algebra.hat(xi))
+        return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]))
 
     def _of_momentum(self, energy: Energy) -> Energy:
         terms = tuple(OfFirst(term, self.body.dim) for term in energy.terms)
@@ -201,12 +201,16 @@ class TurningSystem(System):
 
     def __init__(self, whole: AttitudeSystem, order: int):
         body = whole.body
-        self.whole, self.order, self.dim, self.space = whole, order, body.dim + body.algebra.dim, None
+        self.whole, self.order, self.dim, self.space = whole, order, body.dim + whole.group.dim, None
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _OnMomentum.of(body.dissipation, self.pulled)
         self.preserved_as, self.decided = body.preserved_as, body.decided
+
+    @property
+    def blocks(self):
+        return *self.whole.body.blocks, slice(self.whole.body.dim, None)
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
@@ -217,17 +221,18 @@ class TurningSystem(System):
     def field(self, x, dH, dS, dL=()):
         body, n = self.whole.body, self.whole.body.dim
         given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
-        turning = maps.inverse_dexp(body.algebra, self.angles(x), body.transport(*given), self.order)
+        algebra = self.whole.group.algebra
+        turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
         return jnp.concatenate([body.field(*given), UNIT * turning])
 
     # -- coordinates --------------------------------------------------------------------------------------------------
 
     def around(self, x) -> jax.Array:
         """The coordinates of a state around its own attitude."""
-        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.body.algebra.dim)])
+        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.group.dim)])
 
     def angles(self, v) -> jax.Array:
-        """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
+        """Theta of a vector of coordinates, shape (..., dim of the group)."""
         return v[..., self.whole.body.dim :] / UNIT
 
 

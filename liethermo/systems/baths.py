@@ -57,6 +57,12 @@ class HeatBaths(Module):
         else:
             self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
+    @property
+    def scale(self) -> np.ndarray | float:
+        """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
+        energy = self.energy
+        return np.asarray(energy.capacity) if isinstance(energy, Warmth) and not is_traced(energy) else 1.0
+
 
 def _positive(value, what: str, number: int) -> jax.Array:
     array = real_array(value)

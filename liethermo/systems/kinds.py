@@ -102,7 +102,7 @@ class Kind(Module):
         else:
             found = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
         if self.baths is not None:
-            found[..., self.body_dim :] *= min(1.0, 1.0 / scale)  # of a temperature exp(y) that is finite
+            found[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # of a temperature that is finite
         return found
 
     def outside(self, x) -> str:

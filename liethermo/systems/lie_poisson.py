@@ -41,7 +41,8 @@ class LiePoissonSystem(System):
     validate : bool
         Test the axioms at a few random points and refuse a system that fails.
     group : manifolds.MatrixGroup, optional
-        A group of this algebra: :func:`liethermo.integrate` then returns attitudes g(t) beside mu(t), with
+        A group of this algebra, or of the summand that it begins with where the other is abelian, as of a body with
+        wheels inside: :func:`liethermo.integrate` then returns attitudes g(t) beside mu(t), with
         ``g' = g hat(xi)``. There xi is :meth:`transport`: the gradient of H, and what friction inside adds to it. It
         is the body's, so that the momentum in space is ``Ad_star(inverse(g), mu)``, constant where no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
@@ -128,10 +129,7 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
         return None
     if not isinstance(group, mf.MatrixGroup):
         raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), not {type(group).__name__}")
-    fits = algebra.dim == group.algebra.dim and algebra.shape == group.algebra.shape
-    if not fits or not np.allclose(
-        algebra.structure_constants, group.algebra.structure_constants, rtol=0.0, atol=1e-12
-    ):
+    if not _acts(group.algebra, algebra):
         raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
     if reconstruction is None:
         reconstruction = _best_reconstruction(group)
@@ -139,6 +137,18 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
         raise InputError(f"the reconstruction is {', '.join(map(repr, _MAPS))}, not {reconstruction!r}")
     group._need(_MAPS[reconstruction])
     return reconstruction
+
+
+def _acts(own: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
+    """Whether an algebra is a group's own, or the sum of that and an abelian one: of parts that turn inside a body."""
+    n, more = own.dim, algebra.dim - own.dim
+    if more < 0 or (more > 0 and (len(algebra.shape) != 1 or algebra.dim > LARGEST_BODY)):
+        return False
+    if more == 0 and algebra.shape != own.shape:
+        return False
+    C = np.zeros((algebra.dim,) * 3)
+    C[:n, :n, :n] = own.structure_constants
+    return np.allclose(algebra.structure_constants, C, rtol=0.0, atol=1e-12)
 
 
 _MAPS = {"coadjoint": "adjoint_cayley", "cayley": "cayley", "exp": "exp"}
@@ -155,11 +165,7 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
 @functools.lru_cache(maxsize=64)
 def _of_a_body(algebra: mf.LieAlgebra) -> bool:
     """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body."""
-    if not 3 <= algebra.dim <= LARGEST_BODY or len(algebra.shape) != 1:
-        return False
-    rest = np.zeros((algebra.dim,) * 3)
-    rest[:3, :3, :3] = mf.so(3).structure_constants
-    return np.array_equal(algebra.structure_constants, rest)
+    return algebra.dim >= 3 and _acts(mf.so(3), algebra)
 
 
 LARGEST_BODY = 64

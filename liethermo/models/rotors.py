@@ -1,0 +1,279 @@
+"""Bodies with a part that turns inside about an axis fixed in them: damper wheel, ring damper, dual spin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..dissipation.base import Dissipation
+from ..dissipation.checks import checked_rate
+from ..dissipation.factor import Factor
+from ..errors import InputError
+from ..functions.conditions import require
+from ..functions.energy import Quadratic
+from ..functions.indices import Indices
+from ..systems import HeatBaths, LiePoissonSystem
+from .parameters import positive
+from .rigid_body import checked_inertia
+
+
+class InBearing(Dissipation):
+    """``p' = -k dH/dp`` of the momentum p of a rotor: the bearing rubs, and the angular momentum of the whole stays.
+
+    Parameters
+    ----------
+    friction : float, >= 0
+        k.
+    bath : Indices
+        The bath that it heats.
+    """
+
+    friction: jax.Array
+    bath: Indices = eqx.field(static=True)
+
+    @property
+    def energy_law(self):
+        return "nonincreasing"
+
+    @property
+    def entropy_law(self):
+        return None
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    def force(self, system, x, dH, dS, dL):
+        return jnp.zeros_like(x).at[3].set(-self.friction * dH[3])
+
+    def velocity(self, system, x, dH, dS, dL):
+        return jnp.zeros_like(dH)
+
+    def factor(self, system, x, dH, dL):
+        times = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
+        return Factor(1, times, True, velocity=lambda w: jnp.zeros_like(x)).scaled(self.friction)
+
+
+class InRotor(Dissipation):
+    """Friction inside the rotor: the double bracket in the axes of the rotor.
+
+    ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)``: what the rotor sees of the motion
+    of L is damped, and ``H' = -rate |L × (Omega + w a)|**2``. Of the platform it is that without a, with Omega alone.
+
+    Parameters
+    ----------
+    rate : float, >= 0
+    axis : array, shape (3,)
+        a, or zeros for friction inside the platform.
+    bath : Indices
+    """
+
+    rate: jax.Array
+    axis: jax.Array
+    bath: Indices = eqx.field(static=True)
+
+    @property
+    def energy_law(self):
+        return "nonincreasing"
+
+    @property
+    def entropy_law(self):
+        return None
+
+    @property
+    def needs_entropy(self) -> bool:
+        return False
+
+    def _moved(self, x, sigma) -> jax.Array:
+        turned = jnp.cross(x[:3], sigma)
+        return jnp.append(turned, jnp.dot(self.axis, turned))
+
+    def force(self, system, x, dH, dS, dL):
+        return self._moved(x, self.velocity(system, x, dH, dS, dL)[:3])
+
+    def velocity(self, system, x, dH, dS, dL):
+        return jnp.append(self.rate * jnp.cross(x[:3], dH[:3] + dH[3] * self.axis), 0.0)
+
+    def factor(self, system, x, dH, dL):
+        moved = lambda w: self._moved(x, w)  # noqa: E731
+        return Factor(3, moved, velocity=lambda w: jnp.append(w, 0.0)).scaled(self.rate)
+
+
+def damper_wheel(
+    inertia: Sequence[float] = (2.0, 1.6, 1.0),
+    axis: Sequence[float] = (0.0, 1.0, 0.0),
+    wheel: float = 0.1,
+    friction: float = 0.05,
+    capacity: float = 1.0,
+    temperature: float = 1.0,
+    attitude: bool = True,
+) -> LiePoissonSystem:
+    """A body with a wheel whose bearing is viscous, the simplest nutation damper [Hughes 1986, Likins 1967].
+
+    ``L' = L × Omega``, ``p' = -k w``, ``T y' = k w**2``, with the angular momentum ``L = I Omega + J w a`` of the whole
+    in body axes and that of the wheel about its axis, ``p = J (a . Omega + w)``, w its velocity relative to the body.
+    The energy ``Omega . I Omega / 2 + J w a . Omega + J w**2 / 2 + C (T - T_0)``, ``|L|`` and the angular momentum in
+    space are constant, and the body ends in a spin about the axis of greatest inertia with the wheel at rest: see
+    :func:`spin_temperature`.
+
+    Everything is in SI units, or in any other consistent ones. The state is (L, p, y).
+
+    Parameters
+    ----------
+    inertia : three positive numbers
+        Principal moments I of the whole, the wheel held fast (kg m**2).
+    axis : three numbers
+        a, the direction of the axis of the wheel in body axes, of any length.
+    wheel : float, > 0
+        J, the moment of the wheel about its axis (kg m**2), a part of I.
+    friction : float, >= 0
+        k (N m s).
+    capacity, temperature : float, > 0
+        Of the bath: C (J / K), and T_0 (K) at y = 0.
+    attitude : bool
+        Whether runs have attitudes of the body, elements of SO(3).
+
+    Raises
+    ------
+    InputError
+        If the body without the wheel had an inertia that is not positive, or another parameter cannot be used.
+    """
+    k, baths = checked_rate(friction), HeatBaths(capacity, temperature)
+    return _with_rotor(inertia, axis, wheel, lambda a: InBearing(k, Indices(0)), baths, attitude)
+
+
+def ring_damper(
+    inertia: Sequence[float] = (2.0, 1.6, 1.0),
+    axis: Sequence[float] = (0.0, 1.0, 0.0),
+    radius: float = 0.5,
+    tube: float = 0.02,
+    density: float = 1000.0,
+    viscosity: float = 0.05,
+    capacity: float = 1.0,
+    temperature: float = 1.0,
+    attitude: bool = True,
+) -> LiePoissonSystem:
+    """A body with a ring full of a viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
+
+    The liquid turns in the ring as a wheel does, see :func:`damper_wheel`, with ``J = 2 pi**2 rho a**2 R**3`` and, in
+    Poiseuille's flow, ``k = 16 pi**2 eta R**3``. That is for liquids so viscous that the profile of the flow follows
+    the nutation: ``a sqrt(omega rho / eta)`` is at most about 1.
+
+    Parameters
+    ----------
+    inertia : three positive numbers
+        Principal moments of the whole, the liquid held fast (kg m**2).
+    axis : three numbers
+        The normal of the ring in body axes, of any length.
+    radius, tube : float, > 0
+        R of the ring and a of the tube (m), a thin one: a is far below R.
+    density : float, > 0
+        rho of the liquid (kg / m**3).
+    viscosity : float, > 0
+        eta, the dynamic one (Pa s).
+    capacity, temperature : float, > 0
+        Of the bath: C (J / K), and T_0 (K) at y = 0.
+    attitude : bool
+        Whether runs have attitudes of the body, elements of SO(3).
+
+    Raises
+    ------
+    InputError
+    """
+    R, a = positive(radius, "radius"), positive(tube, "tube")
+    J = 2.0 * np.pi**2 * positive(density, "density") * a**2 * R**3
+    k = 16.0 * np.pi**2 * positive(viscosity, "viscosity") * R**3
+    baths = HeatBaths(capacity, temperature)
+    return _with_rotor(inertia, axis, J, lambda a: InBearing(k, Indices(0)), baths, attitude)
+
+
+def dual_spin(
+    inertia: Sequence[float] = (1.0, 1.0, 0.6),
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    rotor: float = 0.3,
+    friction: float = 0.0,
+    platform_rate: float = 0.0,
+    rotor_rate: float = 0.0,
+    capacity: Sequence[float] | float = 1.0,
+    temperature: Sequence[float] | float = 1.0,
+    attitude: bool = True,
+) -> LiePoissonSystem:
+    """Two bodies on a common axis, each with friction inside: a satellite with dual spin [Likins 1967].
+
+    The platform carries body axes; the rotor, round about the axis a, turns by w relative to it. As in
+    :func:`damper_wheel`, ``L = I Omega + J w a`` and ``p = J (a . Omega + w)``. Friction inside the platform damps
+    what it sees of the motion of L, ``L × Omega``, and friction inside the rotor ``L × (Omega + w a)``: each is a
+    double bracket in axes of its own, so |L| and the angular momentum in space are constant, and each heats a bath of
+    its own. The bearing heats the platform. Where the rotor carries most of L along a, the spin about a is stable though its moment is not the
+    greatest, as long as the platform damps and the rotor hardly does.
+
+    Everything is in SI units, or in any other consistent ones. The state is (L, p, y of the platform, y of the rotor).
+
+    Parameters
+    ----------
+    inertia : three positive numbers
+        Principal moments I of the whole in axes of the platform, the rotor held fast (kg m**2).
+    axis : three numbers
+        a, the direction of the common axis in those axes, of any length.
+    rotor : float, > 0
+        J, the moment of the rotor about the axis (kg m**2), a part of I.
+    friction : float, >= 0
+        k of the bearing (N m s).
+    platform_rate, rotor_rate : float, >= 0
+        Of the friction inside the two (s / (kg m**2)), as of :func:`tumbling_body`.
+    capacity, temperature : float, > 0, or two
+        Of the baths, platform first: C (J / K), and T_0 (K) at y = 0.
+    attitude : bool
+        Whether runs have attitudes of the platform, elements of SO(3).
+
+    Raises
+    ------
+    InputError
+    """
+    k, rates = checked_rate(friction), (checked_rate(platform_rate), checked_rate(rotor_rate))
+
+    def inside(a) -> list[Dissipation]:
+        none = jnp.zeros(3)
+        return [InBearing(k, Indices(0)), InRotor(rates[0], none, Indices(0)), InRotor(rates[1], a, Indices(1))]
+
+    return _with_rotor(inertia, axis, rotor, inside, HeatBaths(capacity, temperature, number=2), attitude)
+
+
+def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:
+    """The temperature (K) at which a body left to itself has come to its spin, with one bath and parts at rest.
+
+    Parameters
+    ----------
+    momentum : float
+        The size of the angular momentum (kg m**2 / s).
+    energy : float
+        The whole (J).
+    inertia, capacity, temperature
+        As the models have them.
+    """
+    return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * max(inertia))) / capacity
+
+
+def _with_rotor(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
+    """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
+    I, J = jnp.asarray(checked_inertia(inertia)), positive(rotor, "the moment of the rotor")
+    direction = np.asarray(axis, dtype=float)
+    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+        raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
+    a = jnp.asarray(direction / np.linalg.norm(direction))
+    left = 1.0 - J * jnp.dot(a, a / I)
+    require(
+        left, lambda v: v > 0.0, "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}"
+    )
+    B = jnp.diag(1.0 / I) + J / left * jnp.outer(a / I, a / I)
+    Ba = a / I / left
+    A = jnp.block([[B, -Ba[:, None]], [-Ba[None], (1.0 / J + jnp.dot(a, Ba))[None, None]]])
+    algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
+    group = mf.SO(3) if attitude else None
+    return LiePoissonSystem(algebra, Quadratic(A), dissipation=inside(a), group=group, baths=baths)

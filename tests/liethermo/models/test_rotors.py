@@ -1,0 +1,127 @@
+"""Bodies with a wheel, a ring or a rotor against DOP853 of the equations of Newton and Euler in velocities."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+from liethermo.models.rotors import spin_temperature
+
+INERTIA, AXIS, START = np.array([2.0, 1.6, 1.0]), np.array([0.1, 1.0, -0.3]), np.array([0.4, 0.3, 1.2])
+
+
+def velocities(inertia, a, J, k, L, p, t_end, inside=lambda L, Omega, w: (np.zeros(3), 0.0)):
+    """(Omega, w) and the heat of the bearing: ``(L)' + Omega × L = 0`` and ``J (a . Omega + w)' = -k w``."""
+    a = a / np.linalg.norm(a)
+    mass = np.block([[np.diag(inertia), J * a[:, None]], [J * a[None], np.array([[J]])]])
+
+    def f(t, s):
+        Omega, w = s[:3], s[3]
+        L = inertia * Omega + J * w * a
+        turning, along = inside(L, Omega, w)
+        return np.append(np.linalg.solve(mass, np.append(np.cross(L, Omega + turning), along - k * w)), k * w**2)
+
+    start = np.append(np.linalg.solve(mass, np.append(L, p)), 0.0)
+    run = solve_ivp(f, (0.0, t_end), start, "DOP853", rtol=3e-14, atol=1e-15)
+    Omega, w = run.y[:3, -1], run.y[3, -1]
+    return np.append(inertia * Omega + J * w * a, J * (a / 1.0 @ Omega + w)), run.y[4, -1]
+
+
+@pytest.mark.parametrize("ring", [False, True], ids=["wheel", "ring"])
+def test_a_nutation_damper_against_velocities(ring):
+    if ring:
+        R, r, rho, eta = 0.5, 0.01, 900.0, 0.01
+        system = lt.models.ring_damper(INERTIA, AXIS, R, r, rho, eta, capacity=2.0)
+        mass_of_liquid, length = rho * np.pi * r**2 * 2 * np.pi * R, 2 * np.pi * R
+        J, k = mass_of_liquid * R**2, 8 * np.pi * eta * length * R * R  # Poiseuille: a force 8 pi eta length speed
+    else:
+        J, k = 0.2, 0.15
+        system = lt.models.damper_wheel(INERTIA, AXIS, J, k, capacity=2.0)
+    run = lt.integrate(system, [*START, 0.1], (0.0, 20.0), 0.05, lt.MetriplecticGauss(3))
+    expected, heat = velocities(INERTIA, AXIS, J, k, START, 0.1, 20.0)
+    assert np.allclose(run.x[-1, :4], expected, rtol=0, atol=2e-9)
+    assert 2.0 * (float(system.temperatures(run.x[-1])[0]) - 1.0) == pytest.approx(heat, abs=1e-9)
+    audit = run.audit()
+    assert audit.passed
+    assert "drift of mu1**2 + mu2**2 + mu3**2" in {row.law for row in audit.rows}
+    assert np.ptp(np.linalg.norm(run.x[:, :3], axis=1)) < 4e-15
+    assert np.allclose(run.provenance["inertia"], np.diag(INERTIA), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        lt.MetriplecticMidpoint(),
+        lt.MetriplecticGauss(2),
+        pytest.param(lt.MetriplecticRungeKutta(6), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize(
+    "system",
+    [
+        pytest.param(lambda: lt.models.damper_wheel(INERTIA, AXIS, 0.2, 0.15), id="wheel"),
+        pytest.param(lambda: lt.models.dual_spin(INERTIA, AXIS, 0.2, 0.1, 0.05, 0.03), id="dual spin"),
+    ],
+)
+def test_the_momentum_in_space_is_constant(system, method):
+    run = lt.integrate(system(), [*START, 0.1], (0.0, 20.0), 0.1, method)
+    S = np.einsum("tij,tj->ti", run.attitude, run.x[:, :3])
+    assert np.abs(S - S[0]).max() < 1e-14
+    rows = {row.law: row for row in run.audit().rows}
+    assert rows["drift of momentum in space"].passed is not False  # Gauss methods do not promise it here
+    assert np.abs(np.diff(run.attitude[:, 0, 0])).max() > 0.01  # it turns
+
+
+def test_a_damper_wheel_brings_the_body_to_its_spin():
+    """About the axis of greatest inertia of the whole, the wheel at rest, as warm as the balance says."""
+    system = lt.models.damper_wheel(INERTIA, AXIS, 0.2, 0.15, capacity=2.0, temperature=3.0, attitude=False)
+    run = lt.integrate(system, [*START, 0.1], (0.0, 2000.0), 0.2)
+    assert np.sin(lt.bodies.nutation(run)[-1]) < 1e-6
+    end = spin_temperature(np.linalg.norm(START), run.energy[0], INERTIA, 2.0, 3.0)
+    assert float(system.temperatures(run.x[-1])[0]) == pytest.approx(end, rel=1e-11)
+
+
+def test_dual_spin_against_velocities():
+    a, J, k, rates = np.array([0.0, 0.0, 1.0]), 0.3, 0.02, (0.05, 0.03)
+    inertia = np.array([1.1, 1.0, 0.6])
+    system = lt.models.dual_spin(inertia, a, J, k, *rates, capacity=(2.0, 3.0))
+
+    def inside(L, Omega, w):
+        of_platform, of_rotor = (r * np.cross(L, v) for r, v in zip(rates, (Omega, Omega + w * a), strict=True))
+        return of_platform + of_rotor, a @ np.cross(L, of_rotor)
+
+    run = lt.integrate(system, [*START, 0.5], (0.0, 20.0), 0.05, lt.MetriplecticGauss(3))
+    expected, _ = velocities(inertia, a, J, k, START, 0.5, 20.0, inside)
+    assert np.allclose(run.x[-1, :4], expected, rtol=0, atol=2e-9)
+    assert run.audit().passed
+    assert np.diff(run.x[:, 4:], axis=0).min() >= 0.0  # each is warmed
+    assert np.ptp(np.linalg.norm(run.x[:, :3], axis=1)) < 4e-15
+
+
+@pytest.mark.parametrize(("damped", "ends"), [("platform_rate", 0.0), ("rotor_rate", 0.5 * np.pi)])
+def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stable(damped, ends):
+    """A despun platform that damps keeps a rod's spin [Likins 1967]; a rotor that damps leaves it for the flat spin."""
+    system = lt.models.dual_spin((1.0, 1.0, 0.6), (0, 0, 1), 0.3, **{damped: 0.2})
+    L = np.array([0.2, 0.0, 1.0])  # the platform is nearly despun: p carries L along the axis
+    run = lt.integrate(system, [*L, 1.0], (0.0, 300.0), 0.1)
+    nutation = lt.bodies.nutation(run, (0, 0, 1))
+    assert nutation[0] == pytest.approx(np.arctan(0.2))
+    assert (nutation[-1] < 1e-3) if ends == 0.0 else (nutation[-1] > 1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: lt.models.damper_wheel(wheel=1.7), "less than the inertia of the whole"),
+        (lambda: lt.models.damper_wheel(axis=(0, 0, 0)), "three numbers that are not all zero"),
+        (lambda: lt.models.damper_wheel(friction=-1.0), "must be >= 0"),
+        (lambda: lt.models.ring_damper(viscosity=0.0), "viscosity must be positive"),
+        (lambda: lt.models.dual_spin(capacity=(1.0, 2.0, 3.0)), "one number, or has shape"),
+        (lambda: lt.models.dual_spin(rotor=-0.1), "must be positive"),
+    ],
+)
+def test_what_is_refused(make, told):
+    with pytest.raises(lt.InputError, match=told) as error:
+        make()
+    assert "\n" not in str(error.value)
