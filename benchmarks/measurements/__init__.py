@@ -2,6 +2,7 @@
 
 NAMES = (
     "single_body",
+    "isolated_body",
     "general",
     "variational",
     "spin",

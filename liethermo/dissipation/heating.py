@@ -33,9 +33,12 @@ class Heating(Carried):
     ----------
     bath : Indices, of shape () or that of the sites
         The number of the bath that takes the heat, from 0; of all sites, or of each.
+    positive : bool
+        Whether the temperatures are positive in every state. Then the motion of the body does not wait for them.
     """
 
     bath: Indices = eqx.field(static=True)
+    positive: bool = eqx.field(static=True)
 
     @property
     def energy_law(self):
@@ -91,6 +94,8 @@ class Heating(Carried):
 
         A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series.
         """
+        if self.positive:
+            return jnp.ones(np.shape(self.bath)).ravel() if self.by_site else jnp.ones(())
         return jnp.where(self._of(T) < 0.0, -1.0, 1.0)
 
     def warming(self, lost, T) -> jax.Array:
@@ -136,9 +141,9 @@ class BesideBaths(Carried):
 
 
 def heated(
-    dissipation: Dissipation | None, body: Geometry, number: int, pulled: Callable[[Energy], Energy]
+    dissipation: Dissipation | None, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
 ) -> Dissipation:
-    """The dissipation of a body, beside baths that take its heat.
+    """The dissipation of a body, beside a number of baths, of positive temperatures or any, that take its heat.
 
     Raises
     ------
@@ -152,11 +157,13 @@ def heated(
             "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
             f"{found}: leave out baths="
         )
-    carried = tuple(_carried(part, body, number, pulled) for part in parts)
+    carried = tuple(_carried(part, body, number, positive, pulled) for part in parts)
     return carried[0] if len(carried) == 1 else Several(carried)
 
 
-def _carried(part: Dissipation, body: Geometry, number: int, pulled: Callable[[Energy], Energy]) -> Dissipation:
+def _carried(
+    part: Dissipation, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
+) -> Dissipation:
     functions = tuple(map(pulled, part.preserve))
     if part.energy_law != "nonincreasing":
         return BesideBaths(part, functions)
@@ -169,4 +176,4 @@ def _carried(part: Dissipation, body: Geometry, number: int, pulled: Callable[[E
     if not (numbers.min() >= 0 and numbers.max() < number):
         outside = int(numbers[(numbers < 0) | (numbers >= number)][0]) if numbers.shape else int(numbers)
         raise InputError(f"a dissipation heats bath {outside}, but there are {number}, which count from 0")
-    return Heating(part, functions, bath)
+    return Heating(part, functions, bath, positive)

@@ -64,7 +64,7 @@ class InRotor(Dissipation):
     """Friction inside the rotor: the double bracket in the axes of the rotor.
 
     ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)``: what the rotor sees of the motion
-    of L is damped, and ``H' = -rate |L × (Omega + w a)|**2``. Of the platform it is that without a, with Omega alone.
+    of L is damped, and ``H' = -rate |L × (Omega + w a)|**2``. Friction inside the platform is that without a.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def dual_spin(
     :func:`damper_wheel`, ``L = I Omega + J w a`` and ``p = J (a . Omega + w)``. Friction inside the platform damps
     what it sees of the motion of L, ``L × Omega``, and friction inside the rotor ``L × (Omega + w a)``: each is a
     double bracket in axes of its own, so |L| and the angular momentum in space are constant, and each heats a bath of
-    its own. The bearing heats the platform. Where the rotor carries most of L along a, the spin about a is stable though its moment is not the
-    greatest, as long as the platform damps and the rotor hardly does.
+    its own. The bearing heats the platform. Where the rotor carries most of L along a, the spin about a is stable
+    though its moment is not the greatest, as long as the platform damps and the rotor hardly does.
 
     Everything is in SI units, or in any other consistent ones. The state is (L, p, y of the platform, y of the rotor).
 

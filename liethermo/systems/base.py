@@ -127,7 +127,7 @@ class System(Kind):
     def _heat(self, baths: HeatBaths) -> None:
         """Put baths beside the body that this system has been so far."""
         body, n, m = copy(self), self.dim, baths.number
-        self.dissipation = heated(self.dissipation, body, m, self._of_body)
+        self.dissipation = heated(self.dissipation, body, m, baths.positive, self._of_body)
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m

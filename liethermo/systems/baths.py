@@ -58,6 +58,11 @@ class HeatBaths(Module):
             self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
     @property
+    def positive(self) -> bool:
+        """Whether every state has positive temperatures, by form."""
+        return isinstance(self.energy, Warmth)
+
+    @property
     def scale(self) -> np.ndarray | float:
         """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
         energy = self.energy

@@ -1,0 +1,80 @@
+"""The isolated body with friction inside beside the relaxed one of the paper: a step, and the first trajectory."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+
+import liethermo as lt
+
+from .. import child, laws
+from ..contest import RELAXATION, STEP
+from ..report import Report, Table, Target, ratio
+from ..timing import race
+
+INERTIA, START = (3.0, 2.0, 1.5), (0.06, 0.1, 1.0)
+
+METHODS = (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6))
+
+SCRIPT = """
+import json, time
+
+import liethermo as lt
+
+body = lt.models.tumbling_body({inertia}, rate=0.1)
+solution = lt.integrate(body, {start}, (0.0, 100.0), 0.1, lt.{method}, engine="compiled")
+print(json.dumps([time.monotonic(), solution.audit().passed]))
+"""
+
+
+def run(quick: bool) -> Report:
+    """Race both bodies, the isolated one with its attitude too; start its first trajectory with a cache and without."""
+    steps, rounds = (2000, 1) if quick else (300_000, 7)
+    rate = RELAXATION / (STEP * steps)
+    bodies = {
+        "relaxed body": lt.models.rigid_body(INERTIA, rate),
+        "isolated body": lt.models.tumbling_body(INERTIA, rate=rate, attitude=False),
+        "isolated body, attitude": lt.models.tumbling_body(INERTIA, rate=rate),
+    }
+    rows, targets = [], []
+    for method in METHODS[: 1 if quick else None]:
+        works = {
+            name: lambda body=body, method=method: lt.integrate(  # type: ignore[misc]
+                body, START, (0.0, STEP * steps), STEP, method, save_every=steps, engine="compiled"
+            )
+            for name, body in bodies.items()
+        }
+        outcomes = race(works, rounds=rounds)
+        first = outcomes["relaxed body"].processor
+        for name, outcome in outcomes.items():
+            beside = ratio(outcome.processor, first)
+            cells = laws.of_solution(outcome.result).cells()
+            rows.append([f"{name}, {method}", outcome.processor / steps, beside, *cells])
+            if name == "isolated body":
+                targets.append(Target(f"a step of the isolated body beside the relaxed one, {method}", 1.5, beside))
+    columns = {"": "text", "Time a step": "seconds", "Relative to the relaxed body": "ratio"} | laws.COLUMNS
+    table = Table(f"A run of {steps:,} steps of size {STEP}; one state kept.", columns, rows)
+
+    again, calls = [], ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)")
+    for method in calls:
+        script = SCRIPT.format(inertia=INERTIA, start=START, method=method)
+        with tempfile.TemporaryDirectory() as cache:
+            cold, *cached = [_seconds(script, cache) for _ in range(2 if quick else 4)]
+        again.append([method, cold, min(cached)])
+        targets.append(Target(f"first trajectory with attitude, cached, {method}", 1.5, min(cached), "seconds"))
+    calls_table = Table(
+        "1000 steps with attitudes in a new process, from its start to its end.",
+        {"": "text", "Empty cache": "seconds", "Cached": "seconds"},
+        again,
+    )
+    text = "Friction inside a body, its heat in a bath and its attitude, beside Morrison's body. Processor times."
+    return Report("The isolated body", text, [table, calls_table], targets)
+
+
+def _seconds(script: str, cache: str) -> float:
+    start = time.monotonic()  # one clock for all processes
+    done, passed = json.loads(child.python("-c", script, cache=cache))
+    if not passed:
+        raise RuntimeError("the audit of the isolated body failed")
+    return done - start
