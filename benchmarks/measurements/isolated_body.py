@@ -40,7 +40,7 @@ def run(quick: bool) -> Report:
     rows, targets = [], []
     for method in METHODS[: 1 if quick else None]:
         works = {
-            name: lambda body=body, method=method: lt.integrate(  # type: ignore[misc]
+            name: lambda body=body, method=method: lt.integrate(
                 body, START, (0.0, STEP * steps), STEP, method, save_every=steps, engine="compiled"
             )
             for name, body in bodies.items()
@@ -57,12 +57,12 @@ def run(quick: bool) -> Report:
     table = Table(f"A run of {steps:,} steps of size {STEP}; one state kept.", columns, rows)
 
     again, calls = [], ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)")
-    for method in calls:
-        script = SCRIPT.format(inertia=INERTIA, start=START, method=method)
+    for call in calls:
+        script = SCRIPT.format(inertia=INERTIA, start=START, method=call)
         with tempfile.TemporaryDirectory() as cache:
             cold, *cached = [_seconds(script, cache) for _ in range(2 if quick else 4)]
-        again.append([method, cold, min(cached)])
-        targets.append(Target(f"first trajectory with attitude, cached, {method}", 1.5, min(cached), "seconds"))
+        again.append([call, cold, min(cached)])
+        targets.append(Target(f"first trajectory with attitude, cached, {call}", 1.5, min(cached), "seconds"))
     calls_table = Table(
         "1000 steps with attitudes in a new process, from its start to its end.",
         {"": "text", "Empty cache": "seconds", "Cached": "seconds"},
