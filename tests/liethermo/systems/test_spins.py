@@ -174,6 +174,7 @@ def test_each_site_heats_its_own_bath():
 def test_the_force_is_that_of_its_factor_for_any_gradients(baths):
     system = small(baths=baths, bath=None if baths is True else np.array([1, 0, 1]))
     x, dH, dS = RANDOM.standard_normal((3, system.dim))
+    dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # temperatures, which constant capacities have above zero
     B = system.dissipation.factor(system, x, jnp.asarray(dH), ())
     force = system.dissipation.force(system, x, jnp.asarray(dH), jnp.asarray(dS), ())
     np.testing.assert_allclose(force, B.times(B.transposed(jnp.asarray(dS))), atol=1e-13)
