@@ -143,7 +143,7 @@ class BesideBaths(Carried):
 def heated(
     dissipation: Dissipation | None, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
 ) -> Dissipation:
-    """The dissipation of a body, beside a number of baths, of positive temperatures or any, that take its heat.
+    """The dissipation of a body, beside baths that take its heat: so many, of positive temperatures or of any.
 
     Raises
     ------
