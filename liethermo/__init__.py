@@ -57,6 +57,7 @@ from .integrators import (
     WithAttitude,
     registered_methods,
 )
+from .models import torques
 from .results.audit import Audit
 from .results.ensemble import Ensemble
 from .results.load import load
@@ -198,6 +199,7 @@ __all__ = [
     "suggest_method",
     "suggest_step",
     "testing",
+    "torques",
     "zipped",
 ]
 

@@ -54,6 +54,11 @@ class Dissipation(Module):
         """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
         return True
 
+    @property
+    def noiseless(self) -> bool:
+        """Whether it is what acts from outside and no friction at all, so that no noise belongs to it."""
+        return False
+
     def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:
         """Which components of the force depend on which components of the state and of the gradients it is handed.
 

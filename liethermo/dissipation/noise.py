@@ -26,7 +26,7 @@ def factors(dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence) -> 
         If one has none.
     """
     found = []
-    for part, own in portions(dissipation, dL):
+    for part, own in _noisy(dissipation, dL):
         B = part.factor(system, x, dH, own)
         if B is None:
             where = "" if system.space is None else f" on {system.space.name}"
@@ -40,7 +40,7 @@ def factors(dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence) -> 
 
 def divergence(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
     """The divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
-    return jnp.concatenate([jnp.zeros(0), *(part.divergence(system, x) for part in dissipation.terms)])
+    return jnp.concatenate([jnp.zeros(0), *(part.divergence(system, x) for part, _ in _noisy(dissipation))])
 
 
 def factors_at(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
@@ -55,7 +55,7 @@ def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Ar
     away = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape[0]))
     found: dict[str, list[jax.Array]] = {SQUARE: [], KERNEL: [], DIVERGENCE: []}
     parts = factors_at(dissipation, system, x)
-    for (part, B), (_, own) in zip(parts, portions(dissipation, dissipation.preserve), strict=True):
+    for (part, B), (_, own) in zip(parts, _noisy(dissipation, dissipation.preserve), strict=True):
         dL, keeps = tuple(L.gradient(x) for L in own), part.energy_law == "conserved"
         force = part.force(system, x, dH, away, dL)
         square = B.times(B.transposed(away)) if keeps else -B.times(B.transposed(dH))
@@ -68,6 +68,12 @@ def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Ar
             varies = jnp.max(jnp.abs(changes)) + size / (1.0 + jnp.linalg.norm(x))  # the former may be rounding alone
             found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), varies))
     return {name: jnp.max(jnp.stack(values)) for name, values in found.items() if values}
+
+
+def _noisy(dissipation: Dissipation, preserved: Sequence | None = None) -> list[tuple[Dissipation, tuple]]:
+    """The summands that noise may belong to, each with its portion of what belongs to the functions that they keep."""
+    parts = portions(dissipation, dissipation.preserve if preserved is None else preserved)
+    return [(part, own) for part, own in parts if not part.noiseless]
 
 
 def _relative(missed, size) -> jax.Array:

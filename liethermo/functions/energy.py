@@ -331,8 +331,13 @@ class Pullback(Energy):
     def value(self, x) -> jax.Array:
         return self.term.value(self.of(x))
 
+    def gradient(self, x) -> jax.Array:
+        y, back = jax.vjp(self.of, x)
+        return back(self.term.gradient(y))[0]  # in its own way, where it has one
+
     def sensitivity(self, x) -> jax.Array:
-        own = self.function is None or isinstance(self.term, WithTime)  # no more than a choice of components, in units
+        chosen = getattr(self.function, "in_other_units", False) or isinstance(self.term, WithTime)
+        own = self.function is None or chosen  # no more than a choice of components, in units
         return self.term.sensitivity(self.of(x)) if own else super().sensitivity(x)
 
     def discrete_gradient(self, scheme, x, d, low) -> jax.Array:

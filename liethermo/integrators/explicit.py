@@ -142,7 +142,8 @@ class ExplicitMethod(OneStepMethod):
         but does not move. Near these the turn that makes up for an error is much larger than the error.
         """
         casimirs = system.casimirs()
-        return system.has_all_casimirs and casimirs.keys() <= set(self.held) and system.body_dim - len(casimirs) <= 2
+        held = bool(system.pushed_by) or casimirs.keys() <= set(self.held)  # of a torque, the impulse is made to fit
+        return system.has_all_casimirs and held and system.body_dim - len(casimirs) <= 2
 
     def on(self, system: System) -> OneStepMethod:
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))

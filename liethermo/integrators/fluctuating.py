@@ -151,7 +151,7 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
     """
     if not isinstance(method, MetriplecticMidpoint):
         raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
-    if system.dissipation is None:
+    if system.dissipation is None or all(part.noiseless for part in system.dissipation.terms):
         raise InputError("noise belongs to a dissipation, and this system has none")
     lowers = [part for part in system.dissipation.terms if part.energy_law != "conserved"]
     if lowers and temperature is None:

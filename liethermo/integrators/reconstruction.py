@@ -10,8 +10,9 @@ from manifolds.groups.maps import central, from_adjoint_cayley, inverse_dexp
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
+from ..functions.frames import towards
 from ..functions.gradients import compensated
-from ..systems import SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
+from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
 from .base import OneStepMethod
 from .tableaus import gauss
 
@@ -45,6 +46,13 @@ class WithAttitude(OneStepMethod):
     Explicit methods turn by ``"exp"``, whatever is asked for: their step is that of (mu, theta), ``g' = g exp(theta)``.
     Where no torque acts they turn a little further, by no more than the error of the step, so that the momentum in
     space is what it was: on coadjoint orbits of two dimensions, as those of SO(3), SU(2), SL(2) and SE(2) are.
+
+    A torque that depends on the attitude is taken at those of the stages, which follow from the slopes of the momentum:
+    so the unknowns of a step are the same. Its impulse is ``h sum_i b_i Ad_star(inverse(g), tau)_i`` with the same
+    collocation on the matrices Ad(g). What is bilinear in these and in mu is kept by it, and so the momentum in space
+    less the impulse is constant to rounding, where it is without a torque. Explicit methods make the impulse by a
+    quadrature of their order. It moves, and the attitude turns, by no more than the error of the step, so that the same
+    holds.
 
     Momenta are those that the method gives without attitudes; the order is the same for all three.
 
@@ -81,7 +89,7 @@ class WithAttitude(OneStepMethod):
         return WithAttitude(self.method.driven_by(dW), self.kind)
 
     def keeps(self, system, name: str) -> bool:
-        if name != SPATIAL_MOMENTUM:
+        if name not in (SPATIAL_MOMENTUM, WITHOUT_IMPULSE):
             return self.method.keeps(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
         return (self.explicit or follows) and self.method.transports(system.body)
@@ -91,37 +99,46 @@ class WithAttitude(OneStepMethod):
         return self.method.explicit
 
     def check(self, system) -> None:
-        self.method.check(system.body)
+        body = system.body
+        self.method.check(body.turned(system.group.identity) if isinstance(body, DrivenSystem) else body)
 
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
     def unknowns(self, system: AttitudeSystem) -> int:  # type: ignore[override]
-        return self.method.unknowns(system.body) + (system.group.dim if self.explicit else 0)
+        if not self.explicit:
+            return self.method.unknowns(system.body)
+        return self.method.unknowns(TurningSystem(system, self.order, system.group.identity))
 
     def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
-        return self.method.judged(system.body, system.points(x))
+        return self.method.judged(system.body_at(x), system.points(x))
 
     def slopes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
         """Those of the momentum; of an explicit method those of the angles beside it."""
-        if not self.explicit:
-            return self.method.slopes(system.body, system.points(x), system.points(low), h, k)
-        local = TurningSystem(system, self.order)
-        return self.method.pulled(local).slopes(local, local.around(x), local.around(low), h, k)
+        method, mu, mu_low = self.method, system.points(x), system.points(low)
+        if self.explicit:
+            local = TurningSystem(system, self.order, system.split(x)[1])
+            return method.pulled(local).slopes(local, local.around(x), local.around(low), h, k)
+        body = system.body
+        if not (isinstance(body, DrivenSystem) and body.needs_attitude):
+            return method.slopes(body, mu, mu_low, h, k)
+        pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_low, h, k))
+        found = pushed(self._torques(system, x, low, h, k))  # all stages with the torques of all
+        return jnp.stack([found[i, i] for i in range(self.stages)])
 
     def increment(self, h, k) -> jax.Array:
         return self.method.increment(h, k)
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body, system.points(x))
-        local = TurningSystem(system, self.order)
+            return self.method.start(system.body_at(x), system.points(x))
+        local = TurningSystem(system, self.order, system.split(x)[1])
         return self.method.start(local, local.around(x))
 
     def missed(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.missed(system.body, system.points(x), system.points(low), h, system.points(k))
 
     def error(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        return self.method.error(system.body, system.points(x), system.points(low), h, system.points(k))
+        return self.method.error(system.body_at(x), system.points(x), system.points(low), h, system.points(k))
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
@@ -129,27 +146,73 @@ class WithAttitude(OneStepMethod):
         (mu, g), (mu_low, g_low) = system.split(x), system.split(low)
         new, new_low = self.method.move(system.body, mu, mu_low, h, system.points(k))
         if self.explicit:
-            group, theta = system.group, TurningSystem(system, self.order).angles(self.increment(h, k))
-            turn = group.exp_map(group.algebra, theta)
-            if system.body.torque_free and self.method.transports(system.body):
-                turn = _carrying(group, turn, mu[: group.algebra.dim], new[: group.algebra.dim])
-            return system.join(new, group.restore_map(g @ turn)), system.join(new_low, jnp.zeros_like(g))
+            return self._moved_explicitly(system, x, low, new, new_low, h, k)
         xi = h * self.method.velocities(system.body, mu, mu_low, h, k)[:, : system.group.dim]
+        p, p_low = self._in_space(system, x, low, h, k, xi) if system.pushed_by else (None, None)
         if self.kind == "cayley":
             gained = (g + g_low) @ _collocated(system.group.algebra.hat(xi))
             turned, turned_low = compensated(g, g_low + gained)
-            return system.join(new, turned), system.join(new_low, turned_low + _missing(system.group, turned))
-        if self.kind == "exp":
-            group, theta = system.group, self._angles(system.group.algebra, xi)
-            turned = group.restore_map(g @ group.exp_map(group.algebra, theta))
+            return system.join(new, turned, p), system.join(new_low, turned_low + _missing(system.group, turned), p_low)
+        turned = system.group.restore_map(g @ self._turn(system.group, xi))
+        return system.join(new, turned, p), system.join(new_low, jnp.zeros_like(g), p_low)
+
+    def _moved_explicitly(self, system: AttitudeSystem, x, low, new, new_low, h, k) -> tuple[jax.Array, jax.Array]:
+        (mu, g), group, n = system.split(x), system.group, system.group.dim
+        local, step = TurningSystem(system, self.order, g), self.increment(h, k)
+        turn, p, p_low = group.exp_map(group.algebra, local.angles(step)), None, None
+        follows = system.body.torque_free and self.method.transports(system.body)
+        before = mu[:n]
+        if system.pushed_by:
+            p, p_low = compensated(system.in_space(x), system.in_space(low) + local.in_space(step))
+            if follows:
+                p, p_low = _on_orbit(system.momenta, p, new[:n]), jnp.zeros_like(p)
+            before = group.Ad_star(g, p)
+        if follows:
+            turn = _carrying(group, turn, before, new[:n])
+        turned = group.restore_map(g @ turn)
+        return system.join(new, turned, p), system.join(new_low, jnp.zeros_like(g), p_low)
+
+    def _turn(self, group, xi) -> jax.Array:
+        """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
+        if self.kind == "coadjoint":
+            return self._coadjoint(group, xi)
+        return group.exp_map(group.algebra, gauss(len(xi)).b @ self._rates(group.algebra, xi))
+
+    def _attitudes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:
+        """Those at the stages, at which torques are taken, shape (stages, m, m), in the group."""
+        (mu, g), (mu_low, g_low), group = system.split(x), system.split(low), system.group
+        xi = h * self.method.velocities(system.body, mu, mu_low, h, k)[:, : system.group.dim]
+        if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
+            return g @ group.exp_map(group.algebra, gauss(len(xi)).A @ self._rates(group.algebra, xi))
+        if self.kind == "cayley":
+            found = (g + g_low) @ _stages(group.algebra.hat(xi))
         else:
-            turned = system.group.restore_map(g @ self._coadjoint(system.group, xi))
-        return system.join(new, turned), system.join(new_low, jnp.zeros_like(g))
+            found = 0.5 * (g + g @ self._turn(group, xi))[None]  # the same from either end
+        for _ in range(RESTORED):
+            found = group.restore_map(found)
+        return found
+
+    def _torques(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:
+        """Those at the stages, shape (stages, size of a state of the body without its clock)."""
+        body, states = system.body, system.points(x) + (system.points(low) + h * (gauss(len(k)).A @ k))
+        assert isinstance(body, DrivenSystem)
+        if not body.needs_attitude:
+            return jax.vmap(body.push)(states)
+        attitudes = self._attitudes(system, x, low, h, k)
+        return jax.vmap(lambda g, state: body.turned(g).push(state))(attitudes, states)
+
+    def _in_space(self, system: AttitudeSystem, x, low, h, k, xi) -> tuple[jax.Array, jax.Array]:
+        """The momentum in space as the impulse of the step makes it, and what rounding keeps from it."""
+        torques = self._torques(system, x, low, h, k)[:, : system.group.dim]
+        actions = _stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(-1, -2)  # Ad(inverse(g)), relative
+        impulse = h * jnp.einsum("i,ia,iab->b", gauss(len(xi)).b, torques, actions)
+        gained = impulse @ system.to_space(system.split(x)[1])
+        return compensated(system.in_space(x), system.in_space(low) + gained)
 
     def along(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """With the momentum displaced: what is looked at on the way of a step are functions of that."""
         mu, g = system.split(x)
-        return system.join(mu + system.points(v), g)
+        return system.join(mu + system.points(v), g, system.in_space(x))
 
     @staticmethod
     def _coadjoint(group, xi) -> jax.Array:
@@ -164,15 +227,15 @@ class WithAttitude(OneStepMethod):
         x = from_adjoint_cayley(algebra, R) + central(algebra, gauss(len(xi)).b @ xi)
         return group.adjoint_cayley_map(algebra, x)
 
-    def _angles(self, algebra, xi) -> jax.Array:
-        """Theta at the end of collocation in the algebra, shape (dim,).
+    def _rates(self, algebra, xi) -> jax.Array:
+        """h theta' at the stages of collocation in the algebra, shape (stages, dim).
 
         A sweep of iteration gains a power of the step; so many are one more than its order needs.
         """
         tableau, k = gauss(len(xi)), xi
         for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
             k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
-        return tableau.b @ k
+        return k
 
     # -- what is that of the method -----------------------------------------------------------------------------------
 
@@ -190,17 +253,27 @@ class WithAttitude(OneStepMethod):
         return f"{self.method} with attitudes by {self.kind}"
 
 
-def _collocated(X) -> jax.Array:
-    """``G - I``, G the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X at the stages, (s, m, m).
+RESTORED = 3
+"""Newton steps to the group from the mean of two attitudes: where a step turns by 0.5, what is left is 1e-11, and
+below rounding where it turns by 0.2."""
 
-    Solved for the transposes of the stages, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
+
+def _collocated(X) -> jax.Array:
+    """``G - I``, G the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X at the stages, (s, m, m)."""
+    return jnp.einsum("j,jab,jbc->ac", gauss(len(X)).b, _stages(X), X)
+
+
+def _stages(X) -> jax.Array:
+    """The stages G_i of that collocation, shape (s, m, m).
+
+    Solved for their transposes, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
     """
     (stages, m), tableau = X.shape[:2], gauss(len(X))
     turned = X.swapaxes(-1, -2)
     implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * m, stages * m)
     start = jnp.tile(jnp.eye(m), (stages, 1))
     G = solve_near_identity(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
-    return jnp.einsum("j,jab,jbc->ca", tableau.b, turned, G)
+    return G.swapaxes(-1, -2)
 
 
 GENTLE = 2.0**-6
@@ -221,6 +294,17 @@ def _missing(group, g) -> jax.Array:
 TURNS, DAMPING = 3, 1e-8
 """Newton steps of :func:`_carrying`, and what is added to the diagonal of a matrix that may be singular, relative to
 it. A step leaves the square of the misfit, or this share of it."""
+
+
+def _on_orbit(momenta, p, mu) -> jax.Array:
+    """The dual vector next to p that has the Casimirs of mu."""
+    size = jnp.max(jnp.abs(mu))
+    size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.casimirs_of_momenta().values()
+    p, mu = p / size, mu / size
+    for _ in range(TURNS):
+        missed = jnp.stack([C.value(mu) - C.value(p) for C in casimirs])
+        p = p + towards([C.gradient(p) for C in casimirs], missed)
+    return size * p
 
 
 def _carrying(group, turn, mu, new) -> jax.Array:

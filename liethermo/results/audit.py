@@ -258,9 +258,8 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
             rows.append(AuditRow(f"change of {name}", change, None, None, note))
     for name in laws.ledger:
         series = solution.casimirs[name]
-        rows.append(
-            AuditRow(name, float(series[-1] - series[0]), None, None, "from outside: the energy above is without")
-        )
+        what = "the momentum in space below" if name.startswith("impulse") else "the energy above"
+        rows.append(AuditRow(name, float(series[-1] - series[0]), None, None, f"from outside: {what} is without"))
     rows.append(_verdict("stage residual", stats.worst_residual, tolerances.residual))
     if stats.attitude_residual is not None:
         rows.append(_verdict("attitude in group", stats.attitude_residual, tolerances.attitude))
@@ -277,8 +276,10 @@ def audit(solution: Record, tolerances: Tolerances) -> Audit:
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:
-    """The momentum in space is a constant where no torque acts from outside."""
+    """The momentum in space is a constant where no torque acts from outside, or less the impulse of one."""
     name = "momentum in space"
+    if any(entry.startswith("impulse") for entry in laws.ledger):
+        name += " less the impulse"
     if name in laws.conserved:
         return _verdict(f"drift of {name}", change, tolerances.casimirs)
     if name in laws.unpromised:

@@ -14,7 +14,7 @@ from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.ensemble import Ensemble
-from ..systems import AttitudeSystem, DrivenSystem, System
+from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, pacing_of
 from .batches import THREADS, Tally, follow_array, follow_compiled, run_array, run_compiled
@@ -22,7 +22,7 @@ from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .paced import Many
-from .preparation import NO_GROUP, as_run, check_choice, decided, laws_of
+from .preparation import as_family, as_run, begun, check_choice, decided, laws_of
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
@@ -132,14 +132,8 @@ def ensemble(
     one_body = _same_inertia(family, member)
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
-    if isinstance(member, AttitudeSystem):
-        attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
-        family = family.through(AttitudeSystem, member.reconstruction)
-        states = np.asarray(member.begin(states, attitude, batch=True))
-    elif attitude is not None:
-        raise InputError(NO_GROUP)
-    if isinstance(member, DrivenSystem):
-        family, states = family.through(DrivenSystem), np.asarray(member.begin(states, course.start, batch=True))
+    attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
+    family, states = as_family(family, member), np.asarray(begun(member, states, course.start, attitude, batch=True))
     method.check(member)
     record = Record(family, member, states, course, outputs, np.nan if isinstance(step, Adaptive) else course.h)
     event = None if until is None else Event(until, member)

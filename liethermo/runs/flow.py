@@ -12,10 +12,10 @@ from manifolds._precision import by_own_settings
 from ..engines import implicit
 from ..engines.stages import explicit, newton_steps, noise_of, scale_of, solve_stages
 from ..engines.stepping import finish, holds_energy, shifted, steering
-from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
-from ..systems import DrivenSystem, System, driven
+from ..systems import System
 from ..tracing.programs import program
+from .preparation import begun, of_steps
 from .timetable import Timetable
 
 
@@ -27,6 +27,7 @@ def flow(
     step: float,
     method: OneStepMethod | None = None,
     save_every: int | None = None,
+    attitude=None,
 ) -> jax.Array:
     """The final state of the flow from x0, a differentiable function of x0 and of the parameters of the system.
 
@@ -48,6 +49,8 @@ def flow(
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int, optional
         Return the states on the way too: every n-th, n this number, and the first and the last one.
+    attitude : array, shape (m, m), optional
+        At the start, where a torque depends on it: the identity by default. What is returned are momenta all the same.
 
     Returns
     -------
@@ -62,10 +65,9 @@ def flow(
         If an argument cannot be used.
     """
     x, table = system.state(x0), Timetable(t_span, step, save_every)
-    n, shown, system = system.dim, system, driven(system)
-    x = system.begin(x, table.start) if isinstance(system, DrivenSystem) else x
-    method = (DEFAULT_METHOD if method is None else method).suited(None).pulled(system).on(system)
-    method = traced_energies(method, system.dim)
+    n, shown = system.dim, system
+    system, method = of_steps(system, DEFAULT_METHOD if method is None else method, attitude=attitude is not None)
+    x = jnp.asarray(begun(system, x, table.start, attitude))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])
     path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))

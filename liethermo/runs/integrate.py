@@ -6,20 +6,17 @@ import os
 from collections.abc import Callable
 from typing import Literal
 
-import jax
-import numpy as np
-
 from manifolds._precision import by_own_settings
 
 from ..engines.codes import Code
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.solution import Solution
-from ..systems import AttitudeSystem, DrivenSystem, System
+from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import NO_GROUP, as_run, check_choice, decided, prepared
+from .preparation import as_run, begun, check_choice, decided, prepared
 from .progress import Progress
 from .run import Run
 from .timetable import Timetable
@@ -54,8 +51,8 @@ def integrate(
     system : System
     x0 : array, shape (n,)
     t_span : (float, float)
-        Start and end, the end later. The last step is shortened to arrive there. An energy that depends on time is
-        taken at these times.
+        Start and end, the end later. The last step is shortened to arrive there. An energy that depends on time, and a
+        torque, are taken at these times.
     step : float or Adaptive
         Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
@@ -120,8 +117,6 @@ def integrate(
     check_choice("on_failure", on_failure, ("raise", "return"))
     system, method = as_run(decided(system, x0), method, noise, step.tolerance if isinstance(step, Adaptive) else None)
     prepared(system, method)  # refuses what the method cannot run
-    if attitude is not None and not isinstance(system, AttitudeSystem):
-        raise InputError(NO_GROUP)
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -134,13 +129,7 @@ def integrate(
             "are for runs without"
         )
     table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    x: jax.Array | np.ndarray
-    if isinstance(system, AttitudeSystem):
-        x = system.begin(x0, attitude)
-    elif isinstance(system, DrivenSystem):
-        x = system.begin(x0, table.start)
-    else:
-        x = system.numbers(x0)
+    x = begun(system, x0, table.start, attitude)
     if reason := system.outside(x):
         raise InputError(f"the run cannot start at this x0: {reason}")
     run = Run(system, method, x, table, save_to, engine, noise)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import numpy as np
+
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import OneStepMethod, WithAttitude
 from ..results.status import Laws
-from ..systems import AttitudeSystem, LiePoissonSystem, System, driven
+from ..systems import AttitudeSystem, DrivenSystem, LiePoissonSystem, System, driven
 from ..tracing.remembered import remembered
+from .family import Family
 from .fluctuations import Fluctuations
 
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
@@ -45,14 +49,47 @@ def as_run(
     if not isinstance(method, OneStepMethod):
         if noise is not None:
             raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
+        if system.needs_attitude:
+            raise InputError(f"{method} follows no attitude, and the torque {system.pushed_by} depends on it")
         return driven(system, unit=1.0), method  # its errors are measured component by component
-    system = driven(system)
-    method = method if noise is None else noise.on(system, method)
-    method = traced_energies(method.suited(tolerance).pulled(system).on(system), system.dim)
-    if isinstance(system, LiePoissonSystem) and system.reconstruction is not None:
-        kind = "exp" if method.explicit else system.reconstruction
-        return AttitudeSystem(system, kind), WithAttitude(method, kind)
-    return system, method
+    method = method if noise is None else noise.on(driven(system), method)
+    return of_steps(system, method, tolerance, attitude=True)
+
+
+def of_steps(
+    system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
+) -> tuple[System, OneStepMethod]:
+    """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
+    found = driven(system)
+    method = traced_energies(method.suited(tolerance).pulled(found).on(found), found.dim)
+    wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
+    if wanted is None or not (attitude or system.needs_attitude):
+        return found, method
+    assert isinstance(found, LiePoissonSystem | DrivenSystem)
+    kind = "exp" if method.explicit else wanted
+    return AttitudeSystem(found, kind), WithAttitude(method, kind)
+
+
+def begun(system: System, x0, t: float, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
+    """The state of a run that starts from one of its user; or several, with ``batch``.
+
+    Raises
+    ------
+    InputError
+        If there is an attitude and no group.
+    """
+    if isinstance(system, AttitudeSystem):
+        return system.begin(x0, attitude, batch, t)
+    if attitude is not None:
+        raise InputError(NO_GROUP)
+    return system.begin(x0, t, batch) if isinstance(system, DrivenSystem) else system.numbers(x0, batch)
+
+
+def as_family(family: Family, system: System) -> Family:
+    """The family of what the members are run as, where the system is what one of them is."""
+    if isinstance(system, AttitudeSystem):
+        return as_family(family, system.body).through(AttitudeSystem, system.reconstruction)
+    return family.through(DrivenSystem) if isinstance(system, DrivenSystem) else family
 
 
 @remembered

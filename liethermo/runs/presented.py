@@ -89,6 +89,7 @@ def provenance_of(
         "group": None if group is None else group.name,
         "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
+        **({"torque": system.pushed_by} if system.pushed_by else {}),
     }
 
 

@@ -132,8 +132,8 @@ class Record:
         self._explain(chosen, after["x"], status, end_time)
         if self.x is not None:
             self.x[chosen] = after["x"]
-        if isinstance(self.member, DrivenSystem):
-            self.work[chosen] = self.member.work(after["x"])
+        if (driven := driven_part(self.member)) is not None:
+            self.work[chosen] = driven.work(after["x"][..., : driven.dim])
 
     def _explain(self, chosen: Part, x: np.ndarray, status: np.ndarray, end_time: np.ndarray) -> None:
         """What is known of trajectories that failed, of the first of them at least."""
@@ -178,8 +178,8 @@ class Record:
             x0, attitude0 = map(np.asarray, self.member.split(x0))
             if x is not None:
                 x, attitude = map(np.asarray, self.member.split(x))
-        if isinstance(self.member, DrivenSystem):
-            work = placed(self.work if self.path is None else np.asarray(self.member.work(x)))
+        if (driven := driven_part(self.member)) is not None:
+            work = placed(self.work if self.path is None else np.asarray(driven.work(x)))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
         found = Ensemble(
             t=t,
@@ -301,6 +301,12 @@ class Followed:
 
     def _seen(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
+
+
+def driven_part(system: System) -> DrivenSystem | None:
+    """What knows of a system as it is run which work is done on it."""
+    found = system.body if isinstance(system, AttitudeSystem) else system
+    return found if isinstance(found, DrivenSystem) else None
 
 
 def _first_terms(model: tuple[Form, int], at):

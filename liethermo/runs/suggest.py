@@ -15,8 +15,9 @@ from ..engines.choice import Chosen
 from ..engines.pacing import DEADBAND, rate_of
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
-from ..systems import DrivenSystem, System, driven
+from ..systems import System
 from .adaptive import Adaptive
+from .preparation import begun, of_steps
 from .stepwise import Outcome, Steps, run
 
 
@@ -35,7 +36,8 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     method : OneStepMethod
         ``MetriplecticGauss(1)`` by default, of order 2.
     t0 : float
-        The time, for an energy that depends on it.
+        The time, for an energy or a torque that depends on it. A torque that depends on the attitude too is taken at
+        the identity.
 
     Raises
     ------
@@ -136,11 +138,10 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
 
 
 def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
-    system = driven(system)
     method = method.suited(rtol)
-    used = method.pulled(system).on(system)
+    system, used = of_steps(system, method)
     used.check(system)
-    x = np.asarray(system.begin(x0, t0) if isinstance(system, DrivenSystem) else system.state(x0))
+    x = np.asarray(begun(system, x0, t0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")

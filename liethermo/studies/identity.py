@@ -36,7 +36,7 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
     task, system = solver.task, solver.members.example
     states = np.concatenate([x0[None], system.samples(PROBED, seed=1)])
     with np.errstate(all="ignore"):
-        probe = [_numbers(system.vector_field(x)) for x in states]
+        probe = [_numbers(_at_start(system, task.t_span[0]).vector_field(x)) for x in states]
         energies = [_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
@@ -88,6 +88,11 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]
     return found
 
 
+def _at_start(system: Any, t: float) -> Any:
+    """A system as it is when a study begins, where its energy depends on time or a torque acts."""
+    return system.at_time(t, system.group.identity) if system.needs_attitude else system.at_time(t)
+
+
 def _differing(what: str, mine: list, theirs: list) -> str:
     a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (mine, theirs))
     if a.shape != b.shape:
@@ -127,7 +132,7 @@ def _operations(solver: Solver) -> str:
     x = jax.ShapeDtypeStruct((members.example.dim,), np.float64)
 
     def laws(system, x):
-        return system.energy.at_time(task.t_span[0]).value(x), system.vector_field(x)
+        return system.energy.at_time(task.t_span[0]).value(x), _at_start(system, task.t_span[0]).vector_field(x)
 
     found, numbers = [], []
     if members.family is None or not task.parameters:

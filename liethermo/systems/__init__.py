@@ -1,6 +1,6 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
-from .attitude import SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
+from .attitude import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, TurningSystem, momenta_of
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
@@ -18,6 +18,7 @@ from .spins import SpinSystem
 
 __all__ = [
     "SPATIAL_MOMENTUM",
+    "WITHOUT_IMPULSE",
     "AttitudeSystem",
     "ChartSystem",
     "ComposedSystem",
@@ -39,4 +40,5 @@ __all__ = [
     "ThermodynamicHerglotz",
     "TurningSystem",
     "driven",
+    "momenta_of",
 ]

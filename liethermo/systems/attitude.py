@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds.groups import maps
 
 from ..dissipation.base import Carried
@@ -19,35 +20,44 @@ from ..functions.energy import Energy, Sum
 from ..functions.of_first import OfFirst
 from ..tracing.interpret import at_points
 from .base import System
+from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
 
 SPATIAL_MOMENTUM = "momentum in space"
 """The name of ``Ad_star(inverse(g), mu)`` among what is constant along a run."""
 
+WITHOUT_IMPULSE = "momentum in space less the impulse"
+"""The name of what is constant in its place where a torque acts."""
+
+IMPULSE = "impulse"
+"""The name of what a torque has given to the momentum in space, before the number of a component."""
+
 
 class AttitudeSystem(System):
     """A Lie-Poisson system for mu, and ``g' = g hat(transport(mu))`` beside it [:doc:`/explanation/exact_laws`].
 
-    A state is mu, with the entropies of baths where there are any, followed by the entries of g, row by row, their
-    imaginary parts last where there are any. Energy, entropy and Casimirs are those of mu. Made by
-    :func:`liethermo.integrate` from a system with a group.
+    A state is that of the body, mu first, followed by the entries of g, row by row, their imaginary parts last where
+    there are any. Where a torque tau acts, the momentum in space as its impulse makes it comes last, ``p' =
+    Ad_star(inverse(g), tau)``. Energy, entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a
+    system with a group.
 
     Attributes
     ----------
-    body : LiePoissonSystem
+    body : LiePoissonSystem, or DrivenSystem of one
     reconstruction : {"coadjoint", "cayley", "exp"}
         How the attitude is found: see :class:`liethermo.WithAttitude`.
     group : manifolds.MatrixGroup
     """
 
-    body: LiePoissonSystem
+    body: LiePoissonSystem | DrivenSystem
     reconstruction: str = eqx.field(static=True)
     group: mf.MatrixGroup = eqx.field(static=True)
 
-    def __init__(self, body: LiePoissonSystem, reconstruction: str):
-        assert body.group is not None
-        self.body, self.reconstruction, self.group, self.space = body, reconstruction, body.group, None
-        self.dim = body.dim + self._parts * self.group.matrix_size**2
+    def __init__(self, body: LiePoissonSystem | DrivenSystem, reconstruction: str):
+        group = momenta_of(body).group
+        assert group is not None
+        self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
+        self.dim = body.dim + self._parts * group.matrix_size**2 + (group.dim if body.pushed_by else 0)
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self._of_momentum(body.energy)
         self.entropy = None if body.entropy is None else self._of_momentum(body.entropy)
@@ -61,19 +71,41 @@ class AttitudeSystem(System):
         unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again
         return self.body.unrollable and self._parts == 1 and unrolls
 
+    @property
+    def momenta(self) -> LiePoissonSystem:
+        """The system of mu and of baths alone."""
+        return momenta_of(self.body)
+
+    @property
+    def pushed_by(self) -> str:
+        return self.body.pushed_by
+
     def split(self, x) -> tuple[jax.Array, jax.Array]:
         """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
         n, m = self.body.dim, self.group.matrix_size
-        parts = x[..., n:].reshape(*x.shape[:-1], self._parts, m, m)
+        parts = x[..., n : n + self._parts * m**2].reshape(*x.shape[:-1], self._parts, m, m)
         return x[..., :n], parts[..., 0, :, :] if self._parts == 1 else parts[..., 0, :, :] + 1j * parts[..., 1, :, :]
 
-    def join(self, mu, g) -> jax.Array:
-        """The inverse of :meth:`split`."""
-        parts = g[..., None, :, :] if self._parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
-        return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1)], axis=-1)
+    def in_space(self, x) -> jax.Array:
+        """The momentum in space as the impulse of the torque makes it, shape (..., dim of the algebra); or (..., 0)."""
+        return x[..., self.body.dim + self._parts * self.group.matrix_size**2 :]
 
-    def begin(self, mu, attitude=None, batch: bool = False) -> jax.Array:
-        """The state with a momentum and an attitude, the identity by default; or several, with ``batch``.
+    def join(self, mu, g, p=None) -> jax.Array:
+        """The inverse of :meth:`split` and :meth:`in_space`."""
+        parts = g[..., None, :, :] if self._parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
+        rest = [] if p is None else [p]
+        return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1), *rest], axis=-1)
+
+    def body_at(self, x) -> LiePoissonSystem | DrivenSystem:
+        """The body, for use at the attitude of a state."""
+        return self.body.turned(self.split(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
+
+    def to_space(self, g) -> jax.Array:
+        """The matrix, shape (..., n, n), that a dual vector is multiplied by from the left to become one in space."""
+        return self.group.Ad(self.group.inverse_map(g))
+
+    def begin(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
+        """The state with a momentum and an attitude, the identity by default, at a time; or several, with ``batch``.
 
         Raises
         ------
@@ -81,40 +113,62 @@ class AttitudeSystem(System):
             If the attitude is not in the group.
         """
         g = self.group.identity if attitude is None else self.group._element(attitude, "attitude")
-        if not bool(self.group.belongs(g).all()):
-            residual = float(self.group.defect(g).max())
-            raise InputError(
-                f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
-            )
-        mu = self.body.state(mu, batch)
+        if not is_traced(g):
+            with jax.ensure_compile_time_eval():  # something else may be traced meanwhile
+                if not bool(self.group.belongs(g).all()):
+                    residual = float(self.group.defect(g).max())
+                    raise InputError(
+                        f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
+                    )
+        body = self.body
+        mu = body.begin(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
         size = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
         if size and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
-        return self.join(jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:])))
+        mu, g = jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:]))
+        if not self.pushed_by:
+            return self.join(mu, g)
+        return self.join(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.to_space(g)))
 
     def points(self, x):
         """The states of the body: what functions of the state are functions of."""
         return x[..., : self.body.dim]
 
+    def seen(self, x):
+        return self.body.seen(self.points(x))
+
+    def outside(self, x) -> str:
+        return self.body.outside(self.points(x))
+
     def sizes(self, k):
         """Those of momenta, which have a unit, and of attitudes, which have none."""
+        n, m = self.body.dim, self.dim - self.in_space(k).shape[-1]
+        parts = [self.body.sizes(k[..., :n]), super().sizes(k[..., n:m])]
+        return jnp.concatenate([*parts, *([super().sizes(k[..., m:])] if m < self.dim else [])], axis=-1)
+
+    def raised(self, x, alpha):
         n = self.body.dim
-        return jnp.concatenate([self.body.sizes(k[..., :n]), super().sizes(k[..., n:])], axis=-1)
+        return jnp.concatenate([self.body.raised(x[:n], alpha[:n]), alpha[n:]])
+
+    def lowered(self, x, v):
+        n = self.body.dim
+        return jnp.concatenate([self.body.lowered(x[:n], v[:n]), v[n:]])
 
     def presented(self, solution):
-        mu, g = self.split(solution.x)
+        states, g = self.split(solution.x)
         stats = dataclasses.replace(
             solution.stats,
             attitude_residual=self.distance(solution.x),
             spatial_momentum_change=self.change_in_space(solution.x),
         )
         dense = None if solution.dense is None else solution.dense.through(self.points)
-        return dataclasses.replace(
-            self.body.presented(solution), x=mu, attitude=np.ascontiguousarray(g), dense=dense, stats=stats
-        ).with_provenance(
-            system=type(self.body).__name__,
-            algebra=self.body.algebra.name,
-            x0=np.asarray(mu[0]).tolist(),
+        series = {name: f - f[0] if name in self.impulses else f for name, f in solution.casimirs.items()}
+        of_body = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
+        found = self.body.presented(of_body)
+        return dataclasses.replace(found, attitude=np.ascontiguousarray(g)).with_provenance(
+            system=type(self.momenta).__name__,
+            algebra=self.momenta.algebra.name,
+            x0=found.x[0].tolist(),
         )
 
     def distance(self, x) -> float:
@@ -124,6 +178,8 @@ class AttitudeSystem(System):
     def change_in_space(self, x) -> float:
         """The largest change of the momentum in space along states, shape (m, n), the first being that at the start.
 
+        Less the impulse, where a torque acts.
+
         Relative to the largest of the terms that it is the sum of.
         """
         found, sizes = _at_states(_in_space, self, x)
@@ -132,24 +188,42 @@ class AttitudeSystem(System):
 
     @property
     def inertia(self):
-        return self.body.inertia
+        return self.momenta.inertia
 
     @property
     def constants(self):
-        return (SPATIAL_MOMENTUM,) if self.body.torque_free else ()
+        if not self.body.torque_free:
+            return ()
+        return (WITHOUT_IMPULSE,) if self.pushed_by else (SPATIAL_MOMENTUM,)
+
+    @property
+    def impulses(self) -> tuple[str, ...]:
+        """The names of the components of the impulse; none where no torque acts."""
+        return tuple(f"{IMPULSE} {i + 1}" for i in range(self.group.dim)) if self.pushed_by else ()
+
+    @property
+    def ledger(self):
+        found = {name: self._of_momentum(f) for name, f in self.body.ledger.items()}
+        return found | {name: Component(i - self.group.dim) for i, name in enumerate(self.impulses)}
+
+    @property
+    def balance(self):
+        return self.body.balance
 
     @property
     def blocks(self):
-        return *self.body.blocks, slice(self.body.dim, None)
+        n, m = self.body.dim, self.dim - (self.group.dim if self.pushed_by else 0)
+        return *self.body.blocks, slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
         return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
 
     def _vector_field(self, x):
-        (mu, g), body = self.split(x), self.body
+        (mu, g), body = self.split(x), self.body_at(x)
         dS = None if body.entropy is None else body.entropy.gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
-        return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]))
+        p = body.push(mu)[: self.group.dim] @ self.to_space(g) if self.pushed_by else None
+        return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
 
     def _of_momentum(self, energy: Energy) -> Energy:
         terms = tuple(OfFirst(term, self.body.dim) for term in energy.terms)
@@ -166,16 +240,36 @@ def _at_states(function: Callable, system: AttitudeSystem, x):
     return at_points(function, system, np.asarray(x)[rows])
 
 
+class Component(Energy):
+    """One component of a state."""
+
+    place: int = eqx.field(static=True)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return x[self.place]
+
+
+def momenta_of(body: System) -> LiePoissonSystem:
+    """The system of momenta in one that may be driven."""
+    found = body.body if isinstance(body, DrivenSystem) else body
+    assert isinstance(found, LiePoissonSystem)
+    return found
+
+
 def _distance(system: AttitudeSystem, x) -> jax.Array:
     return system.group.defect(system.split(x)[1])
 
 
 def _in_space(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
-    """The momentum in space, and the size of the largest terms in it."""
-    (state, g), group = system.split(x), system.group
-    mu = state[: group.algebra.dim]
-    action = group.Ad(group.inverse_map(g))
-    return mu @ action, jnp.max(jnp.abs(mu) @ jnp.abs(action))
+    """The momentum in space, less what the impulse makes of it, and the size of the largest terms in it."""
+    (state, g), p = system.split(x), system.in_space(x)
+    mu, action = state[: system.group.dim], system.to_space(g)
+    found = mu @ action
+    return found - p if system.pushed_by else found, jnp.max(jnp.abs(mu) @ jnp.abs(action))
 
 
 UNIT = 2.0**-300
@@ -187,21 +281,26 @@ class TurningSystem(System):
     """A body in coordinates (mu, theta) around an attitude g, which it turns to ``g exp(hat(theta))``.
 
     ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
-    that needs no more. The laws are those of mu. Theta is in units of :data:`UNIT`.
+    that needs no more. The laws are those of mu. Theta is in units of :data:`UNIT`, and so is the momentum in space
+    that is behind it where a torque acts.
 
     Attributes
     ----------
     whole : AttitudeSystem
     order : int
         The power of theta to which its velocity is computed.
+    attitude : array, shape (m, m)
+        g.
     """
 
     whole: AttitudeSystem
     order: int = eqx.field(static=True)
+    attitude: jax.Array
 
-    def __init__(self, whole: AttitudeSystem, order: int):
+    def __init__(self, whole: AttitudeSystem, order: int, attitude: jax.Array):
         body = whole.body
-        self.whole, self.order, self.dim, self.space = whole, order, body.dim + whole.group.dim, None
+        self.whole, self.order, self.attitude = whole, order, attitude
+        self.dim, self.space = body.dim + whole.group.dim * (2 if whole.pushed_by else 1), None
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
@@ -210,37 +309,70 @@ class TurningSystem(System):
 
     @property
     def blocks(self):
-        return *self.whole.body.blocks, slice(self.whole.body.dim, None)
+        n, m = self.whole.body.dim, self.whole.body.dim + self.whole.group.dim
+        return *self.whole.body.blocks, slice(n, m), *([slice(m, None)] if self.pushed_by else [])
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
 
+    @property
+    def pushed_by(self) -> str:
+        return self.whole.pushed_by
+
     def casimirs(self):
         return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
 
+    def raised(self, x, alpha):
+        return self.whole.raised(x, alpha)
+
+    def lowered(self, x, v):
+        return self.whole.lowered(x, v)
+
     def field(self, x, dH, dS, dL=()):
-        body, n = self.whole.body, self.whole.body.dim
+        body, n = self.body_at(x), self.whole.body.dim
         given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
         algebra = self.whole.group.algebra
         turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
-        return jnp.concatenate([body.field(*given), UNIT * turning])
+        rates = [body.field(*given), UNIT * turning]
+        if self.pushed_by:
+            push = body.push(x[:n])
+            assert push is not None
+            rates.append(UNIT * (push[: algebra.dim] @ self.whole.to_space(self._turned(x))))
+        return jnp.concatenate(rates)
+
+    def body_at(self, x) -> System:
+        """The body, for use at the attitude of the coordinates."""
+        body = self.whole.body
+        return body.turned(self._turned(x)) if isinstance(body, DrivenSystem) and body.needs_attitude else body
+
+    def _turned(self, x) -> jax.Array:
+        group = self.whole.group
+        return self.attitude @ group.exp_map(group.algebra, self.angles(x))
 
     # -- coordinates --------------------------------------------------------------------------------------------------
 
     def around(self, x) -> jax.Array:
         """The coordinates of a state around its own attitude."""
-        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.group.dim)])
+        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.group.dim), UNIT * self.whole.in_space(x)])
 
     def angles(self, v) -> jax.Array:
-        """Theta of a vector of coordinates, shape (..., dim of the group)."""
-        return v[..., self.whole.body.dim :] / UNIT
+        """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
+        n = self.whole.body.dim
+        return v[..., n : n + self.whole.group.dim] / UNIT
+
+    def in_space(self, v) -> jax.Array:
+        """The momentum in space of a vector of coordinates, shape (..., dim of the algebra)."""
+        return v[..., self.whole.body.dim + self.whole.group.dim :] / UNIT
 
 
 class _OnMomentum(Carried):
     """A dissipation of the momentum."""
 
+    @property
+    def noiseless(self) -> bool:
+        return self.part.noiseless
+
     def force(self, system, x, dH, dS, dL):
-        body = system.whole.body
-        n = body.dim
+        n = system.whole.body.dim
         dS, dL = None if dS is None else dS[:n], tuple(L[:n] for L in dL)
-        return jnp.pad(self.part.force(body, x[:n], dH[:n], dS, dL), (0, len(x) - n))
+        return jnp.pad(self.part.force(system.body_at(x), x[:n], dH[:n], dS, dL), (0, len(x) - n))

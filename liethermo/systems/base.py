@@ -247,12 +247,16 @@ class System(Kind):
 
     @property
     def is_driven(self) -> bool:
-        """Whether the energy depends on time, so that work is done from outside: ``H' = dH/dt`` at fixed x."""
+        """Whether the energy depends on time, or a torque acts, so that work is done from outside."""
         return self.energy.depends_on_time
 
     def at_time(self, t) -> System:
         """The system whose energy is for ever what it is at a time; itself where that does not depend on time."""
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
+
+    def at_some_times(self) -> list[System]:
+        """This system at a few times, for what is found out of one that is driven."""
+        return [self.at_time(t) for t in TIMES]
 
     @by_own_settings
     def evaluated(self, function: Callable, x, t, result: str) -> jax.Array:
@@ -272,7 +276,8 @@ class System(Kind):
         if not self.is_driven:
             return jnp.vectorize(lambda y: function(self, y), signature=f"(n)->{result}")(x)
         if t is None:
-            raise InputError("the energy of this system depends on time: give the time beside the state")
+            what = "energy of this system depends on" if self.energy.depends_on_time else "torque is known at a"
+            raise InputError(f"the {what} time: give the time beside the state")
         at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result}")
         return at(x, jnp.asarray(t, dtype=jnp.float64))
 
@@ -381,11 +386,12 @@ class System(Kind):
         if self.decided is not None:
             return self.decided
         claimed, casimirs = set(self.momentum_maps), self.casimirs()
-        if self.dissipation is None or self.dissipation.keeps_casimirs:
+        if not self.pushed_by and (self.dissipation is None or self.dissipation.keeps_casimirs):
             claimed |= set(casimirs)
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            kept = [False] * len(others) if is_traced(self) else self.conserves(tuple(others.values()), near)
+            open_ = is_traced(self) or self.pushed_by  # a torque that is zero at some times tells nothing of others
+            kept = [False] * len(others) if open_ else self.conserves(tuple(others.values()), near)
         verdicts = dict(zip(others, kept, strict=True))
         if declared:
             verdicts |= {name: True for name in self.preserved_names if verdicts.get(name, True) is None}
@@ -417,7 +423,7 @@ class System(Kind):
         if not functions:
             return []
         if self.is_driven:
-            found = [self.at_time(t).conserves(functions, near) for t in TIMES]
+            found = [system.conserves(functions, near) for system in self.at_some_times()]
             return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
         points = np.concatenate([self.samples(4, seed, scale) for seed, scale in enumerate(SCALES)])
         if near is not None:
@@ -576,6 +582,9 @@ def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
         a, b = (_seen(system, x, other * jnp.linalg.norm(d)) for other, d in zip(others, (dH, dS), strict=True))
         parts.append(part.force(system, x, dH, dS, dL))
         speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
+    if (push := system.push(x)) is not None:
+        parts.append(push)
+        speeds.append(jnp.linalg.norm(push))
     sizes = jnp.linalg.norm(gradients, axis=1)
     rates = jnp.stack(parts) @ gradients.T
     energy = system.energy.value(x)  # a derivative may be finite where the function is not defined

@@ -1,8 +1,10 @@
-"""Driven systems: an energy that depends on time, the clock and the work done as two more components of the state."""
+"""Driven systems: energies that depend on time, and torques; clock and work are two more components of the state."""
 
 from __future__ import annotations
 
 import dataclasses
+from copy import copy
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,7 +14,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._module import Module
 
-from ..dissipation.base import Carried
+from ..dissipation.base import Carried, Law, SkewFriction
 from ..errors import InputError
 from ..functions.checks import recognised
 from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime
@@ -33,20 +35,29 @@ class DrivenSystem(System):
     law holds as ever. What corrects the discrete gradient of H goes along x and t alone (:class:`WithTime`), so ``t' =
     1`` holds to rounding and W is what the power comes to.
 
+    A torque tau works too, ``x' = ... + tau``, ``W' = dH/dt + dH . tau``. It is a skew bracket of x and W with the
+    energy alone: so it keeps ``H - W`` whatever gradient it is handed, a discrete one among them.
+
     A state is that of the body followed by t and W, in units of ``unit``. Made by :func:`liethermo.integrate` from a
-    system whose energy depends on time.
+    system whose energy depends on time, or that a torque acts on.
 
     Attributes
     ----------
     body : System
     unit : float
+    attitude : array, shape (m, m), or None
+        That at which a torque is taken that needs one: see :meth:`turned`.
+    torque : array, shape (n,), or None
+        The torque itself, where it is known: see :meth:`with_torque`.
     """
 
     body: System
     unit: float = eqx.field(static=True)
+    attitude: jax.Array | None
+    torque: jax.Array | None
 
     def __init__(self, body: System, unit: float = UNIT):
-        self.body, self.unit, self.dim = body, unit, body.dim + 2
+        self.body, self.unit, self.dim, self.attitude, self.torque = body, unit, body.dim + 2, None, None
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
@@ -56,11 +67,14 @@ class DrivenSystem(System):
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _OnBody.of(body.dissipation, self._of_body)
+        if body.pushed_by:
+            push = _Push("conserved" if body.entropy_law is not None or body.entropy is None else None)
+            self.dissipation = push if self.dissipation is None else self.dissipation + push
         self.preserved_as, self.decided = body.preserved_as, body.decided
 
     @property
     def kind(self) -> str:
-        return f"{self.body.kind} whose energy depends on time"
+        return f"{self.body.kind} {'with a torque' if self.body.pushed_by else 'whose energy depends on time'}"
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -99,9 +113,50 @@ class DrivenSystem(System):
         return self.body.unrollable
 
     def field(self, x, dH, dS, dL=()):
-        dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
-        motion = self._now(x).field(x[:-2], dH[:-2], dS, dL)
-        return jnp.concatenate([motion, _clock(dH, self.unit)])
+        motion = self._now(x).left_alone().field(*_part_of_body(x, dH, dS, dL))
+        motion = jnp.concatenate([motion, _clock(dH, self.unit)])
+        return motion + self.pushed(x, dH) if self.pushed_by else motion
+
+    def transport(self, x, dH, dS, dL=()):
+        return self._now(x).transport(*_part_of_body(x, dH, dS, dL))
+
+    @property
+    def torque_free(self) -> bool:
+        return self.body.torque_free
+
+    @property
+    def body_dim(self) -> int:
+        return self.body.body_dim
+
+    @property
+    def pushed_by(self) -> str:
+        return self.body.pushed_by
+
+    @property
+    def needs_attitude(self) -> bool:
+        return self.body.needs_attitude
+
+    def push(self, x):
+        return self._now(x).push(x[:-2]) if self.torque is None else self.torque
+
+    def pushed(self, x, dH) -> jax.Array:
+        """What a torque does to the state, and the work that it does, for a gradient of either kind."""
+        push = self.push(x)
+        return jnp.concatenate([push, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], push)])])
+
+    def turned(self, attitude) -> DrivenSystem:
+        """The same system, for use at an attitude, shape (m, m); itself where nothing depends on it."""
+        if not self.needs_attitude:
+            return self
+        found = copy(self)
+        object.__setattr__(found, "attitude", attitude)
+        return found
+
+    def with_torque(self, torque) -> DrivenSystem:
+        """The same system, for use where the torque is this one, of the size of a state of the body."""
+        found = copy(self)
+        object.__setattr__(found, "torque", torque)
+        return found
 
     def raised(self, x, alpha):
         """What is moved to correct something is moved in the body: never the clock, nor the work done."""
@@ -111,7 +166,8 @@ class DrivenSystem(System):
         return jnp.concatenate([self.body.lowered(x[:-2], v[:-2]), v[-2:]])
 
     def _now(self, x) -> System:
-        return self.body.at_time(self.time(x))
+        where = () if self.attitude is None else (self.attitude,)
+        return self.body.at_time(self.time(x), *where)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
@@ -155,8 +211,7 @@ class DrivenSystem(System):
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
         if hasattr(body, "algebra"):
             entries["algebra"] = body.algebra.name
-        if body.dissipation is not None:
-            entries["dissipation"] = type(body.dissipation).__name__
+        entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
         energy = solution.energy + solution.casimirs["work"]
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.presented(found)
@@ -199,12 +254,33 @@ def _clock(dH, unit: float) -> jax.Array:
     return unit**2 * jnp.stack([-dH[-1], dH[-2]])
 
 
+def _part_of_body(x, dH, dS, dL) -> tuple:
+    """A state with clock and work and the gradients there, as those of the body."""
+    return x[:-2], dH[:-2], None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
+
+
+class _Push(SkewFriction):
+    """The torque on a body and the work that it does."""
+
+    law: Law | None = eqx.field(static=True)
+
+    @property
+    def entropy_law(self):
+        return self.law
+
+    @property
+    def noiseless(self) -> bool:
+        return True
+
+    def force(self, system, x, dH, dS, dL):
+        return system.pushed(x, dH)
+
+
 class _OnBody(Carried):
     """A dissipation of the body, as it is at the time of the state."""
 
     def force(self, system, x, dH, dS, dL):
-        dS, dL = None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
-        return jnp.pad(self.part.force(system._now(x), x[:-2], dH[:-2], dS, dL), (0, 2))
+        return jnp.pad(self.part.force(system._now(x), *_part_of_body(x, dH, dS, dL)), (0, 2))
 
     def factor(self, system, x, dH, dL):
         B = self.part.factor(system._now(x), x[:-2], dH[:-2], tuple(L[:-2] for L in dL))
@@ -214,6 +290,7 @@ class _OnBody(Carried):
 class _Clock(Module):
     """From a state with clock and work to x and t."""
 
+    in_other_units: ClassVar[bool] = True
     dim: int = eqx.field(static=True)
     unit: float = eqx.field(static=True)
 
@@ -276,5 +353,5 @@ class _InChartAndTime(Energy):
 
 
 def driven(system: System, unit: float = UNIT) -> System:
-    """The system as it is run: with clock and work where its energy depends on time."""
+    """The system as it is run: with clock and work where work is done from outside."""
     return DrivenSystem(system, unit) if system.is_driven else system

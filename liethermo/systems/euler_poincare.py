@@ -99,7 +99,8 @@ class EulerPoincareSystem(LiePoissonSystem):
     def unrollable(self) -> bool:
         return isinstance(self.energy, Quadratic)  # the others iterate
 
-    def at_time(self, t) -> EulerPoincareSystem:
+    def at_time(self, t, attitude=None) -> EulerPoincareSystem:
+        del attitude  # of a torque, which it has none of
         if not self.is_driven:
             return self
         lagrangian = self.lagrangian.at_time(t)

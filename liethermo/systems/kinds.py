@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -114,6 +114,27 @@ class Kind(Module):
         """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
         del x
         return {}
+
+    # -- what acts from outside ---------------------------------------------------------------------------------------
+
+    @property
+    def pushed_by(self) -> str:
+        """What a torque from outside is called; empty where none acts."""
+        return ""
+
+    @property
+    def needs_attitude(self) -> bool:
+        """Whether the torque depends on the attitude."""
+        return False
+
+    def push(self, x) -> jax.Array | None:
+        """The torque at a state, shape (n,), of a system at a time and an attitude; None where none acts."""
+        del x
+        return None
+
+    def left_alone(self) -> Self:
+        """The system without a torque."""
+        return self
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from copy import copy
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,8 +19,9 @@ from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
-from .base import System
-from .baths import HeatBaths
+from .base import TIMES, System
+from .baths import EntropyOfBaths, HeatBaths
+from .torque import checked_torque, name_of, torque_at
 
 
 class LiePoissonSystem(System):
@@ -51,6 +54,17 @@ class LiePoissonSystem(System):
     baths : HeatBaths, optional
         What takes the heat of a dissipation that lowers the energy. A state is then mu, in one row, followed by the
         entropies of the baths; mu alone stands for one with all of these zero.
+    torque : function of t, shape (), and mu, and of the attitude, shape (m, m), where it needs three; or a list of them
+        What acts from outside, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy). It does work,
+        ``W' = xi . torque``, which is the ledger of a run: the energy less the work is constant. With a group it has an
+        impulse besides, what it has given to the momentum in space. An ``equinox.Module`` has its arrays as
+        parameters, ``"torque.moment"``. Casimirs are no constants where a torque acts; momentum maps are those that the
+        torque keeps too. Ready ones are in ``lt.torques``.
+
+    Attributes
+    ----------
+    place : (t, attitude) or None
+        Where a torque is taken: see :meth:`at_time`.
 
     Raises
     ------
@@ -65,6 +79,9 @@ class LiePoissonSystem(System):
     algebra: mf.LieAlgebra = eqx.field(static=True)
     group: mf.MatrixGroup | None = eqx.field(static=True)
     reconstruction: str | None = eqx.field(static=True)
+    torque: Any
+    place: tuple[jax.Array, jax.Array | None] | None
+    turned_parts: tuple[bool, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,15 +94,16 @@ class LiePoissonSystem(System):
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
         baths: HeatBaths | None = None,
+        torque=None,
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
+        self.torque, self.turned_parts = checked_torque(torque, algebra, group)
+        self.place = None
         poisson = mf.LiePoisson(algebra)
         self._build(poisson, algebra.dim, energy, entropy, dissipation, momentum_maps, validate, baths=baths)
-        if group is not None and self.is_driven:
-            raise InputError("attitudes are reconstructed for energies that do not depend on time: leave out the group")
 
     @property
     def sites(self) -> tuple[int, ...]:
@@ -93,6 +111,9 @@ class LiePoissonSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
+        push = self.push(x)
+        if push is not None:
+            return self.left_alone().field(x, dH, dS, dL) + push
         if self.dissipation is None or self.dissipation.momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
         action = self.algebra.action(dH)
@@ -101,7 +122,7 @@ class LiePoissonSystem(System):
 
     @property
     def inertia(self) -> np.ndarray | None:
-        if not _of_a_body(self.algebra) or is_traced(self.energy) or self.is_driven:
+        if not _of_a_body(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
         energy = self.without_baths().energy
         if not energy.is_quadratic:
@@ -112,9 +133,74 @@ class LiePoissonSystem(System):
             return None
         return np.linalg.inv(squares)[:3, :3]
 
+    # -- the torque -----------------------------------------------------------------------------------------------
+
+    @property
+    def pushed_by(self) -> str:
+        return "" if self.torque is None else name_of(self.torque)
+
+    @property
+    def needs_attitude(self) -> bool:
+        return any(self.turned_parts)
+
+    @property
+    def is_driven(self) -> bool:
+        return super().is_driven or (self.torque is not None and self.place is None)
+
+    def at_time(self, t, attitude=None):
+        """The system at a time: its energy, and its torque, which may need the attitude, shape (m, m), too."""
+        found = super().at_time(t)
+        if self.torque is None:
+            return found
+        found = copy(found)
+        place = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
+        object.__setattr__(found, "place", place)
+        return found
+
+    def at_some_times(self):
+        if not self.needs_attitude:
+            return super().at_some_times()
+        assert self.group is not None
+        attitudes = self.group.random(0, (len(TIMES),), scale=1.0)
+        return [self.at_time(t, attitude) for t, attitude in zip(TIMES, attitudes, strict=True)]
+
+    def push(self, x):
+        if self.torque is None:
+            return None
+        t, attitude = (None, None) if self.place is None else self.place
+        if t is None or (attitude is None and self.needs_attitude):
+            what = "time" if not self.needs_attitude else "time and the attitude"
+            raise InputError(
+                f"the torque {self.pushed_by} is known at a {what}: take system.at_time(t"
+                f"{', attitude' if self.needs_attitude else ''})"
+            )
+        if attitude is not None:  # XLA stops the process where it lays out many such matrices for products with vectors
+            attitude = jax.lax.optimization_barrier(attitude)
+        n = self.algebra.dim
+        found = torque_at(self.torque, self.turned_parts, t, x[:n].reshape(self.algebra.shape), attitude)
+        return jnp.pad(found.ravel(), (0, self.dim - n))
+
+    def left_alone(self):
+        if self.torque is None:
+            return self
+        found = copy(self)
+        for name, value in {"torque": None, "turned_parts": (), "place": None}.items():
+            object.__setattr__(found, name, value)
+        return found
+
+    @property
+    def entropy_law(self):
+        """That of a torque beside an entropy of momenta is none; those of baths it does not touch."""
+        law = super().entropy_law
+        return law if self.torque is None or isinstance(self.entropy, EntropyOfBaths) else None
+
     def casimirs(self) -> dict[str, Energy]:
-        found = _recorded_casimirs(self.algebra, self.algebra.basis_names)
+        found = self.casimirs_of_momenta()
         return found if self.baths is None else {name: self._of_body(C) for name, C in found.items()}
+
+    def casimirs_of_momenta(self) -> dict[str, Energy]:
+        """:meth:`casimirs`, as functions of mu alone."""
+        return _recorded_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
     def has_all_casimirs(self) -> bool:

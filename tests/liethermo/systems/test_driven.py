@@ -437,7 +437,6 @@ def test_functions_held_by_the_method_and_stiff_steps():
         (lambda: lt.MetriplecticSystem(None, still, momentum_maps={"J": shaken}, dim=2), "momentum map 'J' depends"),
         (lambda: lt.MetriplecticSystem(None, lambda x, t: t * x, dim=2), r"shape \(2,\)"),
         (lambda: lt.MetriplecticSystem(None, lt.TimeDependent(lambda x, t: x[7] * t).on([7]), dim=2), "component 7"),
-        (lambda: lt.LiePoissonSystem(mf.so(3), in_rotating_field, group=mf.SO(3)), "leave out the group"),
         (lambda: lt.ThermodynamicHerglotz(lambda x, t: x[1] ** 2 - x[0] * t, dim=3), "the Lagrangian depends"),
         (lambda: lt.SimpleClosedSystem(lambda q, v, S, t: v @ v - S * t, dim=3), "external"),
         (lambda: lt.Subsystem(shaken, 3), "the energy of a subsystem depends"),

@@ -1,0 +1,204 @@
+"""Torques for ``lt.LiePoissonSystem(..., torque=...)``: their numbers are parameters, swept and differentiated.
+
+Each is a function f(t, mu), or f(t, mu, attitude), to a dual vector of the shape of mu. An attitude is the matrix from
+body axes to axes in space, so ``attitude.T @ v`` has the components in the body of a vector v in space. Units are any
+consistent ones, such as those of the SI, which are named here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import is_traced, real_array
+from manifolds._module import Module
+
+from ..errors import InputError
+from ..functions.conditions import require
+from .parameters import positive
+
+__all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
+
+PERPENDICULAR = 1e-8
+"""Largest cosine of two directions that count as perpendicular."""
+
+
+class ConstantInBody(Module):
+    """A torque that is fixed in the body, such as that of a thruster that is always on; for any algebra.
+
+    Parameters
+    ----------
+    moment : array, of the shape of mu
+        In body axes (N m, on so(3)).
+    """
+
+    moment: jax.Array
+
+    def __init__(self, moment):
+        self.moment = _finite(moment, "moment")
+
+    def __call__(self, t, mu):
+        del t, mu
+        return self.moment
+
+
+class ConstantInSpace(Module):
+    """A torque on a body on so(3) that is fixed in space.
+
+    Parameters
+    ----------
+    moment : array, shape (3,)
+        In axes in space (N m).
+    """
+
+    moment: jax.Array
+
+    def __init__(self, moment):
+        self.moment = _finite(moment, "moment", 3)
+
+    def __call__(self, t, mu, attitude):
+        del t, mu
+        return attitude.T @ self.moment
+
+
+class GravityGradient(Module):
+    """The torque that the gravity of a centre has on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
+
+    The unit vector n, in body axes, points to the centre, and ``G M / r^3`` is the square of the mean motion [Hughes,
+    *Spacecraft Attitude Dynamics*, 1986, 8.1]. In space n turns in the plane of the orbit from ``towards``, where it is
+    at t = 0. Its sign does not matter.
+
+    Parameters
+    ----------
+    inertia : array, shape (3,) or (3, 3)
+        Principal moments of inertia, or the tensor, in body axes (kg m^2).
+    mean_motion : float, > 0
+        Angular velocity of the orbit, ``sqrt(G M / r^3)`` (rad/s).
+    towards, normal : array, shape (3,)
+        Directions in space, of any length: to the centre at t = 0, and of the angular momentum of the orbit.
+    """
+
+    inertia: jax.Array
+    mean_motion: jax.Array
+    towards: jax.Array
+    normal: jax.Array
+
+    def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
+        self.inertia = real_array(inertia)
+        if self.inertia.shape not in ((3,), (3, 3)):
+            raise InputError(f"inertia has shape (3,) or (3, 3), not {self.inertia.shape}")
+        self.mean_motion = positive(mean_motion, "mean_motion")
+        self.towards, self.normal = _direction(towards, "towards"), _direction(normal, "normal")
+        if not is_traced((self.towards, self.normal)):
+            cosine = float(np.dot(self.towards, self.normal))
+            if abs(cosine) > PERPENDICULAR:
+                raise InputError(f"towards lies in the plane of the orbit, normal to it: their cosine is {cosine:.3g}")
+
+    def __call__(self, t, mu, attitude):
+        del mu
+        n = attitude.T @ self.to_centre(t)
+        turned = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
+        return 3.0 * self.mean_motion**2 * jnp.cross(n, turned)
+
+    def to_centre(self, t) -> jax.Array:
+        """The direction to the centre at a time, in space, shape (3,)."""
+        angle = self.mean_motion * t
+        return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards)
+
+
+class Magnetic(Module):
+    """The torque of a magnetic field on a dipole of the body, ``m × B``.
+
+    Parameters
+    ----------
+    dipole : array, shape (3,)
+        m, in body axes (A m^2).
+    field : array, shape (3,), or function from t to one
+        B, in axes in space (T).
+    """
+
+    dipole: jax.Array
+    field: jax.Array | Callable
+
+    def __init__(self, dipole, field):
+        self.dipole = _finite(dipole, "dipole", 3)
+        self.field = field if callable(field) else _finite(field, "field", 3)
+
+    def __call__(self, t, mu, attitude):
+        del mu
+        field = self.field(t) if callable(self.field) else self.field
+        return jnp.cross(self.dipole, attitude.T @ field)
+
+
+class Motor(Module):
+    """The torques of motors that drive wheels, on a body with wheels: on ``so(3) + R^k``.
+
+    There mu is ``(Pi, l)``: Pi the angular momentum of the body and its wheels, and l that of each wheel about its own
+    axis. A motor turns its wheel by a torque, and the body by the opposite: so it changes l alone, ``l' = u``, and its
+    work is u times the rate at which the wheel turns against the body.
+
+    Parameters
+    ----------
+    moment : array, shape (k,), or function from t to one
+        u, about the axes of the wheels (N m).
+    """
+
+    moment: jax.Array | Callable
+
+    def __init__(self, moment):
+        self.moment = moment if callable(moment) else _finite(np.atleast_1d(moment), "moment")
+
+    def __call__(self, t, mu):
+        moment = jnp.atleast_1d(self.moment(t) if callable(self.moment) else self.moment)
+        return jnp.concatenate([jnp.zeros(mu.shape[0] - moment.shape[0]), moment])
+
+
+class Tabulated(Module):
+    """A torque in the body that a table gives, linear in t between its times, and zero before them and after.
+
+    A step across a time of the table has an error of second order there, whatever the method: let steps end at these
+    times by ``save_at=``. The laws hold all the same.
+
+    Parameters
+    ----------
+    times : array, shape (m,)
+        Increasing (s).
+    moments : array, shape ``(m, *shape of mu)``
+        In body axes at these times (N m, on so(3)).
+    """
+
+    times: jax.Array
+    moments: jax.Array
+
+    def __init__(self, times, moments):
+        self.times, self.moments = _finite(times, "times"), _finite(moments, "moments")
+        if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
+            raise InputError(
+                f"times has shape (m,), m at least 2, and moments m rows: not {self.times.shape} and "
+                f"{self.moments.shape}"
+            )
+        require(self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}")
+
+    def __call__(self, t, mu):
+        del mu
+        begun = jnp.where(t >= self.times, 1.0, 0.0)
+        now = begun[:-1] - begun[1:]  # one in the interval that t is in, zero in the others: no search
+        gone = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
+        return jnp.tensordot(now * (1.0 - gone), self.moments[:-1], 1) + jnp.tensordot(now * gone, self.moments[1:], 1)
+
+
+def _finite(value, name: str, size: int | None = None) -> jax.Array:
+    array = real_array(value)
+    if size is not None and array.shape != (size,):
+        raise InputError(f"{name} has shape ({size},), not {array.shape}")
+    require(array, np.isfinite if not is_traced(array) else jnp.isfinite, name + " must be finite, not {value}")
+    return array
+
+
+def _direction(value, name: str) -> jax.Array:
+    array = _finite(value, name, 3)
+    require(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
+    return array / jnp.sqrt(jnp.sum(array**2))

@@ -1,0 +1,386 @@
+"""Torques: the ledger of work, the impulse, orders against SciPy, closed forms, ensembles, files, refusals."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.systems.driven import _Push
+
+INERTIA = np.array([3.2, 3.0, 1.0])
+START = np.array([0.8, 0.5, 1.3])
+SO3 = mf.SO(3)
+SPAN = (0.3, 5.3)
+
+LAW = 2e-15
+"""Of ``H + U - W`` and of the momentum in space less the impulse, relative, over 100 steps; at most 9e-16 seen."""
+
+
+def rotating_field(t):
+    return jnp.array([jnp.cos(t), jnp.sin(2.0 * t), 0.3])
+
+
+TORQUES = {
+    "body": lt.torques.ConstantInBody([0.1, 0.2, -0.1]),
+    "space": lt.torques.ConstantInSpace([0.1, 0.2, -0.1]),
+    "gravity gradient": lt.torques.GravityGradient(INERTIA, 0.7),
+    "magnetic": lt.torques.Magnetic([0.3, 0.2, 0.5], rotating_field),
+    "thrust": lt.torques.Tabulated(
+        [1.0, 2.0, 4.0, 5.0], [[0.0, 0.0, 0.0], [0.1, 0.2, 0.3], [0.1, 0.0, 0.3], [0.0] * 3]
+    ),
+    "two": [lt.torques.ConstantInSpace([0.1, 0.2, -0.1]), lt.torques.ConstantInBody([0.1, 0.2, -0.1])],
+}
+METHODS = {
+    "midpoint": lt.MetriplecticMidpoint(),
+    "gauss2": lt.MetriplecticGauss(2),
+    "gauss3": lt.MetriplecticGauss(3),
+    "rk4": lt.MetriplecticRungeKutta(4),
+    "rk6": lt.MetriplecticRungeKutta(6),
+    "rk8": lt.MetriplecticRungeKutta(8),
+    "taylor": lt.MetriplecticTaylor(8),
+}
+
+
+def rubbing(torque, warm=True, **more) -> lt.LiePoissonSystem:
+    """A body with friction inside, which heats it, and a torque from outside."""
+    baths = lt.HeatBaths(capacity=2.0, temperature=1.0) if warm else None
+    friction = lt.DoubleBracket(0.02)
+    return lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(1.0 / INERTIA), dissipation=friction, baths=baths, torque=torque, group=SO3, **more
+    )
+
+
+def row(run, law):
+    return next(row for row in run.audit().rows if row.law == law)
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(
+    ("torque", "method"), [pytest.param(t, m, id=f"{t}-{m}") for t in TORQUES for m in METHODS], ids=str
+)
+def test_the_ledger_and_the_impulse(torque, method):
+    """Energy and heat less work, and momentum in space less impulse, constant to rounding; the entropy law besides."""
+    run = lt.integrate(rubbing(TORQUES[torque]), START, SPAN, 0.05, METHODS[method], engine="compiled")
+    assert run.laws.energy == "conserved"
+    assert run.laws.entropy == "nondecreasing"
+    assert run.audit().passed, run.audit()
+    assert run.audit().energy_drift <= LAW
+    assert row(run, "drift of momentum in space less the impulse").value <= LAW
+    work = run.casimirs["work"]
+    assert np.ptp(work) > 0.01
+    assert np.abs(run.energy - run.energy[0] - work).max() <= LAW * np.abs(run.energy).max()
+    impulse = np.stack([run.casimirs[f"impulse {i}"] for i in (1, 2, 3)], axis=1)
+    momentum = np.einsum("tij,tj->ti", run.attitude, run.x[:, :3])
+    assert np.ptp(impulse, axis=0).max() > 0.01
+    assert np.abs(momentum - momentum[0] - impulse).max() <= 4 * LAW
+    assert "change of mu1**2 + mu2**2 + mu3**2" in str(run.audit())
+
+
+def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
+    """Control: the power of a torque by the gradient of H where it acts, and not by the discrete one of the step."""
+    energy = lambda mu: jnp.sum(mu**2 / INERTIA) / 2 + 0.1 * jnp.sum(mu**4)  # noqa: E731
+    system = lt.LiePoissonSystem(mf.so(3), energy, torque=TORQUES["body"])
+    good = lt.integrate(system, START, SPAN, 0.1, lt.MetriplecticMidpoint(), engine="array")
+    assert good.audit().energy_drift <= LAW
+    monkeypatch.setattr(_Push, "force", lambda self, system, x, dH, dS, dL: system.pushed(x, system.energy.gradient(x)))
+    monkeypatch.setattr(
+        lt.DrivenSystem,
+        "field",
+        lambda self, x, dH, dS, dL=(): _without_push(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
+    )
+    method = lt.MetriplecticMidpoint("mean_value")  # of which no program is known
+    bad = lt.integrate(system, START, SPAN, 0.1, method, engine="array", on_failure="return")
+    assert bad.audit().energy_drift > 1e5 * LAW
+    assert not bad.audit().passed
+
+
+def _without_push(system, x, dH):
+    return system.poisson.sharp(x, dH)
+
+
+def test_an_impulse_of_another_collocation_breaks_its_row(monkeypatch):
+    """Control: the impulse by the attitudes of the stages, which lie in the group, in place of the collocated ones."""
+    monkeypatch.setattr(
+        "liethermo.integrators.reconstruction._stages", lambda X: jnp.broadcast_to(jnp.eye(X.shape[-1]), X.shape)
+    )
+    torque = lt.torques.ConstantInSpace([0.1, 0.2, -0.1002])
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=torque, group=SO3, reconstruction="coadjoint"
+    )
+    run = lt.integrate(system, START, (0.0, 2.0), 0.1, lt.MetriplecticMidpoint(), engine="array")
+    assert row(run, "drift of momentum in space less the impulse").value > 1e5 * LAW
+    assert not run.audit().passed
+
+
+# -- orders ------------------------------------------------------------------------------------------------------------
+
+
+def from_all_sides(t, mu, attitude):
+    """It depends on all that a torque may depend on."""
+    field = jnp.array([0.6, 0.3, 0.2]) + 0.4 * jnp.stack([jnp.cos(t), jnp.sin(t), 0.0 * t])
+    return jnp.cross(jnp.array([0.5, -0.3, 0.8]), attitude.T @ field) + 0.1 * jnp.sin(attitude[0, 0] * mu)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Momentum, attitude, impulse and work at t = 2.4 by SciPy, from a field written by hand."""
+
+    def rate(t, y):
+        mu, g = y[:3], y[3:12].reshape(3, 3)
+        field = np.array([0.6, 0.3, 0.2]) + 0.4 * np.array([np.cos(t), np.sin(t), 0.0])
+        torque = np.cross([0.5, -0.3, 0.8], g.T @ field) + 0.1 * np.sin(g[0, 0] * mu)
+        full = mu / INERTIA + 0.02 * np.cross(mu, mu / INERTIA)
+        turning = (g @ np.cross(np.eye(3), full)).ravel()
+        return np.concatenate([np.cross(mu, full) + torque, turning, g @ torque, [mu / INERTIA @ torque]])
+
+    start = np.concatenate([START, np.eye(3).ravel(), np.zeros(4)])
+    return solve_ivp(rate, (0.4, 2.4), start, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+
+
+STEPS = {2: (40, 80, 160), 4: (20, 40, 80), 6: (8, 12, 18), 8: (6, 9, 12)}
+
+
+@pytest.mark.sampled("gauss2-cayley")
+@pytest.mark.parametrize(
+    ("method", "kind"),
+    [
+        pytest.param(method, kind, id=f"{name}-{kind}")
+        for name, method in METHODS.items()
+        for kind in ("cayley", "exp")
+        if name != "taylor" and (kind == "cayley" or not method.explicit)
+    ],
+)
+def test_orders_against_scipy(method, kind, exact):
+    """Of momentum, attitude, impulse and work."""
+    system, errors = rubbing(from_all_sides, warm=False, reconstruction=kind), []
+    for n in STEPS[method.order]:
+        run = lt.integrate(system, START, (0.4, 2.4), 2.0 / n, method, save_every=n, engine="compiled")
+        found = [*run.x[-1], *run.attitude[-1].ravel(), *(run.casimirs[f"impulse {i}"][-1] for i in (1, 2, 3))]
+        errors.append([np.abs(found - exact[:-1]).max(), abs(run.casimirs["work"][-1] - exact[-1])])
+        assert run.audit().passed, run.audit()
+        if kind == "cayley":
+            assert row(run, "drift of momentum in space less the impulse").value <= LAW
+    n = np.array(STEPS[method.order])
+    slopes = np.log(np.array(errors[:-1]) / errors[1:]) / np.log(n[1:] / n[:-1])[:, None]
+    assert np.min(errors) > 1e-12, "at the rounding plateau nothing is measured"
+    assert (np.abs(slopes - method.order) < (0.5 if method.explicit else 0.2)).all(), (errors, slopes)
+
+
+def test_explicit_and_implicit_methods_agree(exact):
+    """Taylor series go through the exponential of the angles too."""
+    run = lt.integrate(rubbing(from_all_sides, warm=False), START, (0.4, 2.4), 0.1, METHODS["rk8"], engine="compiled")
+    assert np.abs(run.x[-1] - exact[:3]).max() < 1e-9
+    assert run.audit().passed
+
+
+# -- closed forms ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gauss2", "rk4"])
+def test_a_body_is_spun_up_from_rest(name):
+    """``Omega = tau t / I`` and ``W = (tau t)^2 / (2 I)`` about a principal axis, a constant torque in the body."""
+    torque, axis = 0.3, 2
+    system = rubbing(lt.torques.ConstantInBody(torque * np.eye(3)[axis]))
+    run = lt.integrate(system, np.zeros(3), (0.0, 10.0), 0.1, METHODS[name], engine="compiled")
+    expected = torque * run.t
+    assert np.abs(run.x[:, axis] - expected).max() < 1e-14
+    assert np.abs(run.casimirs["work"] - expected**2 / (2 * INERTIA[axis])).max() < 1e-14
+    assert np.abs(run.casimirs["impulse 3"] - expected).max() < 1e-14
+    assert run.audit().passed
+
+
+def test_libration_under_gravity_gradient():
+    """A satellite that points to the earth swings in pitch at ``sqrt(3 n^2 (I_roll - I_yaw) / I_pitch)``."""
+    roll, pitch, yaw = 9.0, 10.0, 4.0
+    n, angle = 1.1e-3, 1e-3  # of a low orbit, rad/s; a small angle, so that the swing is linear to 1e-7
+    inertia = np.array([yaw, roll, pitch])  # body axes: to the earth, along the orbit, normal to it
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(1.0 / inertia), torque=lt.torques.GravityGradient(inertia, n), group=SO3
+    )
+    frequency = np.sqrt(3.0 * n**2 * (roll - yaw) / pitch)
+    period = 2.0 * np.pi / frequency
+    tilted = np.asarray(SO3.exp(np.array([0.0, 0.0, angle])))
+    run = lt.integrate(
+        system, [0.0, 0.0, pitch * n], (0.0, 2 * period), period / 100, METHODS["gauss3"], attitude=tilted
+    )
+    to_centre = np.stack([np.cos(n * run.t), np.sin(n * run.t), 0 * run.t], axis=1)
+    in_body = np.einsum("tij,ti->tj", run.attitude, to_centre)
+    swing = -np.arctan2(in_body[:, 1], in_body[:, 0])
+    assert np.abs(swing - angle * np.cos(frequency * run.t)).max() < 1e-5 * angle  # the rest: it is not linear
+    other = np.sqrt(3.0 * n**2 * (roll - yaw) / roll)
+    assert np.abs(swing - angle * np.cos(other * run.t)).max() > 0.1 * angle
+    assert run.audit().passed
+
+
+def test_a_motor_drives_a_wheel():
+    """It turns the wheel and not the whole: |Pi| is constant, and the work is that of the motor against the wheel."""
+    wheel, power = 0.1, lambda t: 0.05 * jnp.sin(t)[None]
+
+    def energy(mu):
+        body = mu[:3] - jnp.array([0.0, 0.0, 1.0]) * mu[3]
+        return jnp.sum(body**2 / INERTIA) / 2 + mu[3] ** 2 / (2 * wheel)
+
+    length = {"Pi": lambda mu: mu[:3] @ mu[:3]}
+    algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
+    system = lt.LiePoissonSystem(algebra, energy, torque=lt.torques.Motor(power), momentum_maps=length)
+    for name in ("gauss2", "rk6"):
+        run = lt.integrate(system, [*START, 0.0], SPAN, 0.05, METHODS[name], engine="compiled")
+        assert run.audit().passed, run.audit()
+        assert "Pi" in run.laws.conserved
+        assert np.abs(run.x[:, 3] - 0.05 * (np.cos(0.3) - np.cos(run.t))).max() < 1e-7
+
+
+# -- time, energies that depend on it ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["midpoint", pytest.param("gauss2", marks=pytest.mark.slow)])
+def test_a_motion_that_is_turned_around_goes_back(name):
+    """Without friction the motion is reversible, and symmetric methods take it back to rounding."""
+    torque = lambda t, mu, g: g.T @ rotating_field(t)  # noqa: E731
+    back = lambda t, mu, g: g.T @ rotating_field(SPAN[1] + SPAN[0] - t)  # noqa: E731
+    there, again = (
+        lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=f, group=SO3) for f in (torque, back)
+    )
+    run = lt.integrate(there, START, SPAN, 0.05, METHODS[name], engine="compiled")
+    returned = lt.integrate(again, -run.x[-1], SPAN, 0.05, METHODS[name], attitude=run.attitude[-1], engine="compiled")
+    assert np.abs(returned.x[-1] + START).max() < 1e-13
+    assert np.abs(returned.attitude[-1] - np.eye(3)).max() < 1e-13
+    assert abs(returned.casimirs["work"][-1] + run.casimirs["work"][-1]) < 1e-13
+
+
+def test_an_energy_that_depends_on_time_has_an_attitude():
+    """Its momentum in space is constant, since no torque acts; with one its impulse is taken off."""
+    swelling = lambda mu, t: jnp.sum(mu**2 / (INERTIA * (1.0 + 0.2 * jnp.sin(t)))) / 2  # noqa: E731
+    run = lt.integrate(
+        lt.LiePoissonSystem(mf.so(3), swelling, group=SO3), START, SPAN, 0.05, METHODS["gauss2"], engine="compiled"
+    )
+    assert run.audit().passed
+    assert run.audit().energy_drift <= LAW
+    assert row(run, "drift of momentum in space").value <= LAW
+    pushed = lt.LiePoissonSystem(mf.so(3), swelling, group=SO3, torque=TORQUES["space"])
+    both = lt.integrate(pushed, START, SPAN, 0.05, METHODS["gauss2"], engine="compiled")
+    assert both.audit().passed
+    assert row(both, "drift of momentum in space less the impulse").value <= LAW
+
+
+# -- ensembles, flows, files -------------------------------------------------------------------------------------------
+
+
+def test_an_ensemble_over_a_parameter_is_single_runs():
+    """To the last bit, with equal steps and with adaptive ones; work and impulse too."""
+    rates, method = np.linspace(0.3, 0.8, 3), METHODS["gauss2"]
+    system = rubbing(TORQUES["gravity gradient"])
+    for step in (0.1, lt.Adaptive(1e-7)):
+        many = lt.ensemble(system, START, SPAN, step, method, parameters={"torque.mean_motion": rates})
+        assert many.provenance["engine"] == "compiled"
+        one = lt.integrate(
+            rubbing(lt.torques.GravityGradient(INERTIA, rates[2])), START, SPAN, step, method, engine="compiled"
+        )
+        assert np.array_equal(many.x[2], one.x[-1])
+        assert np.array_equal(many.attitude[2], one.attitude[-1])
+        assert many.work[2] == one.casimirs["work"][-1]
+        assert many[2].casimirs["impulse 1"][-1] == one.casimirs["impulse 1"][-1]
+        assert many.audit().passed, many.audit()
+
+
+def test_a_flow_is_differentiated_by_a_parameter():
+    def end(rate):
+        return lt.flow(rubbing(lt.torques.GravityGradient(INERTIA, rate), warm=False), START, (0.3, 1.3), 0.1)
+
+    slope = jax.jacfwd(end)(0.5)
+    quotient = (end(0.5 + 1e-5) - end(0.5 - 1e-5)) / 2e-5
+    assert np.abs(slope - quotient).max() < 1e-8
+    assert np.abs(slope).max() > 0.01
+
+
+def test_files_provenance_and_dense_output(tmp_path):
+    system = rubbing(TORQUES["gravity gradient"])
+    run = lt.integrate(system, START, SPAN, lt.Adaptive(1e-8), METHODS["gauss2"], dense=True, engine="compiled")
+    assert run.provenance["torque"] == "GravityGradient"
+    assert run.provenance["dissipation"] == type(system.dissipation).__name__
+    assert run.provenance["system"] == "LiePoissonSystem"
+    assert np.abs(run(run.t) - run.x).max() < 1e-14
+    loaded = lt.load(run.save(tmp_path / "torque.nc"))
+    assert loaded.laws == run.laws
+    assert str(loaded.audit()) == str(run.audit())
+    assert np.array_equal(loaded.casimirs["impulse 2"], run.casimirs["impulse 2"])
+    assert "torque" not in lt.integrate(system.left_alone(), START, (0.0, 0.1), 0.1).provenance
+
+
+def test_what_the_user_asks_of_a_system():
+    system, attitude = rubbing(TORQUES["space"], warm=False), np.asarray(SO3.exp(np.array([0.4, -0.2, 0.7])))
+    here = system.at_time(0.5, attitude)
+    expected = np.asarray(system.left_alone().vector_field(START)) + attitude.T @ [0.1, 0.2, -0.1]
+    assert np.allclose(here.vector_field(START), expected, rtol=1e-14)
+    timed = rubbing(lambda t, mu: t * mu, warm=False)
+    assert np.allclose(timed.vector_field(START, 2.0), timed.left_alone().vector_field(START) + 2.0 * START)
+    assert system.check().passed
+    assert rubbing(TORQUES["space"]).entropy_law == "nondecreasing"
+    own = lt.LiePoissonSystem(
+        mf.so(3),
+        lt.Quadratic(1.0 / INERTIA),
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.1),
+        torque=TORQUES["body"],
+    )
+    assert own.entropy_law is None, "a torque changes an entropy of momenta"
+    assert lt.integrate(own, START, (0.0, 1.0), 0.1).audit().passed
+    assert lt.suggest_step(system, START) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (
+            lambda: lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.ones(3)), torque=TORQUES["space"]),
+            "give the system a group",
+        ),
+        (lambda: rubbing(lambda t, mu: mu[:2]), r"shape \(3,\).*not float64 of shape \(2,\)"),
+        (lambda: rubbing(lambda t: t), "needs 1 arguments"),
+        (lambda: rubbing(3.0), "not float"),
+        (lambda: rubbing([]), "empty list"),
+        (lambda: rubbing(lambda t, mu: mu @ jnp.ones(4)), "could not be evaluated"),
+        (lambda: rubbing(TORQUES["space"]).vector_field(START, 0.0), "a time and the attitude"),
+        (lambda: rubbing(TORQUES["body"]).vector_field(START), "give the time"),
+        (lambda: lt.integrate(rubbing(TORQUES["space"]), START, SPAN, 0.1, lt.Reference()), "follows no attitude"),
+        (lambda: lt.torques.ConstantInSpace([1.0, 2.0]), r"shape \(3,\), not \(2,\)"),
+        (lambda: lt.torques.Magnetic([np.nan, 0.0, 0.0], np.ones(3)), "must be finite"),
+        (lambda: lt.torques.GravityGradient(INERTIA, -1.0), "must be positive"),
+        (lambda: lt.torques.GravityGradient(np.ones(4), 1.0), r"not \(4,\)"),
+        (lambda: lt.torques.GravityGradient(INERTIA, 1.0, normal=(1.0, 0.0, 1.0)), "their cosine is"),
+        (lambda: lt.torques.GravityGradient(INERTIA, 1.0, normal=(0.0, 0.0, 0.0)), "is a direction"),
+        (lambda: lt.torques.Tabulated([0.0, 0.0], np.zeros((2, 3))), "increase"),
+        (lambda: lt.torques.Tabulated([0.0, 1.0], np.zeros((3, 3))), "moments m rows"),
+    ],
+)
+def test_what_is_refused(build, words):
+    with pytest.raises((lt.InputError, lt.FunctionError), match=words) as refused:
+        build()
+    assert "\n" not in str(refused.value).strip().split(": Traceback")[0]
+
+
+def test_a_study_of_a_torque(tmp_path):
+    """Every point is a run of its own, to the last bit, where the torque depends on time and attitude."""
+
+    def build(p):
+        return rubbing(lt.torques.GravityGradient(INERTIA, p["rate"]))
+
+    axes, common = {"rate": np.linspace(0.3, 0.6, 3)}, {"step": 0.1, "method": METHODS["gauss2"]}
+    study = lt.Study(build, axes, x0=START, t_span=SPAN, measure={"end": "final"}, store=tmp_path / "s.zarr", **common)
+    study.run(progress=False)
+    one = lt.integrate(build({"rate": axes["rate"][1]}), START, SPAN, engine="compiled", **common)
+    assert np.array_equal(np.asarray(study.results["end"])[1], one.x[-1])
+
+
+def test_noise_beside_a_torque():
+    """Energy less work and momentum in space less impulse are exact on every path."""
+    noise = lt.Fluctuations(1e-3, 1)
+    run = lt.integrate(rubbing(TORQUES["space"]), START, (0.3, 2.3), 0.05, noise=noise, engine="array")
+    assert run.audit().passed
+    assert run.audit().energy_drift <= LAW
+    assert row(run, "drift of momentum in space less the impulse").value <= LAW
