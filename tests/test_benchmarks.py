@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import sys
@@ -9,16 +10,17 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import child, laws, native, page, reference
+from benchmarks import child, laws, native, page, reference, simulators
 from benchmarks.__main__ import main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
-from benchmarks.measurements import memory, spin, variational
+from benchmarks.measurements import memory, spin, tumbling, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
-from benchmarks.report import Target
+from benchmarks.report import Target, UnavailableError
 from benchmarks.timing import race
+from liethermo import MetriplecticGauss
 from liethermo.engines.codes import Code
 from liethermo.engines.rules import RULES
 
@@ -192,3 +194,33 @@ def test_a_race_takes_turns():
     assert turns == "ab" * 4  # one before the first round
     assert outcomes["b"].result == 7
     assert 0.0 < outcomes["a"].seconds < 0.02
+
+
+@pytest.mark.parametrize("body", [tumbling.FREE, tumbling.DAMPED], ids=["free", "damped"])
+def test_the_tumbling_body_is_one_in_the_library_and_in_scipy(body):
+    ours = simulators.library(body, MetriplecticGauss(3), 0.05, 5.0, 10)()
+    exact, _ = simulators.scipy(body, 1e-12, 5.0, 10)()
+    other, _ = simulators.scipy(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
+    assert np.abs(ours.momentum - exact.momentum).max() <= 1e-9  # measured: 6e-11
+    assert np.abs(ours.in_space - exact.in_space).max() <= 1e-9
+    assert ours.total is not None
+    assert np.ptp(ours.total) <= 1e-14
+    assert np.abs(ours.momentum - other.momentum).max() > 1e-4
+
+
+@pytest.mark.parametrize("body", [tumbling.FREE, tumbling.DAMPED], ids=["free", "damped"])
+def test_the_tumbling_body_is_one_in_mujoco(body):
+    pytest.importorskip("mujoco")
+    theirs = simulators.mujoco(body, "RK4", 0.01, 5.0, 10)()
+    exact, _ = simulators.scipy(body, 1e-12, 5.0, 10)()
+    assert np.abs(theirs.in_space - exact.in_space).max() <= 1e-9
+    assert np.abs(theirs.momentum - exact.momentum).max() <= 1e-9
+
+
+def test_simulators_that_are_missing_are_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setitem(sys.modules, "Basilisk.simulation", None)
+    with pytest.raises(UnavailableError, match="mujoco is not installed"):
+        simulators.mujoco(tumbling.FREE, "RK4", 0.01, 1.0, 1)
+    with pytest.raises(UnavailableError, match="Basilisk is not installed"):
+        simulators.basilisk(tumbling.FREE, 0.01, 1.0, 1)

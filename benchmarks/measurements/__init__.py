@@ -9,6 +9,7 @@ NAMES = (
     "fluids",
     "ensemble",
     "others",
+    "tumbling",
     "work_precision",
     "dimension",
     "bodies",

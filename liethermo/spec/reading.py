@@ -100,8 +100,8 @@ class Spec:
             system.state(self.run.initial)
         except InputError as error:
             raise SpecError(self.path, [f"run.initial = {shown(self.run.initial)}: {error}"]) from error
-        if "momentum_sphere" in self.outputs.figures and system.dim != 3:
-            problem = f"momentum_sphere needs states of 3 components, and these have {system.dim}"
+        if "momentum_sphere" in self.outputs.figures and system.body_dim != 3:
+            problem = f"momentum_sphere needs states of 3 components, and these have {system.body_dim}"
             raise SpecError(self.path, [f"outputs.figures = {shown(self.outputs.figures)}: {problem}"])
         return system
 

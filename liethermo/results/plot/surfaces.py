@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from contourpy import contour_generator
@@ -43,7 +45,8 @@ def momentum_sphere(
     with the coordinate planes and the plane of the paper. The trajectory is coloured by time. What the solid hides
     from the viewpoint of ``ax`` is pale or left out, so turn the axes before drawing, not after. A system without
     entropy shows its first Casimir or momentum map instead; where the energy falls (double bracket) the two change
-    places.
+    places. Of a system with baths the body is shown, which loses the energy that they gain: its momentum on the
+    momentum sphere, and its energy at the start and at the end.
 
     Surfaces are found along rays from the origin. One that a ray meets twice is left out; one that does not close
     around the origin, such as a cylinder, is drawn by sections that end a little beyond the trajectory.
@@ -51,7 +54,7 @@ def momentum_sphere(
     Parameters
     ----------
     solution : Solution
-        Of a system with three components, such as one on so(3)*.
+        Of a system with three components, such as one on so(3)*, and baths besides.
     system : System, optional
         What was integrated. It is not known for a solution read from a file. The energy surface is then the quadric
         through all states, if there is exactly one. The entropy surfaces are spheres if the algebra is so(3) or su(2),
@@ -70,12 +73,15 @@ def momentum_sphere(
         If the file cannot be written.
     """
     path = writable(path)
+    if system is not None and system.body_dim < system.dim == solution.x.shape[1]:
+        solution = _without_baths(solution, system)
     if solution.x.shape[1] != 3:
         raise InputError(
-            f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any"
+            f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any, and "
+            "where the others are the entropies of baths, give the system too"
         )
-    if system is not None and system.dim != 3:
-        raise InputError(f"the states have 3 components, but those of this system have {system.dim}")
+    if system is not None and system.body_dim != 3:
+        raise InputError(f"the states have 3 components, but those of this system have {system.body_dim}")
     if ax is not None and not isinstance(ax, Axes3D):
         raise InputError("ax must be three-dimensional: make it with subplot_kw={'projection': '3d'}")
     if ax is None:
@@ -109,6 +115,20 @@ def momentum_sphere(
     return finished(ax.figure, path)
 
 
+def _without_baths(solution: Solution, system: System) -> Solution:
+    """The body alone: its states, and the energy that it has left."""
+    x = solution.x[:, : system.body_dim]
+    energy = np.asarray(_of_body(system.energy, system)(x))
+    laws = dataclasses.replace(solution.laws, energy="nonincreasing")
+    return dataclasses.replace(solution, x=x, energy=energy, entropy=None, laws=laws)
+
+
+def _of_body(function: Callable, system: System) -> Callable:
+    """A function of the states of a system as one of its body, the entropies of baths being zero."""
+    number = system.dim - system.body_dim
+    return lambda x: function(jnp.concatenate([x, jnp.zeros((*x.shape[:-1], number))], axis=-1))
+
+
 @dataclass(frozen=True)
 class _Quantity:
     """A function of the state and its values along a run."""
@@ -131,9 +151,10 @@ def _quantities(solution: Solution, system: System | None) -> tuple[_Quantity | 
     energy: Function | None
     entropy: Function | None
     if system is not None:
-        energy = _vectorized(system.energy)
-        second = system.entropy or next((J for J, kept in system.invariants().values() if kept), None)
-        entropy = None if second is None else _vectorized(second)
+        energy = _vectorized(_of_body(system.energy, system))
+        own = system.entropy if system.body_dim == system.dim else None  # that of baths is no function of the body
+        second = own or next((J for J, kept in system.invariants().values() if kept), None)
+        entropy = None if second is None else _vectorized(_of_body(second, system))
     else:
         energy = _quadric_through(solution.x) if solution.laws.energy == "conserved" else None
         spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")

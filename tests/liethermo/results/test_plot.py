@@ -295,3 +295,15 @@ def test_other_dimensions_and_flat_axes_are_refused(body, relaxed):
     _, flat = plt.subplots()
     with pytest.raises(lt.InputError, match="three-dimensional"):
         lt.plot.momentum_sphere(relaxed, body, ax=flat)
+
+
+def test_momentum_sphere_of_a_body_with_a_bath():
+    """The body is shown: its momentum keeps to its sphere, and its energy falls while the total one is constant."""
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.3), baths=lt.HeatBaths()
+    )
+    solution = lt.integrate(system, [0.1, 0.2, 1.0], (0.0, 20.0), 0.1)
+    assert labels(lt.plot.momentum_sphere(solution, system))[:2] == ["invariant $1.05$", "energy at start $0.5117$"]
+    assert np.ptp(solution.energy) < 1e-14
+    with pytest.raises(lt.InputError, match="where the others are the entropies of baths, give the system too"):
+        lt.plot.momentum_sphere(solution)

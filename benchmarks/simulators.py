@@ -1,0 +1,262 @@
+"""A tumbling body, free or with a damped wheel inside, in programs that others fly satellites and robots with.
+
+The wheel turns about the middle axis of the body and rubs in its bearing. All programs start from the same turning, have
+no forces from outside, and give the same record. One that is not installed raises :class:`.UnavailableError`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numba
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+import manifolds as mf
+from manifolds.groups.closed_forms import so3_cayley
+
+from .peers import module
+from .report import UnavailableError
+
+START = (0.1, 1.0, 0.1)
+"""The angular velocity, nearly about the middle axis; the wheel is at rest in the body."""
+
+HEAT = 2.0
+"""The capacity of the bath that the wheel heats; its temperature is 1 at the start."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Moments of inertia of the body without the turning of its wheel, and the wheel's; without one it is zero."""
+
+    inertia: np.ndarray
+    wheel: float = 0.0
+    damping: float = 0.0
+
+    @property
+    def hub(self) -> np.ndarray:
+        """What is left where the wheel, a disc about the second axis, is a body of its own."""
+        return self.inertia - 0.5 * self.wheel * np.array([1.0, 0.0, 1.0])
+
+    @property
+    def disc(self) -> np.ndarray:
+        return self.wheel * np.array([0.5, 1.0, 0.5])
+
+    def momentum(self, omega, spin) -> np.ndarray:
+        """In the body, shape (..., 3), from the angular velocity and the wheel's, relative to the body."""
+        return self.inertia * omega + self.wheel * np.multiply.outer(omega[..., 1] + spin, [0.0, 1.0, 0.0])
+
+    def kinetic(self, omega, spin) -> np.ndarray:
+        return 0.5 * np.sum(self.inertia * omega**2, axis=-1) + 0.5 * self.wheel * (omega[..., 1] + spin) ** 2
+
+    def velocities(self, momentum, wheel) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse of :meth:`momentum`, given the wheel's momentum too."""
+        rest = momentum - np.multiply.outer(wheel, [0.0, 1.0, 0.0])
+        omega = rest / self.inertia
+        return omega, (wheel / self.wheel - omega[..., 1] if self.wheel else np.zeros_like(wheel))
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run at times of equal distance.
+
+    Attributes
+    ----------
+    momentum, in_space : array, shape (times, 3)
+    kinetic : array, shape (times,)
+    total : array, shape (times,), or None
+        With the heat, where the program follows it.
+    """
+
+    momentum: np.ndarray
+    in_space: np.ndarray
+    kinetic: np.ndarray
+    total: np.ndarray | None = None
+
+
+def _record(body: Body, omega, spin, attitude, total=None) -> Record:
+    momentum = body.momentum(omega, spin)
+    return Record(momentum, np.einsum("tij,tj->ti", attitude, momentum), body.kinetic(omega, spin), total)
+
+
+def _of_quaternions(q) -> np.ndarray:
+    """Rotations, shape (..., 3, 3), of quaternions with the scalar first."""
+    w, v = q[..., 0, None, None], q[..., 1:]
+    hat = np.cross(v[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    return np.eye(3) + (2.0 * w * hat + 2.0 * hat @ hat) / np.sum(q**2, axis=-1)[..., None, None]
+
+
+# -- this library -----------------------------------------------------------------------------------------------------
+
+
+def system(body: Body) -> lt.LiePoissonSystem:
+    """The body as a Lie-Poisson system: mu and, with a wheel, its momentum and the heat of its bearing."""
+    if not body.wheel:
+        return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / body.inertia), group=mf.SO(3))
+    inverse = np.zeros((4, 4))
+    inverse[:3, :3] = np.diag(1.0 / body.inertia)
+    inverse[3, 3] = 1.0 / body.wheel + 1.0 / body.inertia[1]
+    inverse[1, 3] = inverse[3, 1] = -1.0 / body.inertia[1]
+    algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
+    group = mf.MatrixGroup("SO(3) x R", algebra, _off, cayley_map=None, adjoint_cayley_map=_turned)
+    friction = lt.Friction([0.0, 0.0, 0.0, body.damping])
+    baths = lt.HeatBaths(HEAT, 1.0)
+    return lt.LiePoissonSystem(algebra, lt.Quadratic(inverse), dissipation=friction, baths=baths, group=group)
+
+
+def _off(g):
+    return jnp.abs(g[:3, :3] @ g[:3, :3].T - jnp.eye(3)).max()
+
+
+def _turned(algebra, x):
+    g = jnp.zeros((*x.shape[:-1], 5, 5)).at[..., :3, :3].set(so3_cayley(mf.so(3), x[..., :3]))
+    return g.at[..., 3, 3].set(1.0).at[..., 4, 4].set(1.0).at[..., 3, 4].set(x[..., 3])
+
+
+def library(body: Body, method: lt.OneStepMethod, step: float, t_end: float, times: int) -> Callable[[], Record]:
+    """Steps of one size."""
+    made, omega = system(body), np.array(START)
+    start = body.momentum(omega, 0.0)
+    x0 = [*start, body.wheel * omega[1], 0.0] if body.wheel else start
+    every = round(t_end / step / times)
+
+    def work() -> Record:
+        solution = lt.integrate(made, x0, (0.0, t_end), step, method, save_every=every)
+        x, g = np.asarray(solution.x), np.asarray(solution.attitude)[:, :3, :3]
+        omega, spin = body.velocities(x[:, :3], x[:, 3] if body.wheel else np.zeros(len(x)))
+        return _record(body, omega, spin, g, np.asarray(solution.energy))
+
+    return work
+
+
+# -- SciPy ------------------------------------------------------------------------------------------------------------
+
+
+def scipy(body: Body, tolerance: float, t_end: float, times: int) -> Callable[[], tuple[Record, int]]:
+    """DOP853 on momentum, wheel, quaternion and heat; and how many steps it took."""
+    omega, field = np.array(START), _field(*body.inertia, body.wheel or 1.0, body.damping, bool(body.wheel))
+    x0 = np.array([*body.momentum(omega, 0.0), body.wheel * omega[1], 1.0, 0.0, 0.0, 0.0, 0.0])
+    when = np.linspace(0.0, t_end, times + 1)
+
+    def work() -> tuple[Record, int]:
+        done = solve_ivp(field, (0.0, t_end), x0, method="DOP853", rtol=tolerance, atol=tolerance, t_eval=when)
+        if not done.success:
+            raise RuntimeError(done.message)
+        x = done.y.T
+        omega, spin = body.velocities(x[:, :3], x[:, 3])
+        heat = x[:, 8]
+        record = _record(body, omega, spin, _of_quaternions(x[:, 4:8]), body.kinetic(omega, spin) + heat)
+        return record, done.nfev // 12
+
+    return work
+
+
+def _field(I1, I2, I3, J, damping, turns) -> Callable:
+    @numba.njit
+    def field(t, x):
+        p = x[3] if turns else 0.0
+        a, b, c = x[0] / I1, (x[1] - p) / I2, x[2] / I3
+        s = p / J - b if turns else 0.0
+        w, u, v, z = x[4], x[5], x[6], x[7]
+        return np.array(
+            [
+                x[1] * c - x[2] * b,
+                x[2] * a - x[0] * c,
+                x[0] * b - x[1] * a,
+                -damping * s,
+                -0.5 * (u * a + v * b + z * c),
+                0.5 * (w * a + v * c - z * b),
+                0.5 * (w * b + z * a - u * c),
+                0.5 * (w * c + u * b - v * a),
+                damping * s * s,
+            ]
+        )
+
+    return field
+
+
+# -- MuJoCo -----------------------------------------------------------------------------------------------------------
+
+XML = """
+<mujoco>
+  <option gravity="0 0 0" timestep="{step}" integrator="{integrator}"><flag contact="disable"/></option>
+  <worldbody><body><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="{hub}"/>{wheel}</body></worldbody>
+</mujoco>
+"""
+WHEEL = """
+<body><inertial pos="0 0 0" mass="1e-6" diaginertia="{disc}"/><joint type="hinge" axis="0 1 0" damping="{damping}"/></body>
+"""
+
+
+def mujoco(body: Body, integrator: str, step: float, t_end: float, times: int) -> Callable[[], Record]:
+    """A free body, and a wheel on a hinge; the loop of steps is MuJoCo's own."""
+    mj = module("mujoco")
+    numbers = {name: " ".join(map(str, getattr(body, name))) for name in ("hub", "disc")}
+    wheel = WHEEL.format(damping=body.damping, **numbers) if body.wheel else ""
+    model = mj.MjModel.from_xml_string(XML.format(step=step, integrator=integrator, wheel=wheel, **numbers))
+    every = round(t_end / step / times)
+
+    def work() -> Record:
+        data = mj.MjData(model)
+        data.qvel[3:6] = START
+        states = [np.concatenate([data.qvel, data.qpos[3:7]])]
+        for _ in range(times):
+            mj.mj_step(model, data, nstep=every)
+            states.append(np.concatenate([data.qvel, data.qpos[3:7]]))
+        x = np.array(states)
+        spin = x[:, 6] if body.wheel else np.zeros(len(x))
+        return _record(body, x[:, 3:6], spin, _of_quaternions(x[:, -4:]))
+
+    return work
+
+
+# -- Basilisk ---------------------------------------------------------------------------------------------------------
+
+
+def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], tuple[Record, float]]:
+    """A spacecraft under its default integrator, RK4, and a wheel as a spinning body; and the seconds of the loop.
+
+    What its messages and modules are set up with is not counted: a simulation runs once.
+    """
+    try:
+        from Basilisk.simulation import spacecraft, spinningBodyOneDOFStateEffector
+        from Basilisk.utilities import RigidBodyKinematics, SimulationBaseClass, macros
+    except ImportError:
+        why = "Basilisk is not installed; `pip install bsk` in an environment of its own, since it holds pandas back"
+        raise UnavailableError(why) from None
+
+    def work() -> tuple[Record, float]:
+        simulation = SimulationBaseClass.SimBaseClass()
+        simulation.CreateNewProcess("process").addTask(simulation.CreateNewTask("task", macros.sec2nano(step)))
+        craft = spacecraft.Spacecraft()
+        craft.hub.mHub, craft.hub.IHubPntBc_B = 1.0, np.diag(body.hub).tolist()
+        craft.hub.omega_BN_BInit = [[w] for w in START]
+        simulation.AddModelToTask("task", craft)
+        every = macros.sec2nano(t_end / times)
+        spins = None
+        if body.wheel:
+            wheel = spinningBodyOneDOFStateEffector.SpinningBodyOneDOFStateEffector()
+            wheel.mass, wheel.k, wheel.c = 1e-6, 0.0, body.damping
+            wheel.IPntSc_S, wheel.dcm_S0B = np.diag(body.disc).tolist(), np.eye(3).tolist()
+            wheel.sHat_S = [[0.0], [1.0], [0.0]]
+            craft.addStateEffector(wheel)
+            simulation.AddModelToTask("task", wheel)
+            spins = wheel.spinningBodyOutMsg.recorder(every)
+            simulation.AddModelToTask("task", spins)
+        states = craft.scStateOutMsg.recorder(every)
+        simulation.AddModelToTask("task", states)
+        simulation.InitializeSimulation()
+        simulation.ConfigureStopTime(macros.sec2nano(t_end))
+        start = time.process_time()
+        simulation.ExecuteSimulation()
+        seconds = time.process_time() - start
+        omega = np.array(states.omega_BN_B)
+        attitude = np.array([RigidBodyKinematics.MRP2C(sigma).T for sigma in states.sigma_BN])
+        spin = np.zeros(len(omega)) if spins is None else np.array(spins.thetaDot)
+        return _record(body, omega, spin, attitude), seconds
+
+    return work
