@@ -1,7 +1,7 @@
 """A tumbling body, free or with a damped wheel inside, in programs that others fly satellites and robots with.
 
-The wheel turns about the middle axis of the body and rubs in its bearing. All programs start from the same turning, have
-no forces from outside, and give the same record. One that is not installed raises :class:`.UnavailableError`.
+The wheel turns about the middle axis of the body and rubs in its bearing. All programs start from the same turning,
+have no forces from outside, and give the same record. One that is not installed raises :class:`.UnavailableError`.
 """
 
 from __future__ import annotations
@@ -188,7 +188,8 @@ XML = """
 </mujoco>
 """
 WHEEL = """
-<body><inertial pos="0 0 0" mass="1e-6" diaginertia="{disc}"/><joint type="hinge" axis="0 1 0" damping="{damping}"/></body>
+<body><inertial pos="0 0 0" mass="1e-6" diaginertia="{disc}"/>
+  <joint type="hinge" axis="0 1 0" damping="{damping}"/></body>
 """
 
 
