@@ -17,13 +17,13 @@ require = @command -v "$(PYTHON)" >/dev/null || { echo "$(PYTHON) was not found;
 	"$(PYTHON)" -c 'import sys; sys.exit(not sys.version_info$(1))' || { echo "$(2)" >&2; exit 1; }
 
 help:
-	@echo "make demo       run the relaxed rigid body; results go to demo_output/"
+	@echo "make demo       run a tumbling body with friction inside; results go to demo_output/"
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
-	@echo "make bench      measure against C, SciPy, diffrax and heyoka; writes docs/reference/benchmarks.md"
+	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes docs/reference/benchmarks.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for all locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
@@ -53,7 +53,7 @@ comma := ,
 space := $(subst ,, )
 
 demo: .venv
-	$(BIN)/liethermo run examples/relaxed_rigid_body.toml --out demo_output
+	$(BIN)/liethermo run examples/tumbling_body.toml --out demo_output
 
 test: .venv/test
 	$(BIN)/ruff check .

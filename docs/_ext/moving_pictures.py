@@ -1,6 +1,6 @@
 """A Sphinx extension: moving pictures that a reader can turn, computed by the build.
 
-``momentum-sphere`` is the relaxed rigid body on its energy surface, ``sphere-field`` a decaying flow on the sphere. The
+``momentum-sphere`` is a body with friction inside on its momentum sphere, ``sphere-field`` a decaying flow on the sphere. The
 content of each directive says in words what it shows.
 """
 
@@ -16,9 +16,8 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 
 INERTIA = (3.0, 2.0, 1.0)
-ENERGY = 0.5
 START = (0.06, 0.1)
-"""First two components of the momentum at the start; the third follows from the energy."""
+"""First two components of the momentum at the start, of length one."""
 
 
 def _motion(system, start, end: float, step: float, digits: int = 4) -> list[list[float]]:
@@ -31,23 +30,21 @@ def _motion(system, start, end: float, step: float, digits: int = 4) -> list[lis
 
 
 def relaxing_body() -> dict:
-    """Free motions on the energy ellipsoid, and one that relaxes."""
+    """Free motions on the momentum sphere, and one that friction inside takes from the one axis to the other."""
     import liethermo as lt
 
-    moments = np.array(INERTIA)
-    axes = np.sqrt(2 * ENERGY * moments)
-    first, second = START
-    third = np.sqrt(2 * ENERGY * moments[2] * (1 - first**2 / axes[0] ** 2 - second**2 / axes[1] ** 2))
-    relaxing = _motion(lt.models.rigid_body(INERTIA, rate=0.08), [first, second, third], 60.0, 0.1)
+    third = np.sqrt(1.0 - START[0] ** 2 - START[1] ** 2)
+    body = lt.models.tumbling_body(INERTIA, rate=0.08, attitude=False)
+    relaxing = [point[:3] for point in _motion(body, [*START, third], 150.0, 0.1)]
     orbits = []
     for axis, other in ((2, 0), (0, 2)):  # around the axis of least inertia, and around that of greatest
         for angle in np.linspace(0.1, 0.97, 6) * np.pi / 2:
             start = np.zeros(3)
-            start[[axis, 1]] = axes[axis] * np.cos(angle), axes[1] * np.sin(angle)
+            start[[axis, 1]] = np.cos(angle), np.sin(angle)
             orbit = _motion(lt.models.free_rigid_body(INERTIA), start, 60.0, 0.2, 3)
             once = 2 + np.nonzero(np.diff(np.sign([point[other] for point in orbit[1:]])))[0][1]
             orbits += [orbit[: once + 1], (-np.array(orbit[: once + 1])).tolist()]
-    return {"axes": axes.tolist(), "orbits": orbits, "relaxing": relaxing}
+    return {"axes": [1.0, 1.0, 1.0], "orbits": orbits, "relaxing": relaxing}
 
 
 FLUID, GRID, FRAMES, END = 20, (32, 64), 25, 60.0

@@ -1,4 +1,4 @@
-// Draws the scene of a <canvas class="momentum-sphere">: free motions on the energy surface, and a relaxing one.
+// Draws the scene of a <canvas class="momentum-sphere">: free motions of a body on a sphere or an ellipsoid, and a relaxing one.
 "use strict";
 
 pictures("momentum-sphere", (canvas, scene) => {
