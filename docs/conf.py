@@ -92,7 +92,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"liethermo {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_js_files = ["turning.js", "momentum_sphere.js", "sphere_field.js"]
+html_js_files = ["turning.js", "momentum_sphere.js", "sphere_field.js", "tumbling_rod.js"]
 html_show_sourcelink = False
 html_theme_options = {
     "logo": {"text": "liethermo"},

@@ -41,6 +41,7 @@ def scratch(tmp_path, monkeypatch):
 COSTLY = (
     *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
     *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
+    *("asteroid_wobble", "real_bodies"),
 )
 """Pages that compile much: in the slow tier."""
 

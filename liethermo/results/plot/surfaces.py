@@ -45,8 +45,7 @@ def momentum_sphere(
     with the coordinate planes and the plane of the paper. The trajectory is coloured by time. What the solid hides
     from the viewpoint of ``ax`` is pale or left out, so turn the axes before drawing, not after. A system without
     entropy shows its first Casimir or momentum map instead; where the energy falls (double bracket) the two change
-    places. Of a system with baths the body is shown, which loses the energy that they gain: its momentum on the
-    momentum sphere, and its energy at the start and at the end.
+    places. So it is with a system that has baths: they are left out, and the body loses the energy that they gain.
 
     Surfaces are found along rays from the origin. One that a ray meets twice is left out; one that does not close
     around the origin, such as a cylinder, is drawn by sections that end a little beyond the trajectory.
