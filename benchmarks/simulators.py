@@ -10,14 +10,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numba
 import numpy as np
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from manifolds.groups.closed_forms import so3_cayley
 
 from .peers import module
 from .report import UnavailableError
@@ -94,27 +92,11 @@ def _of_quaternions(q) -> np.ndarray:
 
 
 def system(body: Body) -> lt.LiePoissonSystem:
-    """The body as a Lie-Poisson system: mu and, with a wheel, its momentum and the heat of its bearing."""
+    """The body, with its attitude: mu and, with a wheel, its momentum and the heat of its bearing."""
     if not body.wheel:
         return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / body.inertia), group=mf.SO(3))
-    inverse = np.zeros((4, 4))
-    inverse[:3, :3] = np.diag(1.0 / body.inertia)
-    inverse[3, 3] = 1.0 / body.wheel + 1.0 / body.inertia[1]
-    inverse[1, 3] = inverse[3, 1] = -1.0 / body.inertia[1]
-    algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
-    group = mf.MatrixGroup("SO(3) x R", algebra, _off, cayley_map=None, adjoint_cayley_map=_turned)
-    friction = lt.Friction([0.0, 0.0, 0.0, body.damping])
-    baths = lt.HeatBaths(HEAT, 1.0)
-    return lt.LiePoissonSystem(algebra, lt.Quadratic(inverse), dissipation=friction, baths=baths, group=group)
-
-
-def _off(g):
-    return jnp.abs(g[:3, :3] @ g[:3, :3].T - jnp.eye(3)).max()
-
-
-def _turned(algebra, x):
-    g = jnp.zeros((*x.shape[:-1], 5, 5)).at[..., :3, :3].set(so3_cayley(mf.so(3), x[..., :3]))
-    return g.at[..., 3, 3].set(1.0).at[..., 4, 4].set(1.0).at[..., 3, 4].set(x[..., 3])
+    whole = body.inertia + np.array([0.0, body.wheel, 0.0])
+    return lt.models.damper_wheel(whole, (0.0, 1.0, 0.0), body.wheel, body.damping, HEAT, 1.0)
 
 
 def library(body: Body, method: lt.OneStepMethod, step: float, t_end: float, times: int) -> Callable[[], Record]:

@@ -1,7 +1,7 @@
 """A Sphinx extension: moving pictures that a reader can turn, computed by the build.
 
-``momentum-sphere`` is a body with friction inside on its momentum sphere, ``sphere-field`` a decaying flow on the sphere,
-``tumbling-rod`` a satellite like Explorer 1. The content of each directive says in words what it shows.
+``momentum-sphere`` is a body with friction inside on its momentum sphere, ``sphere-field`` a decaying flow on the
+sphere, ``tumbling-rod`` a satellite like Explorer 1. The content of each directive says in words what it shows.
 """
 
 from __future__ import annotations
