@@ -6,6 +6,8 @@ have no forces from outside, and give the same record. One that is not installed
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,12 +70,18 @@ class Record:
     kinetic : array, shape (times,)
     total : array, shape (times,), or None
         With the heat, where the program follows it.
+    steps : int or None
+        How many it took, where it chose.
+    seconds : float or None
+        Of the processor in its own loop, where the rest of the work is setting up.
     """
 
     momentum: np.ndarray
     in_space: np.ndarray
     kinetic: np.ndarray
     total: np.ndarray | None = None
+    steps: int | None = None
+    seconds: float | None = None
 
 
 def _record(body: Body, omega, spin, attitude, total=None) -> Record:
@@ -118,13 +126,13 @@ def library(body: Body, method: lt.OneStepMethod, step: float, t_end: float, tim
 # -- SciPy ------------------------------------------------------------------------------------------------------------
 
 
-def scipy(body: Body, tolerance: float, t_end: float, times: int) -> Callable[[], tuple[Record, int]]:
-    """DOP853 on momentum, wheel, quaternion and heat; and how many steps it took."""
-    omega, field = np.array(START), _field(*body.inertia, body.wheel or 1.0, body.damping, bool(body.wheel))
+def scipy(body: Body, tolerance: float, t_end: float, times: int) -> Callable[[], Record]:
+    """DOP853 on momentum, wheel, quaternion and heat."""
+    omega, field = np.array(START), _field(body)
     x0 = np.array([*body.momentum(omega, 0.0), body.wheel * omega[1], 1.0, 0.0, 0.0, 0.0, 0.0])
     when = np.linspace(0.0, t_end, times + 1)
 
-    def work() -> tuple[Record, int]:
+    def work() -> Record:
         done = solve_ivp(field, (0.0, t_end), x0, method="DOP853", rtol=tolerance, atol=tolerance, t_eval=when)
         if not done.success:
             raise RuntimeError(done.message)
@@ -132,12 +140,14 @@ def scipy(body: Body, tolerance: float, t_end: float, times: int) -> Callable[[]
         omega, spin = body.velocities(x[:, :3], x[:, 3])
         heat = x[:, 8]
         record = _record(body, omega, spin, _of_quaternions(x[:, 4:8]), body.kinetic(omega, spin) + heat)
-        return record, done.nfev // 12
+        return dataclasses.replace(record, steps=done.nfev // 12)
 
     return work
 
 
-def _field(I1, I2, I3, J, damping, turns) -> Callable:
+def _field(body: Body) -> Callable:
+    (I1, I2, I3), J, damping, turns = body.inertia, body.wheel or 1.0, body.damping, bool(body.wheel)
+
     @numba.njit
     def field(t, x):
         p = x[3] if turns else 0.0
@@ -200,29 +210,37 @@ def mujoco(body: Body, integrator: str, step: float, t_end: float, times: int) -
 # -- Basilisk ---------------------------------------------------------------------------------------------------------
 
 
-def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], tuple[Record, float]]:
-    """A spacecraft under its default integrator, RK4, and a wheel as a spinning body; and the seconds of the loop.
+BASILISK = (
+    "Basilisk.simulation.spacecraft",
+    "Basilisk.simulation.spinningBodyOneDOFStateEffector",
+    "Basilisk.utilities.RigidBodyKinematics",
+    "Basilisk.utilities.macros",
+    "Basilisk.utilities.SimulationBaseClass",
+)
+
+
+def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], Record]:
+    """A spacecraft under its default integrator, RK4, and a wheel as a spinning body.
 
     What its messages and modules are set up with is not counted: a simulation runs once.
     """
     try:
-        from Basilisk.simulation import spacecraft, spinningBodyOneDOFStateEffector
-        from Basilisk.utilities import RigidBodyKinematics, SimulationBaseClass, macros
+        simulated, spinning, tools, macros, simulations = map(importlib.import_module, BASILISK)
     except ImportError:
         why = "Basilisk is not installed; `pip install bsk` in an environment of its own, since it holds pandas back"
         raise UnavailableError(why) from None
 
-    def work() -> tuple[Record, float]:
-        simulation = SimulationBaseClass.SimBaseClass()
+    def work() -> Record:
+        simulation = simulations.SimBaseClass()
         simulation.CreateNewProcess("process").addTask(simulation.CreateNewTask("task", macros.sec2nano(step)))
-        craft = spacecraft.Spacecraft()
+        craft = simulated.Spacecraft()
         craft.hub.mHub, craft.hub.IHubPntBc_B = 1.0, np.diag(body.hub).tolist()
         craft.hub.omega_BN_BInit = [[w] for w in START]
         simulation.AddModelToTask("task", craft)
         every = macros.sec2nano(t_end / times)
         spins = None
         if body.wheel:
-            wheel = spinningBodyOneDOFStateEffector.SpinningBodyOneDOFStateEffector()
+            wheel = spinning.SpinningBodyOneDOFStateEffector()
             wheel.mass, wheel.k, wheel.c = 1e-6, 0.0, body.damping
             wheel.IPntSc_S, wheel.dcm_S0B = np.diag(body.disc).tolist(), np.eye(3).tolist()
             wheel.sHat_S = [[0.0], [1.0], [0.0]]
@@ -238,8 +256,8 @@ def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], 
         simulation.ExecuteSimulation()
         seconds = time.process_time() - start
         omega = np.array(states.omega_BN_B)
-        attitude = np.array([RigidBodyKinematics.MRP2C(sigma).T for sigma in states.sigma_BN])
+        attitude = np.array([tools.MRP2C(sigma).T for sigma in states.sigma_BN])
         spin = np.zeros(len(omega)) if spins is None else np.array(spins.thetaDot)
-        return _record(body, omega, spin, attitude), seconds
+        return dataclasses.replace(_record(body, omega, spin, attitude), seconds=seconds)
 
     return work

@@ -47,7 +47,9 @@ def contestants(body: Body, t_end: float) -> dict[str, tuple[str, float | None, 
 def run(quick: bool) -> Report:
     """One table for the free body, one for the damped."""
     t_end, rounds = (10.0, 1) if quick else (1000.0, 3)
-    tables, skipped, drifts = [], {}, []
+    tables: list[Table] = []
+    skipped: dict[str, str] = {}
+    worst = 0.0
     captions = {
         f"The free body, I = (3, 2, 1), to t = {t_end:g} s.": FREE,
         f"With a wheel about the middle axis that rubs in its bearing, to t = {t_end:g} s.": DAMPED,
@@ -56,19 +58,16 @@ def run(quick: bool) -> Report:
         settings = contestants(body, t_end)
         works, missing = take_part({name: build for name, (_, _, build) in settings.items()})
         skipped |= missing
-        exact, _ = scipy(body, EXACT, t_end, TIMES)()
+        exact = scipy(body, EXACT, t_end, TIMES)()
         rows: list[list[Any]] = []
         for name, outcome in race(works, rounds=rounds, patience=8.0).items():
-            setting, step, _ = settings[name]
-            record, seconds, steps = outcome.result, outcome.processor, step and round(t_end / step)
-            if name.startswith("SciPy"):
-                record, steps = record
-            elif name.startswith("Basilisk"):
-                record, seconds = record
+            (setting, step, _), record = settings[name], outcome.result
+            steps = record.steps or round(t_end / (step or t_end))
+            seconds = outcome.processor if record.seconds is None else record.seconds
             found = _drifts(record, exact, exact.kinetic if body.wheel else exact.kinetic[:1])
             rows.append([name, setting, seconds / steps, seconds, *found])
             if name.startswith("this library"):
-                drifts.append(max(found[1] or 0.0, *found[2:4]))
+                worst = max(worst, *(drift for drift in found[1:4] if drift is not None))
         tables.append(Table(caption, COLUMNS, rows))
     text = (
         "A body that starts about its middle axis, and the same with a damped wheel inside, which brings it to the "
@@ -79,7 +78,6 @@ def run(quick: bool) -> Report:
         "are its own. MuJoCo and Basilisk do not follow the heat. Times are of the processor; every row has the "
         "attitude too."
     )
-    worst = max(drifts)
     targets = [Target("a tumbling body for 1000 s: momentum in space, energy with heat", 1e-12, worst, "error")]
     return Report("A tumbling body, beside MuJoCo and Basilisk", text, tables, targets, skipped)
 
