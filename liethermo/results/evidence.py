@@ -41,7 +41,9 @@ WHOLE = 0.01
 long steps."""
 
 ROUNDED = 1e-10
-"""Slope of a step that rounding may have left of none, relative to the state over the step."""
+"""Slope of a step that rounding may have left of none, relative to the state over the step. And the distance of states,
+relative to them, between which a field changes by what rounding may have left of none: the heat of friction is that
+much in a body whose wheel has come to rest, whatever its entropy is counted from."""
 
 TINY = float(np.finfo(float).tiny)
 
@@ -147,7 +149,8 @@ class Witness:
         whole = WHOLE * float(np.ptp(places, axis=0).max())
         looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
         again, missed = self._worst(looked, whole)
-        tried = [self._step(looked.x[i], looked.h[i], looked.t[i]) for i in again]
+        least = self._least_field(looked.x[again])
+        tried = [self._step(looked.x[i], looked.h[i], looked.t[i], f) for i, f in zip(again, least, strict=True)]
         steps = [step for step in tried if step is not None and step.length > STILL]
         if not steps:  # nothing moves
             return found
@@ -162,6 +165,16 @@ class Witness:
             found, local_error=float(errors[worst]), error_time=float(looked.t[again[worst]]), looked=len(looked.h)
         )
 
+    def _least_field(self, x: np.ndarray) -> np.ndarray:
+        """The least field at states, shape (m, n), that is more than rounding, of each block, shape (m, blocks)."""
+        moved = x.copy()
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # in no axes of the system
+        for block in self.system.blocks:
+            moved[:, block] += ROUNDED * np.abs(x[:, block]).max(axis=1, initial=0.0, keepdims=True) * signs[block]
+        before, after = field_at(self.system, np.concatenate([x, moved])).reshape(2, *x.shape)
+        change = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
+        return np.stack([change[:, block].max(axis=1, initial=0.0) for block in self.system.blocks], axis=1)
+
     def _worst(self, steps: Steps, whole: float) -> tuple[np.ndarray, np.ndarray]:
 
         def field(at: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -174,7 +187,7 @@ class Witness:
         if step is None or not told:
             return np.nan if step is None else 0.0
         parts = taken_again(self.system.dim)
-        short = self._step(step.x, step.h / parts, step.t, parts)
+        short = self._step(step.x, step.h / parts, step.t, step.least, parts)
         if short is None:
             return np.nan
         ends = np.asarray(self.system.points(np.stack([step.x + step.d, step.x + short.d])))
@@ -187,7 +200,7 @@ class Witness:
         short: list[list[_Step]] = []
         for i in spread(len(moving), PLACES):
             first = min(moving[i].h, SHORT * moving[i].h / moving[i].length)
-            tried = (self._step(moving[i].x, first / 8.0**n, moving[i].t) for n in range(RUNGS))
+            tried = (self._step(moving[i].x, first / 8.0**n, moving[i].t, moving[i].least) for n in range(RUNGS))
             short.append([step for step in tried if step is not None])
         starts = [step.x for steps in short for step in steps]
         ends = [step.x + step.d for steps in short for step in steps]
@@ -197,7 +210,7 @@ class Witness:
         missed = [[_missed(step, blocks, *next(found)) for step in steps] for steps in short]
         return max((np.nanmin(values) for values in missed if np.isfinite(values).any()), default=None)
 
-    def _step(self, x: np.ndarray, h: float, t: float, steps: int = 1) -> _Step | None:
+    def _step(self, x: np.ndarray, h: float, t: float, least: np.ndarray, steps: int = 1) -> _Step | None:
         """A step from a state at a time, or so many in its place; None where it cannot be taken."""
         points = self.system.points
         try:
@@ -209,14 +222,19 @@ class Witness:
         d = (np.asarray(state.x) - x) + np.asarray(state.low)
         start = np.asarray(points(x))
         moved = float(np.abs(np.asarray(points(x + d)) - start).max())
-        length = max(_relative(d[block], x[block]) for block in self.system.blocks)
-        return _Step(float(t), float(h), x, d, moved, float(np.abs(start).max()), length)
+        lengths = (
+            _relative(d[block], np.append(x[block], d[block]))  # what starts at zero has the size that it gets
+            for block, f in zip(self.system.blocks, least, strict=True)
+            if np.abs(d[block]).max(initial=0.0) > STILL / ROUNDED * steps * h * f
+        )
+        return _Step(float(t), float(h), x, d, moved, float(np.abs(start).max()), max(lengths, default=0.0), least)
 
 
 class _Step(NamedTuple):
     """A step from a state x of the run, which displaces it by d, and what its user sees of it, of a size, by ``moved``.
 
-    ``length`` is that of d relative to the state, the largest over its blocks.
+    ``length`` is that of d relative to the state, the largest over its blocks, and ``least`` the least field of each
+    that is more than rounding.
     """
 
     t: float
@@ -226,15 +244,18 @@ class _Step(NamedTuple):
     moved: float
     size: float
     length: float
+    least: np.ndarray
 
 
 def _missed(step: _Step, blocks: tuple[slice, ...], before: np.ndarray, after: np.ndarray) -> float:
     """How far the slope of a step is from the mean of the field at its ends, relative to that; the worst of the blocks.
 
-    A block that is all but still is measured by what rounding leaves of its slope.
+    A block that is all but still is measured by what rounding leaves of its slope and of its field.
     """
     mean, slope = 0.5 * (before + after), step.d / step.h
-    least = [ROUNDED * np.abs(step.x[block]).max() / step.h for block in blocks]
+    least = [
+        max(ROUNDED * np.abs(step.x[block]).max() / step.h, f) for block, f in zip(blocks, step.least, strict=True)
+    ]
     return max(
         _relative(slope[block] - mean[block], mean[block], size) for block, size in zip(blocks, least, strict=True)
     )

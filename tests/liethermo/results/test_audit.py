@@ -316,6 +316,41 @@ def test_consistency_is_judged_by_short_steps(method, passed):
     assert passed or row.value == pytest.approx(1e-3, rel=0.01)
 
 
+class Cold(lt.MetriplecticMidpoint):
+    """Control: a thousandth of the heat that friction makes in :func:`with_wheel` is missing."""
+
+    def slopes(self, system, x, low, h, k):
+        return super().slopes(system, x, low, h, k).at[:, 4].multiply(0.999)
+
+
+def with_wheel(attitude):
+    return lt.models.damper_wheel(inertia=(1.6, 2.0, 1.0), attitude=attitude)
+
+
+@pytest.mark.parametrize("attitude", [True, False])
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=["mid", "2", "4"]
+)
+def test_the_heat_of_a_wheel_at_rest_is_rounding(method, attitude):
+    """The wheel turns by 1e-17 relative to the body, and makes a heat of 1e-34 from an entropy of zero."""
+    solution = lt.integrate(with_wheel(attitude), [1e-17, 1.0, 2e-17, 0.05, 0.0], (0.0, 20.0), 0.1, method)
+    assert abs(solution.entropy[-1]) < 1e-30
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    assert attitude or solution.evidence.inconsistency is None  # nothing moves
+
+
+@pytest.mark.parametrize("nutation", [1e-3, 1e-9])
+@pytest.mark.parametrize(("method", "passed"), [(lt.MetriplecticMidpoint(), True), (Cold(), False)], ids=["", "cold"])
+def test_heat_that_is_missing_in_a_body_almost_at_rest(method, passed, nutation):
+    """Control of the test above: the heat, as small as the square of the nutation, is looked at while there is one."""
+    x0 = [nutation, 1.0, 0.0, 0.05 + nutation, 0.0]
+    solution = lt.integrate(with_wheel(True), x0, (0.0, 20.0), 0.1, method)
+    row = the_row(solution.audit(), "consistency")
+    assert row.passed is passed, row
+    assert passed or row.value == pytest.approx(1e-3, rel=0.01)
+
+
 # -- what is conserved ------------------------------------------------------------------------------------------------
 
 
