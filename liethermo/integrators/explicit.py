@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import VANISHED, towards
 from ..functions.gradients import EPS, Gonzalez
-from ..systems import ChartSystem, System
+from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod
 from .charts import InCharts, in_charts
 from .preserved import check_preserved, preserved_functions, seen_on
@@ -168,7 +168,7 @@ class ExplicitMethod(OneStepMethod):
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
-        levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: x.shape[0]]
+        levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: _room(system)]
         levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
         return jnp.zeros((self.stages, x.shape[0])).at[SLOPE].set(system.vector_field(x)).at[LEVELS].set(levels)
 
@@ -179,11 +179,11 @@ class ExplicitMethod(OneStepMethod):
         laws = self._laws(system)
         d, changes, error, between = self.uncorrected(system, laws, x, low, h)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
-            changes = changes + self._steering(laws, x, low, k[LEVELS])
+            changes = changes + self._steering(system, laws, x, low, k[LEVELS])
         d, missed = self._corrected(system, laws, x, low, d, changes)
         return jnp.stack([d / h, error, jnp.broadcast_to(missed / h, x.shape), k[LEVELS], *between])
 
-    def _steering(self, laws: list[Law], x, low, levels) -> jax.Array:
+    def _steering(self, system: System, laws: list[Law], x, low, levels) -> jax.Array:
         """What functions that are conserved are to change by, back to the levels that the run has begun on.
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
@@ -196,7 +196,8 @@ class ExplicitMethod(OneStepMethod):
             return jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -STEERED * size, STEERED * size), 0.0)
 
         found = [
-            back(law, levels[i]) if law.sign == 0.0 and i < x.shape[0] else jnp.zeros(()) for i, law in enumerate(laws)
+            back(law, levels[i]) if law.sign == 0.0 and i < _room(system) else jnp.zeros(())
+            for i, law in enumerate(laws)
         ]
         return jax.lax.stop_gradient(jnp.stack(found))
 
@@ -325,3 +326,8 @@ class ExplicitMethod(OneStepMethod):
     def __str__(self) -> str:
         kept = f", preserve={len(self.functions)} functions" if self.functions else ""
         return f"{type(self).__name__}(order={self.number}{kept})"
+
+
+def _room(system: System) -> int:
+    """How many levels a run remembers: no more than the components that functions depend on, as angles are none."""
+    return system.whole.body.dim if isinstance(system, TurningSystem) else system.dim

@@ -14,6 +14,7 @@ from ..functions.frames import towards
 from ..functions.gradients import compensated
 from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
 from .base import OneStepMethod
+from .explicit import LEVELS
 from .tableaus import gauss
 
 RECONSTRUCTIONS = ("coadjoint", "cayley", "exp")
@@ -45,7 +46,8 @@ class WithAttitude(OneStepMethod):
 
     Explicit methods turn by ``"exp"``, whatever is asked for: their step is that of (mu, theta), ``g' = g exp(theta)``.
     Where no torque acts they turn a little further, by no more than the error of the step, so that the momentum in
-    space is what it was: on coadjoint orbits of two dimensions, as those of SO(3), SU(2), SL(2) and SE(2) are.
+    space is what it was when the run began: on coadjoint orbits of two dimensions, as those of SO(3), SU(2), SL(2) and
+    SE(2) are.
 
     A torque that depends on the attitude is taken at those of the stages, which follow from the slopes of the momentum:
     so the unknowns of a step are the same. Its impulse is ``h sum_i b_i Ad_star(inverse(g), tau)_i`` with the same
@@ -131,8 +133,10 @@ class WithAttitude(OneStepMethod):
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
             return self.method.start(system.body_at(x), system.points(x))
-        local = TurningSystem(system, self.order, system.split(x)[1])
-        return self.method.start(local, local.around(x))
+        mu, g = system.split(x)
+        local, n = TurningSystem(system, self.order, g), system.group.dim
+        k = self.method.start(local, local.around(x))  # behind the levels that it has begun on is room for more
+        return k.at[LEVELS, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.to_space(g))
 
     def missed(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.missed(system.body, system.points(x), system.points(low), h, system.points(k))
@@ -157,20 +161,20 @@ class WithAttitude(OneStepMethod):
         return system.join(new, turned, p), system.join(new_low, jnp.zeros_like(g), p_low)
 
     def _moved_explicitly(self, system: AttitudeSystem, x, low, new, new_low, h, k) -> tuple[jax.Array, jax.Array]:
-        (mu, g), group, n = system.split(x), system.group, system.group.dim
+        g, group, n = system.split(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
-        turn, p, p_low = group.exp_map(group.algebra, local.angles(step)), None, None
-        follows = system.body.torque_free and self.method.transports(system.body)
-        before = mu[:n]
+        turned = g @ group.exp_map(group.algebra, local.angles(step))
+        follows, p_low = system.body.torque_free and self.method.transports(system.body), None
         if system.pushed_by:
             p, p_low = compensated(system.in_space(x), system.in_space(low) + local.in_space(step))
             if follows:
                 p, p_low = _on_orbit(system.momenta, p, new[:n]), jnp.zeros_like(p)
-            before = group.Ad_star(g, p)
+        else:  # that of the start of the run, since the roundings of steps would add up
+            p = k[LEVELS, system.body.dim : system.body.dim + n]
         if follows:
-            turn = _carrying(group, turn, before, new[:n])
-        turned = group.restore_map(g @ turn)
-        return system.join(new, turned, p), system.join(new_low, jnp.zeros_like(g), p_low)
+            turned = _carrying(group, turned, p, new[:n])
+        turned = group.restore_map(turned)
+        return system.join(new, turned, p if system.pushed_by else None), system.join(new_low, jnp.zeros_like(g), p_low)
 
     def _turn(self, group, xi) -> jax.Array:
         """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
@@ -307,24 +311,24 @@ def _on_orbit(momenta, p, mu) -> jax.Array:
     return size * p
 
 
-def _carrying(group, turn, mu, new) -> jax.Array:
-    """The element next to ``turn`` whose coadjoint action takes the momentum mu to the new one, on the same orbit.
+def _carrying(group, g, p, new) -> jax.Array:
+    """The element next to g whose coadjoint action takes the momentum in space to the new one, on the same orbit.
 
-    By Newton's method: ``ad*_eta m = new - m`` for the least eta, m being what mu has become [Marquardt 1963].
+    By Newton's method: ``ad*_eta m = new - m`` for the least eta, m being p as seen from g [Marquardt 1963].
     """
-    algebra, size = group.algebra, jnp.max(jnp.abs(mu))
-    mu, new = (v / jnp.where(size > 0.0, size, 1.0) for v in (mu, new))
+    algebra, size = group.algebra, jnp.max(jnp.abs(new))
+    p, new = (v / jnp.where(size > 0.0, size, 1.0) for v in (p, new))
 
-    def nearer(made: int, turn) -> jax.Array:
-        m = group.Ad_star(turn, mu)
+    def nearer(made: int, g) -> jax.Array:
+        m = group.Ad_star(g, p)
         missed, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
         square = moved @ moved.T
         diagonal = jnp.diagonal(square)
         damping = jnp.where(diagonal > 0.0, DAMPING * diagonal, 1.0)  # what does not move m does not turn either
         eta = solve_near_identity(square + jnp.diag(damping), (moved @ missed)[:, None])[:, 0]
-        turn = turn @ group.exp_map(algebra, eta)
+        g = g @ group.exp_map(algebra, eta)
         if made == TURNS:
-            return turn
-        return jax.lax.cond(jnp.max(jnp.abs(missed)) > DAMPING, lambda: nearer(made + 1, turn), lambda: turn)
+            return g
+        return jax.lax.cond(jnp.max(jnp.abs(missed)) > DAMPING, lambda: nearer(made + 1, g), lambda: g)
 
-    return nearer(1, turn)
+    return nearer(1, g)

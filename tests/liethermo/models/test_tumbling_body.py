@@ -89,15 +89,19 @@ def test_long_explicit_steps_in_any_units(scale):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 1e19, 1e-3])
-@pytest.mark.parametrize(("method", "allowed"), [("midpoint", 1e-13), ("gauss", 1e-13), ("rk8", 2e-12)])
+@pytest.mark.parametrize(("method", "allowed"), [("midpoint", 1e-13), ("gauss", 1e-13), ("rk4", 5e-15), ("rk8", 5e-15)])
 def test_the_momentum_in_space_after_a_million_steps(method, allowed, size):
-    """Implicit steps keep it to 3e-14, tumbling and when it has come to a spin; explicit ones to 8e-13."""
+    """Implicit steps keep it to 3e-14, tumbling and when it has come to a spin; explicit ones to 1e-15.
+
+    These were at 9e-13 while each step judged it by what the step before had left.
+    """
     inertia, omega = size * np.array([1.0, 1.5, 2.0]), 1.0 if size == 1.0 else 2e-5 if size > 1.0 else 0.2
     mu0 = inertia * omega * np.array([0.8, 0.07, 0.3])
     for friction in (1e-6, 1e-3):
         rate = friction / np.linalg.norm(mu0)
         body = lt.models.tumbling_body(inertia, rate=rate, capacity=np.sum(mu0**2 / inertia), temperature=1.0)
-        run = lt.integrate(body, mu0, (0.0, 1e5 / omega), 0.1 / omega, METHODS[method], save_every=10_000)
+        chosen = METHODS.get(method, lt.MetriplecticRungeKutta(4))
+        run = lt.integrate(body, mu0, (0.0, 1e5 / omega), 0.1 / omega, chosen, save_every=10_000)
         assert run.stats.steps == 1_000_000
         assert in_space(run) < allowed
         assert run.stats.attitude_residual < 1e-15
