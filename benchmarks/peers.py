@@ -241,7 +241,8 @@ def heyoka_equations(system: lt.System) -> list:
     variables = [hy.make_vars(f"x{i}") for i in range(system.dim)]
     values = dict(zip(program.inputs[0], variables, strict=True))
     for target, op, args in program.instructions:
-        function = getattr(operator, {"div": "truediv"}.get(op, op), None) or getattr(hy, op)
+        name = str(op)
+        function = getattr(operator, {"div": "truediv"}.get(name, name), None) or getattr(hy, name)
         values[target] = function(*(values[a] if isinstance(a, str) else a for a in args))
     found = [values[a] if isinstance(a, str) else hy.expression(a) for a in program.outputs[0]]
     return list(zip(variables, found, strict=True))

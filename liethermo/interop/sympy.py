@@ -26,7 +26,8 @@ from ..errors import FileError, InputError
 from ..integrators import MetriplecticGauss, Reference
 from ..runs.integrate import integrate
 from ..systems import LiePoissonSystem, System
-from ..tracing.scalarize import Program, scalarize
+from ..tracing.program import Program
+from ..tracing.scalarize import scalarize
 
 FORMAT = "liethermo-problem-1"
 
@@ -269,10 +270,10 @@ def _interpreted(program: Program, variables: Sequence[sympy.Symbol]) -> list[sy
     for target, op, args in program.instructions:
         if op == "float":
             values[target] = value(args[0])
-        elif op in OPERATIONS:
+        elif isinstance(op, str) and op in OPERATIONS:
             values[target] = OPERATIONS[op](*map(value, args))
         else:
-            raise InputError(f"the operation {op!r} has no SymPy expression")
+            raise InputError(f"the operation {str(op)!r} has no SymPy expression")
     return [sympy.expand(value(a)) if _small(value(a)) else value(a) for entries in program.outputs for a in entries]
 
 

@@ -1,4 +1,4 @@
-"""JAX functions as programs: traced by content, unrolled to scalar arithmetic, interpreted at a few points.
+"""JAX functions as programs: traced by content, made scalar instructions, loops and calls, interpreted at a few points.
 
 Knows nothing of dynamics.
 """

@@ -10,8 +10,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
-from .builder import Instruction
-from .scalarize import Program
+from .builder import Block, Instruction
+from .program import Program
 
 LONG = 32
 """Instructions that are worth a jump."""
@@ -60,7 +60,7 @@ def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
     for instruction in program.instructions:
         guard = guards[instruction.target]
         for depth in range(1, len(guard) + 1):
-            sizes[guard[:depth]] += LONG if instruction.op in CALLS else 1
+            sizes[guard[:depth]] += LONG if instruction.op in CALLS or isinstance(instruction.op, Block) else 1
     for target, guard in guards.items():
         while guard and sizes[guard] < least:
             guard = guard[:-1]

@@ -6,6 +6,7 @@ such objects, so NumPy itself moves data: reshaping, slicing or transposing cost
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -17,11 +18,42 @@ import scipy
 Scalar = str | float | int | bool
 
 
+class Block:
+    """An operation with several results, which ``item`` picks out: a loop, or a call. Those that do the same are equal.
+
+    Attributes
+    ----------
+    name : str
+    kinds : tuple of str
+        Of its results: ``"f"`` for a number, ``"i"`` for an integer, ``"b"`` for a truth value.
+    """
+
+    name: str
+    kinds: tuple[str, ...]
+
+    def __call__(self, *args) -> list:
+        """Its results, for numbers or for NumPy arrays of them."""
+        raise NotImplementedError
+
+    @functools.cached_property
+    def _text(self) -> str:
+        return repr(self)
+
+    def __eq__(self, other) -> bool:
+        return type(self) is type(other) and self._text == other._text
+
+    def __hash__(self) -> int:
+        return hash(self._text)
+
+    def __str__(self) -> str:
+        return self.name
+
+
 class Instruction(NamedTuple):
-    """``target = op(*args)``, op a key of :data:`OPERATIONS`."""
+    """``target = op(*args)``, op a key of :data:`OPERATIONS` or a block, whose target stands for all its results."""
 
     target: str
-    op: str
+    op: str | Block
     args: tuple[Scalar, ...]
 
 
@@ -33,6 +65,39 @@ def _truncated(a) -> np.ndarray:
     return np.where(inside, np.where(inside, a, 0.0).astype(np.int64), outside)
 
 
+def _quotient(a, n):
+    """The quotient of integers, towards zero; by zero it is -1, as XLA has it."""
+    a, n = np.asarray(a, dtype=np.int64), np.asarray(n, dtype=np.int64)
+    safe = np.where(n == 0, 1, n)
+    below = a // safe
+    towards_zero = below + ((below * safe != a) & ((a < 0) != (safe < 0)))
+    return np.where(n == 0, -1, towards_zero)[()]
+
+
+def _wrapped(a, bits: int, signed: bool):
+    """An integer as so many bits hold it."""
+    low = np.asarray(a, dtype=np.int64) & ((1 << bits) - 1)
+    return np.where(signed & (low >> (bits - 1) == 1), low - (1 << bits), low)[()]
+
+
+def _picked(place, *entries):
+    """The entry at a place from zero; the first, or the last, where it lies outside."""
+    place = np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1)
+    return np.take_along_axis(np.stack(np.broadcast_arrays(place, *entries)[1:]), place[None], 0)[0][()]
+
+
+SPECIAL: dict[str, Callable[..., Any]] = {
+    "lgamma": lambda x: scipy.special.gammaln(x),
+    "digamma": lambda x: scipy.special.psi(x),
+    "erf_inv": lambda x: scipy.special.erfinv(x),
+    "bessel_i0e": lambda x: scipy.special.i0e(x),
+    "bessel_i1e": lambda x: scipy.special.i1e(x),
+    "igamma": lambda a, x: scipy.special.gammainc(a, x),
+    "igammac": lambda a, x: scipy.special.gammaincc(a, x),
+    "regularized_incomplete_beta": lambda a, b, x: scipy.special.betainc(a, b, x),
+}
+"""Special functions, SciPy's. It is imported where one is needed."""
+
 ELEMENTARY: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
     **{name: getattr(np, name) for name in "sinh cosh tanh floor ceil".split()},
@@ -43,26 +108,45 @@ ELEMENTARY: dict[str, Callable[..., Any]] = {
     **{name: getattr(operator, name) for name in "eq ne lt le gt ge xor".split()},
     "and": operator.and_,
     "or": operator.or_,
+    **SPECIAL,
 }
 """Operations that are primitives of the same name, with nothing to simplify."""
 
-OPERATIONS: dict[str, Callable[..., Any]] = ELEMENTARY | {
-    **{name: getattr(operator, name) for name in "add sub mul neg".split()},
-    "div": operator.truediv,
-    "pow": operator.pow,
-    "rem": np.fmod,
-    "trunc": np.trunc,
-    "rint": np.rint,
-    "max": np.maximum,  # like XLA's, NaN if either is
-    "min": np.minimum,
-    "not": np.logical_not,
-    "select": np.where,
-    "float": lambda a: np.asarray(a, dtype=np.float64),
-    "int": lambda a: np.asarray(a, dtype=np.int64),
-    "truncate": _truncated,
-    "branch": lambda condition, number: condition,
-}
+OPERATIONS: dict[str, Callable[..., Any]] = (
+    ELEMENTARY
+    | {
+        **{name: getattr(operator, name) for name in "add sub mul neg".split()},
+        "div": operator.truediv,
+        "pow": operator.pow,
+        "rem": np.fmod,
+        "trunc": np.trunc,
+        "rint": np.rint,
+        "max": np.maximum,  # like XLA's, NaN if either is
+        "min": np.minimum,
+        "not": np.logical_not,
+        "select": np.where,
+        "float": lambda a: np.asarray(a, dtype=np.float64),
+        "int": lambda a: np.asarray(a, dtype=np.int64),
+        "truncate": _truncated,
+        "branch": lambda condition, number: condition,
+        "quotient": _quotient,
+        "wrap": _wrapped,
+        "single": lambda a: (
+            np.float64(np.float32(a)) if np.ndim(a) == 0 else np.asarray(a, np.float32).astype(np.float64)
+        ),
+        "pick": _picked,
+        "item": lambda results, i: results[i],
+        "column": lambda results, start, length: results[start : start + length],
+        "table": lambda *entries: list(entries),
+    }
+)
 """What each operation means, on numbers and on NumPy arrays of them."""
+
+
+def meaning(op: str | Block) -> Callable[..., Any]:
+    """What an operation or a block means."""
+    return op if isinstance(op, Block) else OPERATIONS[op]
+
 
 TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 """Operations on numbers that give a truth value."""
@@ -88,16 +172,24 @@ class Builder:
     def __init__(self, limit: int):
         self.limit = limit
         self.instructions: list[Instruction] = []
-        self._emitted: dict[tuple[str, ...], str] = {}
+        self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
         self._branches: dict[tuple[str, ...], int] = {}
 
-    def op(self, op: str, *args: Scalar) -> Scalar:
+    @property
+    def real(self) -> Builder:
+        """The builder of real scalars: itself."""
+        return self
+
+    def op(self, op: str | Block, *args: Scalar) -> Any:
         """The result of an operation, with no simplification but constants folded and equal expressions merged."""
         if not any(type(a) is str for a in args):
             return fold(op, *args)
         if op in COMMUTATIVE:
             args = tuple(sorted(args, key=str))
+        return self._named(op, *args)
+
+    def _named(self, op: str | Block, *args: Scalar) -> str:
         key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
         name = self._emitted.get(key)
         if name is None:
@@ -106,6 +198,25 @@ class Builder:
             name = self._emitted[key] = f"t{len(self.instructions)}"
             self.instructions.append(Instruction(name, op, args))
         return name
+
+    def block(self, block: Block, *args: Scalar) -> list[Scalar]:
+        """The results of a block."""
+        whole = self.op(block, *args)
+        if isinstance(whole, str):
+            return [self.op("item", whole, i) for i in range(len(block.kinds))]
+        return [a.item() if isinstance(a, np.generic | np.ndarray) else a for a in whole]
+
+    def table(self, entries: Sequence[Scalar]) -> str:
+        """Entries as one variable, which a loop reads by their numbers: what another loop has made is left as it is."""
+        first = self._made(entries[0]) if entries else None
+        if first is not None and first.op == "item":
+            whole, start = first.args[0], int(first.args[1])
+            if all(self._made(a) == (a, "item", (whole, start + i)) for i, a in enumerate(entries)):
+                return self._named("column", whole, start, len(entries))
+        return self._named("table", *entries)
+
+    def _made(self, a: Scalar) -> Instruction | None:
+        return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None
 
     def add(self, a, b):
         if type(a) is not str and type(b) is not str:
@@ -198,6 +309,20 @@ class Builder:
         own = self.op("branch", condition, self._branches.setdefault(key, len(self._branches)))
         return [self.select(own, a, b) for a, b in zip(then, otherwise, strict=True)]
 
+    def pick(self, place, entries: Sequence[Scalar]) -> Scalar:
+        """The entry at a place, an integer from zero: of one that lies outside the nearest."""
+        if type(place) is not str:
+            return entries[min(max(place, 0), len(entries) - 1)]
+        alike = all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries)
+        return entries[0] if alike else self.op("pick", place, *entries)
+
+    def conj(self, a):
+        """Its complex conjugate: itself."""
+        return a
+
+    def real_part(self, a):
+        return a
+
     def max(self, a, b):
         return self.op("max", a, b)
 
@@ -219,28 +344,47 @@ class Builder:
         return result
 
 
-def fold(op: str, *args: Scalar) -> Scalar:
+def fold(op: str | Block, *args: Scalar) -> Any:
     """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
     with np.errstate(all="ignore"):
-        value = OPERATIONS[op](*(np.float64(a) if type(a) is float else a for a in args))
+        value = meaning(op)(*(np.float64(a) if type(a) is float else a for a in args))
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 
 # -- arrays of scalars ----------------------------------------------------------------------------------------------
 
 
+class Pair:
+    """A complex scalar. No sequence, so that NumPy's object arrays take it for one entry."""
+
+    __slots__ = ("im", "re")
+
+    def __init__(self, re: Scalar, im: Scalar):
+        self.re, self.im = re, im
+
+
+def pair(a) -> Pair:
+    """A complex number, or a real scalar, as one."""
+    if isinstance(a, Pair):
+        return a
+    return Pair(a.real, a.imag) if isinstance(a, complex) else Pair(a, 0.0)
+
+
 def constant(value, dtype=None) -> np.ndarray:
-    """An array of numbers as an array of scalars."""
-    return np.asarray(value, dtype=dtype).astype(object)
+    """An array of numbers as an array of scalars, complex ones as pairs."""
+    found = np.asarray(value, dtype=dtype)
+    if found.dtype.kind != "c":
+        return found.astype(object)
+    return array([Pair(a.real, a.imag) for a in found.ravel().tolist()], found.shape)
 
 
-def array(scalars: Sequence[Scalar], shape) -> np.ndarray:
+def array(scalars: Sequence[Any], shape) -> np.ndarray:
     result = np.empty(len(scalars), object)
     result[:] = scalars
     return result.reshape(shape)
 
 
-def elementwise(function: Callable[..., Scalar], *arrays: np.ndarray) -> np.ndarray:
+def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
     """Apply a function entry by entry."""
     arrays = np.broadcast_arrays(*arrays)
     return array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)

@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .builder import ELEMENTARY, Builder, Scalar, array, constant, elementwise, entries_along, integers
+from . import indexing
+from . import linear_algebra as algebra
+from .builder import ELEMENTARY, Pair, Scalar, array, constant, elementwise, entries_along, integers, pair
 
 Rule = Callable[..., "np.ndarray | list[np.ndarray]"]
 
@@ -47,21 +49,15 @@ def _alike(b, eqn, *arrays):
 
 
 def _divide(b, eqn, x, y):
-    if _dtype(eqn).kind == "i":
-        return elementwise(_integer_quotient, x, y)
+    if _dtype(eqn).kind in "iu":
+        return _plain("quotient")(b, eqn, x, y)
     return _numeric("div")(b, eqn, x, y)
 
 
 def _remainder(b, eqn, x, y):
-    if _dtype(eqn).kind == "i":
-        return elementwise(lambda a, n: a - n * _integer_quotient(a, n), x, y)
+    if _dtype(eqn).kind in "iu":
+        return elementwise(lambda a, n: b.sub(a, b.mul(n, b.op("quotient", a, n))), x, y)
     return _plain("rem")(b, eqn, x, y)
-
-
-def _integer_quotient(a, n):
-    if type(a) is str or type(n) is str or n == 0:
-        raise NotImplementedError("of integers known only at run time")
-    return abs(a) // abs(n) * (1 if (a < 0) == (n < 0) else -1)
 
 
 def _integer_pow(b, eqn, x):
@@ -95,8 +91,13 @@ def _select(b, eqn, which, *cases):
 
 def _convert(b, eqn, x):
     conversion = _dtype(eqn).kind + np.dtype(eqn.params["new_dtype"]).kind
-    if conversion in ("ff", "ii", "bb"):
+    conversion = conversion.replace("u", "i")
+    if conversion in ("ff", "ii", "bb", "cc"):
         return x
+    if conversion == "cf":
+        return elementwise(lambda a: pair(a).re, x)
+    if conversion[1] == "c":
+        return elementwise(lambda a: Pair(a if conversion[0] == "f" else b.real.op("float", a), 0.0), x)
     if conversion in ("fb", "ib"):
         return elementwise(lambda a: b.op("ne", a, 0), x)
     op = {"if": "float", "bf": "float", "bi": "int", "fi": "truncate"}[conversion]
@@ -108,10 +109,14 @@ def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> R
         rows, shape = entries_along(x, eqn.params["axes"])
         if start is None and not all(rows):
             raise NotImplementedError("of no entries")
-        empty: Scalar = 0.0 if start is None else _dtype(eqn).type(start).item()
+        empty: Any = 0.0 if start is None else constant(start, _dtype(eqn)).item()
         return array([reduce(lambda u, v: combine(b, u, v), row) if row else empty for row in rows], shape)
 
     return rule
+
+
+def _method(name: str) -> Callable[..., Scalar]:
+    return lambda b, u, v: getattr(b, name)(u, v)
 
 
 def _op(op: str) -> Callable[..., Scalar]:
@@ -146,6 +151,15 @@ def _cumulative(combine: Callable[..., Scalar]) -> Rule:
     return rule
 
 
+UNROLLED_PRODUCTS = 900
+"""Products of entries in a product of matrices that is unrolled; where there are more it is a loop."""
+
+
+def _products(rows: np.ndarray, columns: np.ndarray) -> int:
+    """How many products of entries a product of two matrices takes, those with a zero left out."""
+    return int(np.sum((rows != 0).sum(axis=0) * (columns != 0).sum(axis=0)))
+
+
 def _dot_general(b, eqn, x, y):
     (sum_x, sum_y), (batch_x, batch_y) = eqn.params["dimension_numbers"]
     rest_x = [i for i in range(x.ndim) if i not in (*sum_x, *batch_x)]
@@ -154,10 +168,13 @@ def _dot_general(b, eqn, x, y):
     batch, size = math.prod(x.shape[i] for i in batch_x), math.prod(x.shape[i] for i in sum_x)
     left = x.transpose(*batch_x, *rest_x, *sum_x).reshape(batch, math.prod(x.shape[i] for i in rest_x), size)
     right = y.transpose(*batch_y, *rest_y, *sum_y).reshape(batch, math.prod(y.shape[i] for i in rest_y), size)
-    zero, result = _dtype(eqn).type(0).item(), []
-    for rows, columns in zip(left.tolist(), right.tolist(), strict=True):
-        sparse = [[(k, a) for k, a in enumerate(row) if a != 0] for row in rows]  # structure constants are mostly zero
-        for entries, column in itertools.product(sparse, columns):
+    zero, result = constant(0, _dtype(eqn)).item(), []
+    for rows, columns in zip(left, right, strict=True):
+        sparse = [[(k, a) for k, a in enumerate(row) if a != 0] for row in rows.tolist()]  # as structure constants are
+        if eqn.outvars[0].aval.dtype.kind in "fc" and _products(rows, columns) > UNROLLED_PRODUCTS:
+            result += algebra.product(b, rows, columns.T).ravel().tolist()
+            continue
+        for entries, column in itertools.product(sparse, columns.tolist()):
             result.append(reduce(b.add, (b.mul(a, column[k]) for k, a in entries), zero))
     return array(result, shape)
 
@@ -195,10 +212,14 @@ def _window(x: np.ndarray, starts, sizes) -> tuple[slice, ...]:
 
 
 def _dynamic_slice(b, eqn, x, *starts):
+    if not indexing.known(*starts):
+        return indexing.window(b, x, [i.item() for i in starts], eqn.params["slice_sizes"])
     return x[_window(x, starts, eqn.params["slice_sizes"])]
 
 
 def _dynamic_update_slice(b, eqn, x, update, *starts):
+    if not indexing.known(*starts):
+        return indexing.updated(b, x, update, [i.item() for i in starts])
     result = x.copy()
     result[_window(x, starts, update.shape)] = update
     return result
@@ -230,17 +251,21 @@ def _split(x, params):
 
 
 def _gather(b, eqn, x, indices):
+    fill_value = eqn.params["fill_value"]
+    if fill_value is None:
+        fill_value = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
+    if not indexing.known(indices):
+        return indexing.gathered(b, eqn, x, indices, fill_value)
     numbers = jnp.arange(x.size).reshape(x.shape)
     where = integers(indices).astype(_dtype(eqn, 1))
     came_from = np.asarray(eqn.primitive.bind(numbers, where, **{**eqn.params, "fill_value": -1}))
-    fill_value = eqn.params["fill_value"]
-    if fill_value is None:
-        fill_value = {"f": math.nan, "b": True}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
     entries = [*x.ravel().tolist(), fill_value]
     return array([entries[i] for i in came_from.ravel()], came_from.shape)
 
 
 def _scatter(b, eqn, x, indices, updates):
+    if not indexing.known(indices):
+        return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: new)
     numbers = jnp.arange(x.size + updates.size)
     old, new = numbers[: x.size].reshape(x.shape), numbers[x.size :].reshape(updates.shape)
     where = integers(indices).astype(_dtype(eqn, 1))
@@ -251,6 +276,8 @@ def _scatter(b, eqn, x, indices, updates):
 
 def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
     def rule(b, eqn, x, indices, updates):
+        if not indexing.known(indices):
+            return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: combine(b, old, new))
         where = integers(indices).astype(_dtype(eqn, 1))
         options = {key: eqn.params[key] for key in ("dimension_numbers", "mode")}
 
@@ -269,39 +296,6 @@ def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
     return rule
 
 
-def _cholesky(b, eqn, a):
-    n = a.shape[-1]
-    lower = constant(np.zeros(a.shape))
-    for A, L in zip(a.reshape(-1, n, n), lower.reshape(-1, n, n), strict=True):
-        positive: Scalar = True
-        for j in range(n):
-            pivot = reduce(b.sub, (b.mul(v, v) for v in L[j, :j]), A[j, j])
-            positive = b.op("and", positive, b.op("gt", pivot, 0.0))
-            L[j, j] = b.op("sqrt", pivot)
-            for i in range(j + 1, n):
-                L[i, j] = b.div(reduce(b.sub, map(b.mul, L[i, :j], L[j, :j]), A[i, j]), L[j, j])
-        L[...] = elementwise(lambda v, ok=positive: b.select(ok, v, math.nan), L)
-    return lower
-
-
-def _triangular_solve(b, eqn, a, rhs):
-    """``x`` with ``a x = rhs``, or ``x a = rhs``, by substitution."""
-    params = eqn.params
-    if params["transpose_a"] == params["left_side"]:
-        a = a.swapaxes(-1, -2)
-    if not params["left_side"]:
-        rhs = rhs.swapaxes(-1, -2)
-    lower = params["lower"] != (params["transpose_a"] == params["left_side"])
-    n, x = a.shape[-1], rhs.copy()
-    order = range(n) if lower else range(n)[::-1]
-    for A, X in zip(a.reshape(-1, n, n), x.reshape(-1, n, rhs.shape[-1]), strict=True):
-        for done, i in enumerate(order):
-            for k in range(X.shape[1]):
-                rest = reduce(b.sub, (b.mul(A[i, j], X[j, k]) for j in order[:done]), X[i, k])
-                X[i, k] = rest if params["unit_diagonal"] else b.div(rest, A[i, i])
-    return x if params["left_side"] else x.swapaxes(-1, -2)
-
-
 RULES: dict[str, Rule] = {
     **{name: _numeric(name) for name in ("add", "sub", "mul", "neg", "pow", "max", "min", "logistic")},
     "add_any": _numeric("add"),
@@ -317,18 +311,18 @@ RULES: dict[str, Rule] = {
     "select_n": _select,
     "convert_element_type": _convert,
     **dict.fromkeys(("stop_gradient", "copy", "copy_p", "name", "optimization_barrier"), _alike),
-    "reduce_sum": _reduction(Builder.add, 0),
-    "reduce_prod": _reduction(Builder.mul, 1),
-    "reduce_max": _reduction(Builder.max),
-    "reduce_min": _reduction(Builder.min),
+    "reduce_sum": _reduction(_method("add"), 0),
+    "reduce_prod": _reduction(_method("mul"), 1),
+    "reduce_max": _reduction(_method("max")),
+    "reduce_min": _reduction(_method("min")),
     "reduce_and": _reduction(_op("and"), True),
     "reduce_or": _reduction(_op("or"), False),
     "argmax": _arg_extreme("gt"),
     "argmin": _arg_extreme("lt"),
-    "cumsum": _cumulative(Builder.add),
-    "cumprod": _cumulative(Builder.mul),
-    "cummax": _cumulative(Builder.max),
-    "cummin": _cumulative(Builder.min),
+    "cumsum": _cumulative(_method("add")),
+    "cumprod": _cumulative(_method("mul")),
+    "cummax": _cumulative(_method("max")),
+    "cummin": _cumulative(_method("min")),
     "dot_general": _dot_general,
     "broadcast_in_dim": _move(_broadcast),
     "reshape": _move(_reshape),
@@ -343,26 +337,43 @@ RULES: dict[str, Rule] = {
     "tile": _move(lambda x, params: np.tile(x, params["reps"])),
     "pad": _pad,
     "iota": _iota,
+    "empty2": lambda b, eqn: constant(np.zeros(eqn.outvars[0].aval.shape, eqn.outvars[0].aval.dtype)),
     "platform_index": _platform_index,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
     "scatter": _scatter,
-    "scatter-add": _scatter_combining(Builder.add),
-    "scatter-sub": _scatter_combining(Builder.sub),
-    "scatter-mul": _scatter_combining(Builder.mul),
-    "scatter-min": _scatter_combining(Builder.min),
-    "scatter-max": _scatter_combining(Builder.max),
-    "cholesky": _cholesky,
-    "triangular_solve": _triangular_solve,
+    "scatter-add": _scatter_combining(_method("add")),
+    "scatter-sub": _scatter_combining(_method("sub")),
+    "scatter-mul": _scatter_combining(_method("mul")),
+    "scatter-min": _scatter_combining(_method("min")),
+    "scatter-max": _scatter_combining(_method("max")),
+    "real": lambda b, eqn, x: elementwise(lambda a: pair(a).re, x),
+    "imag": lambda b, eqn, x: elementwise(lambda a: pair(a).im, x),
+    "conj": lambda b, eqn, x: elementwise(b.conj, x),
+    "complex": lambda b, eqn, x, y: elementwise(Pair, x, y),
+    "eigh": algebra.eigh,
+    "lu": algebra.lu,
+    "qr": algebra.qr,
+    "svd": algebra.svd,
+    "cholesky": algebra.cholesky,
+    "triangular_solve": algebra.triangular_solve,
+    "sort": algebra.sort,
+    "lt_to": algebra.total_order("lt"),
+    "le_to": algebra.total_order("le"),
+    "conv_general_dilated": algebra.convolution,
+    "zeta": lambda b, eqn, s, q: elementwise(lambda u, v: algebra.zeta(b, u, v), s, q),
+    "polygamma": algebra.polygamma,
 }
 """How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.tracing.scalarize`."""
 
 PARAMETERS = """
-accuracy axes axis broadcast_dimensions conjugate_a dimension dimension_numbers dimensions dtype fill_value index_dtype
-indices_are_sorted left_side limit_indices lower mode name new_dtype new_sizes out_sharding padding_config permutation
-platforms precision preferred_element_type reps reverse rounding_method shape sharding sizes slice_sizes start_indices
-strides transpose_a unique_indices unit_diagonal update_consts update_jaxpr weak_type y
+accuracy algorithm axes axis batch_group_count broadcast_dimensions compute_uv conjugate_a dimension dimension_numbers
+dimensions dtype feature_group_count fill_value full_matrices index_dtype indices_are_sorted input_dtype is_stable
+left_side lhs_dilation limit_indices lower memory_space mode name new_dtype new_sizes num_keys out_sharding padding
+padding_config permutation pivoting platforms precision preferred_element_type reps reverse rhs_dilation
+rounding_method shape sharding sizes slice_sizes sort_eigenvalues start_indices strides subset_by_index transpose_a
+unique_indices unit_diagonal update_consts update_jaxpr use_magma weak_type window_strides y
 """
 """Parameters of primitives that the rules heed, or that do not matter here. Another one, if it is set, may mean
 anything: the primitive is refused."""

@@ -1,36 +1,26 @@
-"""From a traced JAX function of small arrays to a straight-line program of scalar instructions.
+"""From a traced JAX function of small arrays to a program of scalar instructions, calls and loops.
 
 The jaxpr, derivatives included, is unrolled entry by entry. What is known at compile time is computed then, structural
 zeros vanish, equal subexpressions merge and dead ones are dropped, so an ``einsum`` with structure constants becomes
-the few products that it stands for. The result is the same to rounding as JAX's, or there is none.
+the few products that it stands for. Loops whose length is not known, or that are long, stay loops, and the linear
+algebra of larger matrices is called. Complex numbers are pairs. The result is the same to rounding as JAX's, or there
+is none.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ..errors import InputError, LiethermoError
-from .builder import (
-    OF_TESTS,
-    OPERATIONS,
-    TESTS,
-    Builder,
-    Instruction,
-    LimitExceededError,
-    Scalar,
-    array,
-    constant,
-)
+from .builder import Builder, LimitExceededError, Scalar, array, constant, elementwise
+from .complex_numbers import ComplexBuilder, arranged, flat, kinds
 from .primitives import PARAMETERS, RULES
+from .program import Program, Scan, While, live
 
 LIMIT = 200_000
 """Instructions that a program may have: far more than compile in reasonable time."""
@@ -57,142 +47,6 @@ class UnsupportedPrimitive(LiethermoError):
         self.primitive, self.where, self.reason, self.too_large = primitive, where, reason, too_large
         refusal = f"the compiled engine cannot run the JAX primitive {primitive!r} {reason}".rstrip()
         super().__init__(f"{refusal} ({where})")
-
-
-@dataclass(frozen=True)
-class Program:
-    """Scalar instructions in order, each variable assigned once.
-
-    Attributes
-    ----------
-    inputs : tuple of tuple of str
-        Names of the entries of each input array, in row-major order.
-    instructions : tuple of Instruction
-    outputs : tuple of tuple of scalars
-        For each output array its entries: names, or numbers where they are constant.
-    shapes : tuple of tuple of int
-        Shapes of the output arrays.
-    """
-
-    inputs: tuple[tuple[str, ...], ...]
-    instructions: tuple[Instruction, ...]
-    outputs: tuple[tuple[Scalar, ...], ...]
-    shapes: tuple[tuple[int, ...], ...]
-
-    @property
-    def operations(self) -> Counter[str]:
-        """How many instructions there are of each kind."""
-        return Counter(instruction.op for instruction in self.instructions)
-
-    def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
-        """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
-
-        With ``batch`` inputs and outputs have one axis more in front, the same for all.
-        """
-        values: dict[Scalar, Any] = {}
-        front: tuple[int, ...] = ()
-        for names, x in zip(self.inputs, arrays, strict=True):
-            x = np.asarray(x, dtype=np.float64)
-            if batch:
-                front = x.shape[:1]
-                x = x.reshape(*front, len(names)).T
-            values.update(zip(names, x if batch else x.ravel(), strict=True))
-        with np.errstate(all="ignore"):
-            for target, op, args in self.instructions:
-                values[target] = OPERATIONS[op](*(values[a] if type(a) is str else a for a in args))
-
-        def gathered(entries, shape):
-            found = np.empty((*front, len(entries)))
-            for i, a in enumerate(entries):
-                found[..., i] = values[a] if type(a) is str else a
-            return found.reshape((*front, *shape))
-
-        return [gathered(entries, shape) for entries, shape in zip(self.outputs, self.shapes, strict=True)]
-
-    def degree(self, place: int) -> float:
-        """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
-
-        Parameters
-        ----------
-        place : int
-            Of the input.
-        """
-        degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
-        for target, op, args in self.instructions:
-            found = [degrees.get(a, 0) for a in args]
-            if op in ("add", "sub", "neg"):
-                degrees[target] = max(found)
-            elif op == "mul":
-                degrees[target] = sum(found)
-            elif op == "div" and not found[1]:
-                degrees[target] = found[0]
-            else:
-                degrees[target] = math.inf if any(found) else 0
-        return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
-
-    def factored(self, varying: Sequence[int]) -> Program:
-        """The same, with products ``(v a) b`` written ``v (a b)`` where a and b do not depend on some of the inputs.
-
-        In a loop over those, ``a b`` is then computed once.
-
-        Parameters
-        ----------
-        varying : sequence of int
-            Places of those inputs.
-        """
-        depends: set[Scalar] = {name for i in varying for name in self.inputs[i]}
-        products: dict[Scalar, tuple[Scalar, Scalar]] = {}
-        factors: dict[tuple[Scalar, Scalar], str] = {}
-        instructions: list[Instruction] = []
-        for instruction in self.instructions:
-            changing = [a for a in instruction.args if a in depends]
-            if changing:
-                depends.add(instruction.target)
-            if instruction.op == "mul" and len(changing) == 1:
-                first, second = instruction.args
-                v, b = (first, second) if first in depends else (second, first)
-                if v in products:
-                    v, a = products[v]
-                    if (a, b) not in factors:
-                        factors[a, b] = f"{instruction.target}_factor"
-                        instructions.append(Instruction(factors[a, b], "mul", (a, b)))
-                    b = factors[a, b]
-                products[instruction.target] = v, b
-                instruction = instruction._replace(args=(v, b))
-            instructions.append(instruction)
-        return replace(self, instructions=tuple(instructions))
-
-    def split(self, late: Sequence[int]) -> tuple[Program, Program]:
-        """What can be computed without some of the inputs, and the rest.
-
-        The second program has one more input array, at the end: the output of the first. Arrays hold numbers, so truth
-        values are handed over as 1.0 and 0.0.
-
-        Parameters
-        ----------
-        late : sequence of int
-            Places of those inputs.
-        """
-        waiting: set[Scalar] = {name for i in late for name in self.inputs[i]}
-        early, rest = [], []
-        for instruction in self.instructions:
-            if waiting.isdisjoint(instruction.args):
-                early.append(instruction)
-            else:
-                rest.append(instruction)
-                waiting.add(instruction.target)
-        wanted = {a for instruction in rest for a in instruction.args} | {
-            a for entries in self.outputs for a in entries
-        }
-        handed = [instruction.target for instruction in early if instruction.target in wanted]
-        true_or_false = truth_values(early)
-        truths = {a: f"{a}_as_number" for a in handed if a in true_or_false}
-        early += [Instruction(number, "float", (a,)) for a, number in truths.items()]
-        rest = [Instruction(a, "ne", (number, 0.0)) for a, number in truths.items()] + rest
-        handed = [truths.get(a, a) for a in handed]
-        instructions, renamed = _live(early, handed)
-        first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
-        return first, Program((*self.inputs, tuple(handed)), tuple(rest), self.outputs, self.shapes)
 
 
 def scalarize(closed: ClosedJaxpr, known: Sequence | None = None, limit: int = LIMIT) -> Program:
@@ -227,12 +81,17 @@ def scalarize(closed: ClosedJaxpr, known: Sequence | None = None, limit: int = L
         arguments.append(array(entries, var.aval.shape))
     results = _unroll(builder, closed.jaxpr, closed.consts, arguments)
     outputs = [x.ravel().tolist() for x in results]
-    instructions, renamed = _live(builder.instructions, [a for entries in outputs for a in entries])
+    return _program(builder, inputs, outputs, [x.shape for x in results])
+
+
+def _program(b: Builder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence) -> Program:
+    """What a builder has collected, as far as the outputs depend on it."""
+    instructions, renamed = live(b.instructions, [a for entries in outputs for a in entries])
     return Program(
-        tuple(inputs),
+        tuple(map(tuple, inputs)),
         instructions,
         tuple(tuple(renamed.get(a, a) if type(a) is str else a for a in entries) for entries in outputs),
-        tuple(x.shape for x in results),
+        tuple(shapes),
     )
 
 
@@ -247,10 +106,11 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         try:
-            _check_equation(eqn)
-            found = (CONTROL.get(name) or RULES.get(name) or _refuse)(b, eqn, *map(read, eqn.invars))
-            results = found if isinstance(found, list) else [found]
-            _check_results(eqn, results)
+            is_complex = _check_equation(eqn)
+            control = CONTROL.get(name)
+            own = ComplexBuilder(b) if is_complex and control is None else b
+            found = (control or RULES.get(name) or _refuse)(own, eqn, *map(read, eqn.invars))
+            results = _as_kept(b, eqn, found if isinstance(found, list) else [found])
         except NotImplementedError as error:
             raise UnsupportedPrimitive(name, origin(eqn), str(error)) from None
         except UnsupportedPrimitive as inside:
@@ -268,36 +128,50 @@ def _refuse(b, eqn, *arguments):
     raise NotImplementedError
 
 
-def _check_equation(eqn) -> None:
-    """Refuse what the rules were not written for."""
+def _check_equation(eqn) -> bool:
+    """Refuse what the rules were not written for; whether complex numbers are in it."""
     if eqn.primitive.name in RULES:
         for name, value in eqn.params.items():
             if name not in PARAMETERS.split() and value is not None:
                 raise NotImplementedError(f"with {name}={value}")
     for var in (*eqn.invars, *eqn.outvars):
-        if getattr(getattr(var.aval, "dtype", None), "kind", None) not in ("f", "i", "b"):
+        dtype = getattr(var.aval, "dtype", None)
+        if getattr(dtype, "kind", None) not in ("f", "i", "u", "b", "c") or dtype in UNKNOWN_TYPES:
             raise NotImplementedError(f"on {var.aval}")
+    return any(var.aval.dtype.kind == "c" for var in (*eqn.invars, *eqn.outvars))
 
 
-MOVES = frozenset("broadcast_in_dim reshape squeeze expand_dims transpose slice concatenate".split())
-"""Primitives that compute nothing: what they move was admitted where it was made."""
+UNKNOWN_TYPES = tuple(map(np.dtype, ("float16", "complex64", "uint64")))
+
+MOVES = frozenset("broadcast_in_dim reshape squeeze expand_dims transpose slice concatenate select_n gather".split())
+"""Primitives that compute nothing: what they move was rounded, or wrapped around, where it was made."""
 
 
-def _check_results(eqn, results: Sequence[np.ndarray]) -> None:
-    """Refuse what Python's float and int would not compute alike: other precisions, integers that could wrap around."""
-    name = eqn.primitive.name
-    harmless = name in MOVES or (name == "convert_element_type" and eqn.invars[0].aval.dtype == bool)
+def _as_kept(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
+    """The results as their types hold them: numbers of single precision rounded, integers wrapped around."""
+    name, kept = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
         dtype = var.aval.dtype
-        assert result.shape == var.aval.shape, f"{eqn.primitive.name}: {result.shape} is not {var.aval.shape}"
-        if dtype.kind == "f" and dtype != np.float64:
-            raise NotImplementedError(f"on {dtype}")
-        if dtype.kind == "i":
-            limits, numbers = np.iinfo(dtype), [a for a in result.flat if type(a) is not str]
-            if len(numbers) < result.size and dtype != np.int64 and not harmless:
-                raise NotImplementedError(f"on {dtype} at run time")
-            if not all(limits.min <= a <= limits.max for a in numbers):
-                raise NotImplementedError(f"beyond the range of {dtype}")
+        assert result.shape == var.aval.shape, f"{name}: {result.shape} is not {var.aval.shape}"
+        if name not in MOVES and name not in CONTROL:
+            if dtype == np.float32:
+                result = elementwise(lambda a: b.op("single", a), result)
+            elif dtype.kind in "iu" and dtype != np.int64 and (name in WRAPPING or name == "convert_element_type"):
+                bits, signed = 8 * dtype.itemsize, dtype.kind == "i"
+                if name in WRAPPING or eqn.invars[0].aval.dtype.kind in "fiu":
+                    result = elementwise(lambda a, n=bits, s=signed: b.op("wrap", a, n, s), result)
+            if dtype.kind == "i":
+                limits, numbers = np.iinfo(dtype), [a for a in result.flat if type(a) is not str]
+                if not all(limits.min <= a <= limits.max for a in numbers):
+                    raise NotImplementedError(f"beyond the range of {dtype}")
+        kept.append(result)
+    return kept
+
+
+WRAPPING = frozenset(
+    "add sub mul neg add_any integer_pow square div rem dot_general reduce_sum reduce_prod cumsum cumprod".split()
+) | {"scatter-add", "scatter-sub", "scatter-mul"}
+"""Primitives whose results may not fit the type of integers that they are of."""
 
 
 # -- primitives that contain jaxprs -----------------------------------------------------------------------------------
@@ -319,7 +193,7 @@ def _linear_solve(b, eqn, *arguments):
 
 def _cond(b, eqn, index, *arguments):
     """Every branch, then a choice of results: the branches are pure."""
-    shapes = [var.aval.shape for var in eqn.outvars]
+    avals = [var.aval for var in eqn.outvars]
     branches = eqn.params["branches"]
     which = index.item()
     if type(which) is not str:
@@ -327,16 +201,128 @@ def _cond(b, eqn, index, *arguments):
     *others, chosen = (_unroll(b, branch.jaxpr, branch.consts, arguments) for branch in branches)
     for i in reversed(range(len(others))):
         first = b.op("le", which, i)
-        sides = ([a for x in side for a in x.ravel().tolist()] for side in (others[i], chosen))
-        entries = iter(b.branch(first, *sides))
-        chosen = [array(list(itertools.islice(entries, math.prod(shape))), shape) for shape in shapes]
+        chosen = arranged(iter(b.branch(first, flat(others[i]), flat(chosen))), avals)
     return chosen
 
 
+class _Inside:
+    """A program inside a loop, while it is made: the scalars around it that it reads are its first input.
+
+    Attributes
+    ----------
+    outer : dict
+        The names that those have inside.
+    """
+
+    def __init__(self):
+        self.outer: dict[str, str] = {}
+
+    def entered(self, arrays: Sequence[np.ndarray], avals: Sequence) -> list[np.ndarray]:
+        """Arrays as they are known inside."""
+        inner = (self.outer.setdefault(a, f"x0_{len(self.outer)}") if type(a) is str else a for a in flat(arrays))
+        return arranged(inner, avals)
+
+    @staticmethod
+    def unrolled(limit: int, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> tuple[Builder, list[np.ndarray]]:
+        own = Builder(limit)
+        return own, _unroll(own, closed.jaxpr, closed.consts, arguments)
+
+
+class _Carried:
+    """What a loop carries. What begins as a number is taken to stay it, until a pass of the loop says otherwise."""
+
+    def __init__(self, start: Sequence[np.ndarray], avals: Sequence):
+        self.avals, self.start = avals, flat(start)
+        self.entries: list[Scalar] = [f"x1_{i}" if type(a) is str else a for i, a in enumerate(self.start)]
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        return arranged(iter(self.entries), self.avals)
+
+    def released(self, results: Sequence[np.ndarray]) -> bool:
+        """Let go of what a pass has changed; whether there was any."""
+        changed = [
+            i
+            for i, (a, new) in enumerate(zip(self.entries, flat(results), strict=True))
+            if type(a) is not str and (type(new) is str or repr(new) != repr(a))
+        ]
+        for i in changed:
+            self.entries[i] = f"x1_{i}"
+        return bool(changed)
+
+    @property
+    def moving(self) -> list[int]:
+        return [i for i, a in enumerate(self.entries) if type(a) is str]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        found = kinds(self.avals)
+        return tuple(found[i] for i in self.moving)
+
+    def after(self, found: Sequence[Scalar]) -> list[np.ndarray]:
+        """What is carried at the end, where those that move are found to be this."""
+        whole = list(self.entries)
+        for i, a in zip(self.moving, found, strict=True):
+            whole[i] = a
+        return arranged(iter(whole), self.avals)
+
+
+def _while(b, eqn, *arguments):
+    """A loop of unknown length."""
+    params, avals = eqn.params, [var.aval for var in eqn.invars]
+    n, m = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    inside, carried = _Inside(), _Carried(arguments[m:], avals[m:])
+    for_test = inside.entered(arguments[:n], avals[:n])
+    for_body = inside.entered(arguments[n:m], avals[n:m])
+    test, step = params["cond_jaxpr"], params["body_jaxpr"]
+    while True:
+        testing, (going,) = inside.unrolled(b.limit, test, [*for_test, *carried.arrays])
+        making, results = inside.unrolled(b.limit, step, [*for_body, *carried.arrays])
+        if going.shape:  # several loops beside each other: those that have ended wait
+            (own,) = _unroll(making, test.jaxpr, test.consts, [*for_test, *carried.arrays])
+            results = [
+                elementwise(
+                    (ComplexBuilder(making) if aval.dtype.kind == "c" else making).select,
+                    np.broadcast_to(_lifted(own, x.ndim), x.shape),
+                    x,
+                    old,
+                )
+                for x, old, aval in zip(results, carried.arrays, carried.avals, strict=True)
+            ]
+        if not carried.released(results):
+            break
+    goes_on: Scalar = False
+    for one in going.ravel().tolist():
+        goes_on = testing.op("or", goes_on, one)
+    if goes_on is False:
+        return list(arguments[m:])
+    inputs = [tuple(inside.outer.values()), tuple(carried.entries[i] for i in carried.moving)]
+    new = flat(results)
+    loop = While(
+        _program(testing, inputs, [[goes_on]], [()]),
+        _program(making, inputs, [[new[i] for i in carried.moving]], [(len(carried.moving),)]),
+        carried.kinds,
+    )
+    return carried.after(b.block(loop, *inside.outer, *(carried.start[i] for i in carried.moving)))
+
+
+def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
+    """Tests along the first axes of an array with more."""
+    return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
+
+
+LONG, SHORT = 4_000, 32
+"""Instructions of an unrolled loop from which it stays a loop; and passes up to which it never does."""
+
+
 def _scan(b, eqn, *arguments):
-    """A loop of known length, unrolled."""
+    """A loop of known length: unrolled, or kept where it is long."""
     params = eqn.params
     inner, consts, carried = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
+    if params["length"] > SHORT:
+        kept = _kept_scan(b, eqn, arguments[:consts], arguments[consts:carried], arguments[carried:])
+        if kept is not None:
+            return kept
     carry, slices = list(arguments[consts:carried]), arguments[carried:]
     rows = range(params["length"])
     gathered = []
@@ -347,10 +333,45 @@ def _scan(b, eqn, *arguments):
     if params["reverse"]:
         gathered.reverse()
     stacked = [
-        array([a for row in gathered for a in row[k].flat], var.aval.shape)
+        array([a for row in gathered for a in row[k].ravel().tolist()], var.aval.shape)
         for k, var in enumerate(eqn.outvars[len(carry) :])
     ]
     return carry + stacked
+
+
+def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
+    """The results of a loop that stays one; None where it is short enough to be unrolled."""
+    length, closed, avals = eqn.params["length"], eqn.params["jaxpr"], [var.aval for var in eqn.invars]
+    consts, end = len(constants), len(constants) + len(start)
+    inside, carried = _Inside(), _Carried(start, avals[consts:end])
+    given = inside.entered(constants, avals[:consts])
+    rows = [aval.update(shape=aval.shape[1:]) for aval in avals[end:]]
+    columns = list(zip(*(flat([x[i, ...] for x in slices]) for i in range(length)), strict=True))
+    row = arranged((f"x2_{j}" for j in range(len(columns))), rows)
+    while True:
+        own, results = inside.unrolled(b.limit, closed, [*given, *carried.arrays, *row])
+        if not carried.released(results[: len(start)]):
+            break
+    if len(own.instructions) * length <= LONG:
+        return None
+    moving, new, made = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
+    inputs = [
+        tuple(inside.outer.values()),
+        [carried.entries[i] for i in moving],
+        [f"x2_{j}" for j in range(len(columns))],
+    ]
+    body = _program(own, inputs, [[new[i] for i in moving], made], [(len(moving),), (len(made),)])
+    out = [var.aval for var in closed.jaxpr.outvars[len(start) :]]
+    loop = Scan(length, eqn.params["reverse"], body, carried.kinds, kinds(out))
+    tables = [b.table(column) for column in columns]
+    found = b.block(loop, *inside.outer, *(carried.start[i] for i in moving), *tables)
+    rest = found[len(moving) :]
+    each = [arranged((rest[j * length + i] for j in range(len(made))), out) for i in range(length)]
+    stacked = [
+        array([a for row in each for a in row[k].ravel().tolist()], var.aval.shape)
+        for k, var in enumerate(eqn.outvars[len(start) :])
+    ]
+    return carried.after(found[: len(moving)]) + stacked
 
 
 CALLS = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2"
@@ -359,45 +380,8 @@ CONTROL = {
     "custom_linear_solve": _linear_solve,
     "cond": _cond,
     "scan": _scan,
+    "while": _while,
 }
-
-
-# -- helpers ----------------------------------------------------------------------------------------------------------
-
-
-def truth_values(instructions: Sequence[Instruction]) -> set[str]:
-    """The targets that are true or false."""
-    found: set[str] = set()
-    for target, op, args in instructions:
-        chosen = args[1:] if op == "select" else ()
-        if op in TESTS or op in OF_TESTS or any(a in found or isinstance(a, bool) for a in chosen):
-            found.add(target)
-    return found
-
-
-def _live(
-    instructions: Sequence[Instruction], results: Sequence[Scalar]
-) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
-    """The instructions that results depend on, each as late as its first use allows, and their new names.
-
-    Computing a value just before it is used keeps few alive at a time: registers are scarce.
-    """
-    defined: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
-    order: list[Instruction] = []
-    renamed: dict[Scalar, str] = {}
-    for result in results:
-        stack = [result]
-        while stack:
-            instruction = defined.get(stack[-1])
-            if instruction is None or instruction.target in renamed:
-                stack.pop()
-            elif missing := [a for a in instruction.args if a in defined and a not in renamed]:
-                stack.extend(reversed(missing))
-            else:
-                args = tuple(renamed.get(a, a) if type(a) is str else a for a in instruction.args)
-                renamed[stack.pop()] = f"t{len(order)}"
-                order.append(Instruction(f"t{len(order)}", instruction.op, args))
-    return tuple(order), renamed
 
 
 def origin(eqn) -> str:

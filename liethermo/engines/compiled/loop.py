@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from ...tracing.scalarize import Program
+from ...tracing.program import Program
 from .machine_code import MachineCode
 from .writer import NUMBER, WHOLE, Writer
 

@@ -12,7 +12,7 @@ import threading
 import llvmlite.binding as llvm
 from llvmlite import ir
 
-from . import kept
+from . import kept, lapack
 
 
 class MachineCode:
@@ -20,6 +20,8 @@ class MachineCode:
 
     def __init__(self, module: ir.Module):
         text = str(module)
+        if lapack.PREFIX in text:
+            lapack.bind()
         with _lock:
             name = hashlib.sha256(f"{_this_machine()[-1]}\n{text}".encode()).hexdigest()[:32]
             found = _object(kept.read(name))

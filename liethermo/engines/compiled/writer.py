@@ -10,9 +10,12 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.branches import Branch, branched
-from ...tracing.builder import Instruction, Scalar
-from ...tracing.scalarize import Program, UnsupportedPrimitive
+from ...tracing.builder import Block, Instruction, Scalar
+from ...tracing.program import Program
+from ...tracing.scalarize import UnsupportedPrimitive
+from .blocks import Results, Table, picked, table, write_block
 from .exponential import exponential
+from .lapack import SPECIAL, declared
 
 NUMBER, TEST, WHOLE = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
 
@@ -42,6 +45,7 @@ class Writer:
         self.number, self.test, self.whole = (
             kind if lanes == 1 else ir.VectorType(kind, lanes) for kind in (NUMBER, TEST, WHOLE)
         )
+        self.kinds = {"f": self.number, "b": self.test, "i": self.whole}
 
     def write(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
         """The values of the outputs, array by array.
@@ -51,9 +55,23 @@ class Writer:
         read : function from the places of an array among the inputs, and of an entry in it, to its value
             Asked for what the program uses.
         """
+        return [[self._as_number(value) for value in entries] for entries in self.values(program, read)]
+
+    def values(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
+        """The same, integers and truth values as they are."""
         written = _Written(self, program, read)
         written.all(branched(program))
-        return [[self._as_number(written.value(a)) for a in entries] for entries in program.outputs]
+        return [[written.value(a) for a in entries] for entries in program.outputs]
+
+    def cast(self, value: ir.Value, kind: str) -> ir.Value:
+        """A value as one of a kind, a key of ``kinds``."""
+        if value.type == self.kinds[kind]:
+            return value
+        if kind == "f":
+            return self._as_number(value)
+        if kind == "i" and value.type == self.test:
+            return self.builder.zext(value, self.whole)
+        raise UnsupportedPrimitive("convert_element_type", "of unknown origin", f"from {value.type}")
 
     def constant(self, number: bool | int | float) -> ir.Value:
         kind = {bool: self.test, int: self.whole}.get(type(number), self.number)
@@ -83,6 +101,15 @@ class Writer:
             return build.select(better, x, rest[0])
         if op == "branch":
             return x
+        if op == "pick":
+            return picked(self, x, rest)
+        if op == "quotient":
+            return self._quotient(x, *rest)
+        if real and op == "single":
+            short = ir.FloatType() if self.lanes == 1 else ir.VectorType(ir.FloatType(), self.lanes)
+            return build.fpext(build.fptrunc(x, short), self.number)
+        if real and op in SPECIAL:
+            return self._special(op, args)
         if op == "float":
             return self._as_number(x)
         if op == "int":
@@ -100,7 +127,40 @@ class Writer:
         if real and op == "sign":  # NaN of NaN, a zero of a zero
             signed = self.intrinsic("llvm.copysign", [self.constant(1.0), x], self.number)
             return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed, x)
+        if op in ("abs", "sign") and x.type == self.whole:
+            negative = build.icmp_signed("<", x, self.constant(0))
+            if op == "abs":
+                return build.select(negative, build.neg(x), x)
+            positive = build.zext(build.icmp_signed(">", x, self.constant(0)), self.whole)
+            return build.select(negative, self.constant(-1), positive)
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
+
+    def _quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
+        """The quotient of integers, towards zero; by zero -1, and by -1 without a trap."""
+        build, one = self.builder, self.constant(1)
+        zero, minus = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
+        found = build.sdiv(x, build.select(build.or_(zero, minus), one, n))
+        return build.select(zero, self.constant(-1), build.select(minus, build.neg(x), found))
+
+    def wrapped(self, x: ir.Value, bits: int, signed: bool) -> ir.Value:
+        """An integer as so many bits hold it."""
+        short = ir.IntType(bits) if self.lanes == 1 else ir.VectorType(ir.IntType(bits), self.lanes)
+        widen = self.builder.sext if signed else self.builder.zext
+        return widen(self.builder.trunc(x, short), self.whole)
+
+    def _special(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
+        """SciPy's, one lane after another; its last argument is none of the mathematics."""
+        skip = ir.Constant(ir.IntType(32), 0)
+        kinds = [NUMBER] * SPECIAL[op][1] + [skip.type]
+        function = declared(self.builder.module, op, NUMBER, kinds)
+        if self.lanes == 1:
+            return self.builder.call(function, [*args, skip])
+        result = ir.Constant(self.number, ir.Undefined)
+        for lane in range(self.lanes):
+            place = ir.Constant(ir.IntType(32), lane)
+            own = [self.builder.extract_element(a, place) for a in args]
+            result = self.builder.insert_element(result, self.builder.call(function, [*own, skip]), place)
+        return result
 
     def fused(self, op: str, place: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]) -> ir.Value:
         """A sum or difference whose term at a place is a product."""
@@ -155,9 +215,9 @@ class Writer:
             yield build.load(counter)
             build.store(build.add(build.load(counter), self.whole_number(1)), counter)
 
-    def alike(self, op: str, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
+    def alike(self, op: str | Block, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
         """Constants as numbers of the type of what stands beside them."""
-        chosen = slice(1, None) if op == "select" else slice(None)
+        chosen = slice(1, None) if op in ("select", "pick") else slice(None)
         types = [v.type for v, a in zip(values[chosen], args[chosen], strict=True) if isinstance(a, str)]
         for i in range(len(values))[chosen]:
             if not isinstance(args[i], str) and types and values[i].type != types[0] and types[0] == self.number:
@@ -209,6 +269,8 @@ class _Written:
         self.values: ChainMap[str, ir.Value] = ChainMap()
         self.products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
         self.sizes: set[Scalar] = set()  # numbers without a sign
+        self.blocks: dict[Scalar, Results] = {}
+        self.tables: dict[Scalar, Table] = {}
 
     def value(self, a: Scalar) -> ir.Value:
         if not isinstance(a, str):
@@ -226,6 +288,21 @@ class _Written:
 
     def instruction(self, instruction: Instruction) -> None:
         writer, (target, op, args) = self.writer, instruction
+        if isinstance(op, Block):
+            self.blocks[target] = write_block(writer, op, [self.tables.get(a) or self.value(a) for a in args])
+            return
+        if op == "item":
+            self.values[target] = self.blocks[args[0]].item(int(args[1]))
+            return
+        if op in ("table", "column"):
+            whole = op == "table"
+            self.tables[target] = (
+                table(writer, [self.value(a) for a in args]) if whole else self.blocks[args[0]].column(int(args[1]))
+            )
+            return
+        if op == "wrap":
+            self.values[target] = writer.wrapped(self.value(args[0]), int(args[1]), bool(args[2]))
+            return
         given = writer.alike(op, [self.value(a) for a in args], args)
         unsigned = op == "max" and self.sizes.issuperset(args)
         fused = [i for i, a in enumerate(args) if a in self.products] if op in ("add", "sub") else []

@@ -1,0 +1,159 @@
+"""Loops and calls as LLVM instructions, for all lanes at once."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from llvmlite import ir
+
+from ...tracing.builder import Block
+from ...tracing.calls import Call
+from ...tracing.program import Scan, While
+from .lapack import kernel
+
+PLACE = ir.IntType(32)
+
+
+def write_block(writer: Any, block: Block, args: Sequence[Any]) -> Results:
+    """Write a block, of values and tables.
+
+    Parameters
+    ----------
+    writer : Writer
+    """
+    if isinstance(block, While):
+        return _while(writer, block, args)
+    if isinstance(block, Scan):
+        return _scan(writer, block, args)
+    assert isinstance(block, Call)
+    return _call(writer, block, args)
+
+
+def picked(writer: Any, place: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
+    """The entry at a place, by the bits of its number: of one that lies outside the nearest."""
+    build, last = writer.builder, writer.constant(len(entries) - 1)
+    place = build.select(build.icmp_signed("<", place, writer.constant(0)), writer.constant(0), place)
+    place = build.select(build.icmp_signed(">", place, last), last, place)
+    entries, bit = list(entries), 0
+    while len(entries) > 1:
+        odd = build.trunc(build.lshr(place, writer.constant(bit)), writer.test)
+        pairs = [build.select(odd, b, a) for a, b in zip(entries[::2], entries[1::2], strict=False)]
+        entries, bit = pairs + entries[2 * len(pairs) :], bit + 1
+    return entries[0]
+
+
+def _slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
+    """Memory for values of some kinds, that holds them."""
+    build, slots = writer.builder, []
+    for kind, value in zip(kinds, values, strict=True):
+        with build.goto_entry_block():  # else each pass of a loop around would take more of the stack
+            slot = build.alloca(writer.kinds[kind])
+        build.store(writer.cast(value, kind), slot)
+        slots.append(slot)
+    return slots
+
+
+def _reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
+    return lambda i, j: arrays[i][j]
+
+
+def _while(writer: Any, loop: While, args: Sequence[ir.Value]) -> Results:
+    build, fixed = writer.builder, len(loop.test.inputs[0])
+    constants, slots = args[:fixed], _slots(writer, loop.kinds, args[fixed:])
+    going: list[ir.Value] = []
+
+    def goes_on() -> ir.Value:
+        carried = [build.load(slot) for slot in slots]
+        ((test,),) = writer.values(loop.test, _reader(constants, carried))
+        going[:] = [writer.cast(test, "b")]
+        return writer.any(going[0])
+
+    with writer.repeated(goes_on):
+        before = [build.load(slot) for slot in slots]
+        (new,) = writer.values(loop.body, _reader(constants, before))
+        for slot, kind, after, old in zip(slots, loop.kinds, new, before, strict=True):
+            build.store(build.select(going[0], writer.cast(after, kind), old), slot)
+    return Results([build.load(slot) for slot in slots])
+
+
+def _scan(writer: Any, loop: Scan, args: Sequence[Any]) -> Results:
+    build, fixed = writer.builder, len(loop.body.inputs[0])
+    start = fixed + len(loop.carried)
+    constants, slots, tables = args[:fixed], _slots(writer, loop.carried, args[fixed:start]), args[start:]
+    made = [Table(writer, writer.kinds[kind], length=loop.length) for kind in loop.made]
+    with writer.counted(writer.whole_number(loop.length)) as count:
+        i = build.sub(writer.whole_number(loop.length - 1), count) if loop.reverse else count
+        carried, row = [build.load(slot) for slot in slots], [table.read(i) for table in tables]
+        new, out = writer.values(loop.body, _reader(constants, carried, row))
+        for slot, kind, value in zip(slots, loop.carried, new, strict=True):
+            build.store(writer.cast(value, kind), slot)
+        for table, kind, value in zip(made, loop.made, out, strict=True):
+            table.write(i, writer.cast(value, kind))
+    return Results([build.load(slot) for slot in slots], made, loop.length)
+
+
+class Table:
+    """Values of one kind in memory, by their numbers."""
+
+    def __init__(self, writer: Any, kind: ir.Type, values: Sequence[ir.Value] = (), length: int = 0):
+        self.build, self.kind, self.writer = writer.builder, kind, writer
+        self.widened = writer.kinds["i"] if kind == writer.kinds["b"] else None  # bits are awkward in memory
+        if values and not self.widened and all(isinstance(value, ir.Constant) for value in values):
+            rows, module = ir.ArrayType(self.kind, len(values)), self.build.module
+            fixed = ir.GlobalVariable(module, rows, module.get_unique_name("table"))
+            fixed.initializer, fixed.global_constant, fixed.linkage = ir.Constant(rows, list(values)), True, "internal"
+            self.start = self.build.bitcast(fixed, self.kind.as_pointer())
+            return
+        with self.build.goto_entry_block():
+            self.start = self.build.alloca(self.widened or self.kind, max(len(values), length))
+        for i, value in enumerate(values):
+            self.write(writer.whole_number(i), value)
+
+    def read(self, i: ir.Value) -> ir.Value:
+        found = self.build.load(self.build.gep(self.start, [i]))
+        return self.build.trunc(found, self.kind) if self.widened else found
+
+    def write(self, i: ir.Value, value: ir.Value) -> None:
+        value = self.build.zext(value, self.widened) if self.widened else value
+        self.build.store(value, self.build.gep(self.start, [i]))
+
+
+class Results:
+    """The results of a block: values, then tables of one length. What is in those is read where it is used."""
+
+    def __init__(self, values: Sequence[ir.Value], tables: Sequence[Table] = (), length: int = 1):
+        self.values, self.tables, self.length = values, tables, length
+
+    def item(self, i: int) -> ir.Value:
+        if i < len(self.values):
+            return self.values[i]
+        table, row = divmod(i - len(self.values), self.length)
+        return self.tables[table].read(ir.Constant(ir.IntType(64), row))
+
+    def column(self, start: int) -> Table:
+        return self.tables[(start - len(self.values)) // self.length]
+
+
+def table(writer: Any, values: Sequence[ir.Value]) -> Table:
+    """Values as a table; they are numbers where one of them is."""
+    kind = writer.number if any(value.type == writer.number for value in values) else values[0].type
+    return Table(writer, kind, [writer.cast(v, "f") if kind == writer.number else v for v in values])
+
+
+def _call(writer: Any, call: Call, args: Sequence[ir.Value]) -> Results:
+    """By a function of its own, lane by lane: what it makes of one does not depend on the others."""
+    build, count = writer.builder, len(call.kinds)
+    given = Table(writer, writer.number, [writer.cast(a, "f") for a in args])
+    found = Table(writer, writer.number, length=count)
+    pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (given, found)]
+    function = kernel(build.module, call, writer.lanes)
+    with writer.counted(writer.whole_number(writer.lanes)) if writer.lanes > 1 else _once(writer) as lane:
+        build.call(function, [build.gep(pointer, [lane]) for pointer in pointers])
+    return Results([], [found], count)
+
+
+@contextlib.contextmanager
+def _once(writer: Any) -> Iterator[ir.Value]:
+    yield writer.whole_number(0)

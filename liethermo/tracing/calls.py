@@ -1,0 +1,137 @@
+"""Linear algebra that does not unroll: calls of LAPACK, and products of matrices as loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from .builder import Block
+
+
+@dataclass(frozen=True, eq=False)
+class Call(Block):
+    """A function of matrices, on their entries row by row; of complex ones all real parts, then all imaginary ones.
+
+    NaN where an argument is not finite, or the function does not end.
+
+    Attributes
+    ----------
+    name : str
+        A key of :data:`FUNCTIONS`.
+    sizes : tuple of int
+        What its function is told of the matrices.
+    is_complex : bool
+    """
+
+    name: str
+    sizes: tuple[int, ...]
+    is_complex: bool = False
+
+    @property
+    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("f",) * sum(self.lengths(self.results))
+
+    @property
+    def arguments(self) -> list[tuple[int, ...]]:
+        """Shapes of the matrices that it is given."""
+        return FUNCTIONS[self.name].arguments(*self.sizes)
+
+    @property
+    def results(self) -> list[tuple[tuple[int, ...], bool]]:
+        """Shapes of the arrays that it makes, and whether they are real even where its arguments are not."""
+        return FUNCTIONS[self.name].results(*self.sizes)
+
+    def lengths(self, results) -> list[int]:
+        return [math.prod(shape) * (2 if self.is_complex and not real else 1) for shape, real in results]
+
+    def __call__(self, *args) -> list:
+        arrays = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in args))
+        front = arrays[0].shape
+        rows = np.stack(arrays, axis=-1).reshape(-1, len(args))
+        found = np.stack([self._of_one(row) for row in rows]).reshape(*front, -1)
+        return [found[..., i][()] for i in range(found.shape[-1])]
+
+    def _of_one(self, row: np.ndarray) -> np.ndarray:
+        if not np.isfinite(row).all():
+            return np.full(len(self.kinds), np.nan)
+        matrices, start = [], 0
+        for shape in self.arguments:
+            size = math.prod(shape)
+            matrix = row[start : start + size].reshape(shape)
+            if self.is_complex:
+                matrix = matrix + 1j * row[start + size : start + 2 * size].reshape(shape)
+            matrices.append(matrix)
+            start += size * (2 if self.is_complex else 1)
+        try:
+            found = FUNCTIONS[self.name].meaning(self.sizes, *matrices)
+        except np.linalg.LinAlgError:
+            return np.full(len(self.kinds), np.nan)
+        parts = []
+        for x, (_, real) in zip(found, self.results, strict=True):
+            parts += [x.real.ravel(), x.imag.ravel()] if self.is_complex and not real else [np.real(x).ravel()]
+        return np.concatenate(parts).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Function:
+    """What a call is of.
+
+    Attributes
+    ----------
+    arguments, results : functions of the sizes
+        See :class:`Call`.
+    meaning : function of the sizes and the matrices to a sequence of arrays
+    """
+
+    arguments: Callable[..., list[tuple[int, ...]]]
+    results: Callable[..., list[tuple[tuple[int, ...], bool]]]
+    meaning: Callable[..., Any]
+
+
+def _lu(sizes, a) -> tuple[np.ndarray, np.ndarray]:
+    (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (a,))
+    factors, pivots, _ = getrf(a)
+    return factors, pivots.astype(np.float64)
+
+
+def _qr(sizes, a) -> tuple[np.ndarray, np.ndarray]:
+    columns = sizes[2]
+    q, r = scipy.linalg.qr(a, mode="full" if columns == sizes[0] else "economic")
+    return q, r[: sizes[0] if columns == sizes[0] else columns]
+
+
+def _svd(sizes, a) -> tuple[np.ndarray, ...]:
+    u, s, v = scipy.linalg.svd(a, full_matrices=bool(sizes[2]), lapack_driver="gesdd")
+    return s, u, v
+
+
+def _parts(m: int, n: int, full: int) -> list[tuple[tuple[int, ...], bool]]:
+    least = min(m, n)
+    return [((least,), True), ((m, m if full else least), False), ((n if full else least, n), False)]
+
+
+FUNCTIONS = {
+    "eigh": Function(
+        lambda n: [(n, n)],
+        lambda n: [((n, n), False), ((n,), True)],
+        lambda sizes, a: scipy.linalg.eigh(a, driver="evd")[::-1],
+    ),
+    "lu": Function(lambda m, n: [(m, n)], lambda m, n: [((m, n), False), ((min(m, n),), True)], _lu),
+    "qr": Function(
+        lambda m, n, columns: [(m, n)],
+        lambda m, n, columns: [((m, columns), False), ((columns, n), False)],
+        _qr,
+    ),
+    "svd": Function(lambda m, n, full: [(m, n)], _parts, _svd),
+    "matmul": Function(
+        lambda m, k, n: [(m, k), (k, n)], lambda m, k, n: [((m, n), False)], lambda sizes, a, b: [a @ b]
+    ),
+}
+"""``eigh``: eigenvectors and eigenvalues, from the lower triangle; ``lu``: factors in one matrix, and the row that each
+row is exchanged with; ``qr``: with as many columns as are asked for; ``svd``: singular values, left vectors, and right
+ones as rows; ``matmul``: the product of real matrices."""

@@ -1,0 +1,324 @@
+"""How the primitives of linear algebra, of sorting, convolution and of special functions become instructions."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import reduce
+
+import numpy as np
+
+from .builder import Pair, Scalar, array, constant, elementwise, pair
+from .calls import Call
+from .complex_numbers import ComplexBuilder
+
+FEW_ROWS = 4
+"""Rows of a matrix whose elimination is unrolled; a larger one is LAPACK's."""
+
+SHORT_SORT = 16
+"""Entries that are sorted by exchanging neighbours; more take a network whose size grows as n log(n)^2."""
+
+
+def _matrices(x: np.ndarray) -> np.ndarray:
+    return x.reshape(-1, *x.shape[-2:])
+
+
+def called(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[np.ndarray]:
+    """The results of a call, as arrays of scalars."""
+    is_complex = isinstance(b, ComplexBuilder)
+    call = Call(name, sizes, is_complex)
+    given: list[Scalar] = []
+    for x in matrices:
+        entries = x.ravel().tolist()
+        given += [a.re for a in entries] + [a.im for a in entries] if is_complex else entries
+    found, made = iter(b.real.block(call, *given)), []
+    for shape, real in call.results:
+        size = math.prod(shape)
+        parts = list(itertools.islice(found, size))
+        if is_complex and not real:
+            parts = [Pair(re, im) for re, im in zip(parts, list(itertools.islice(found, size)), strict=True)]
+        made.append(array(parts, shape))
+    return made
+
+
+def product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The product of two matrices, as a loop; of complex ones those of their parts."""
+    sizes = (*x.shape, y.shape[1])
+    if not isinstance(b, ComplexBuilder):
+        return called(b, "matmul", sizes, x, y)[0]
+    (a, c), (d, e) = ([elementwise(lambda v, k=k: getattr(pair(v), k), m) for k in ("re", "im")] for m in (x, y))
+    ad, ce, ae, cd = (called(b.real, "matmul", sizes, *both)[0] for both in ((a, d), (c, e), (a, e), (c, d)))
+    return elementwise(Pair, elementwise(b.real.sub, ad, ce), elementwise(b.real.add, ae, cd))
+
+
+def _each(b, eqn, x: np.ndarray, function) -> list[np.ndarray]:
+    """``function`` of each matrix in x, shape (..., m, n): arrays with the same axes in front."""
+    found = [function(a) for a in _matrices(x)]
+    outputs = []
+    for var, parts in zip(eqn.outvars, zip(*found, strict=True), strict=True):
+        outputs.append(array([a for part in parts for a in part.ravel().tolist()], var.aval.shape))
+    return outputs
+
+
+def eigh(b, eqn, a):
+    if eqn.params["subset_by_index"] not in (None, (0, a.shape[-1])):
+        raise NotImplementedError("of some eigenvalues alone")
+    lower = eqn.params["lower"]
+
+    def of_one(m):
+        m = m if lower else m.T if not isinstance(b, ComplexBuilder) else elementwise(b.conj, m.T)
+        return called(b, "eigh", (len(m),), m)
+
+    return _each(b, eqn, a, of_one)
+
+
+def _exchanged(b, x: np.ndarray, k: int, place: Scalar) -> np.ndarray:
+    """A matrix with row k and the row at a place, which is not before k, in each other's place."""
+    x, first, rest = x.copy(), x[k].copy(), x[k:].copy()
+    for j in range(x.shape[1]):
+        x[k, j] = b.pick(b.real.sub(place, k), list(rest[:, j]))
+    for i in range(k + 1, len(x)):
+        hit = b.real.op("eq", place, i)
+        for j in range(x.shape[1]):
+            x[i, j] = b.select(hit, first[j], x[i, j])
+    return x
+
+
+def _eliminated(b, a: np.ndarray) -> tuple[np.ndarray, list[Scalar]]:
+    """LU factors with the largest pivots, and the row that each is exchanged with."""
+    a, r = a.copy(), b.real
+    pivots: list[Scalar] = []
+    for k in range(min(a.shape)):
+        sizes = [r.op("abs", v) if not isinstance(b, ComplexBuilder) else b.size(v) for v in a[k:, k]]
+        best, at = sizes[0], k
+        for i, size in enumerate(sizes[1:], k + 1):
+            larger = r.op("gt", size, best)
+            best, at = r.select(larger, size, best), r.select(larger, i, at)
+        a = _exchanged(b, a, k, at)
+        pivots.append(at)
+        for i in range(k + 1, len(a)):
+            factor = b.div(a[i, k], a[k, k])
+            # a column of zeros stays one, as LAPACK has it
+            zero = b.op("eq", a[k, k], 0.0)
+            a[i, k] = b.select(zero, a[i, k], factor)
+            for j in range(k + 1, a.shape[1]):
+                a[i, j] = b.sub(a[i, j], b.mul(a[i, k], a[k, j]))
+    return a, pivots
+
+
+def lu(b, eqn, a):
+    m, n = a.shape[-2:]
+    r = b.real
+
+    def of_one(x):
+        if m <= FEW_ROWS and n <= FEW_ROWS:
+            factors, pivots = _eliminated(b, x)
+        else:
+            factors, found = called(b, "lu", (m, n), x)
+            pivots = [r.op("truncate", p) for p in found.tolist()]
+        order = constant(np.arange(m)[:, None])
+        for k, place in enumerate(pivots):
+            order = _exchanged(r, order, k, place)
+        return factors, array(pivots, (len(pivots),)), order[:, 0]
+
+    return _each(b, eqn, a, of_one)
+
+
+def qr(b, eqn, a):
+    if eqn.params["pivoting"]:
+        raise NotImplementedError("with pivoting")
+    m, n = a.shape[-2:]
+    columns = m if eqn.params["full_matrices"] else min(m, n)
+    return _each(b, eqn, a, lambda x: called(b, "qr", (m, n, columns), x))
+
+
+def svd(b, eqn, a):
+    if eqn.params["subset_by_index"] not in (None, (0, min(a.shape[-2:]))):
+        raise NotImplementedError("of some singular values alone")
+    m, n = a.shape[-2:]
+    full = int(eqn.params["full_matrices"]) if eqn.params["compute_uv"] else 0
+
+    def of_one(x):
+        found = called(b, "svd", (m, n, full), x)
+        return found if eqn.params["compute_uv"] else found[:1]
+
+    return _each(b, eqn, a, of_one)
+
+
+def cholesky(b, eqn, a):
+    n, r = a.shape[-1], b.real
+    lower = constant(np.zeros(a.shape))
+    for A, L in zip(_matrices(a), _matrices(lower), strict=True):
+        positive: Scalar = True
+        for j in range(n):
+            pivot = reduce(b.sub, (b.mul(v, b.conj(v)) for v in L[j, :j]), A[j, j])
+            size = pivot.re if isinstance(pivot, Pair) else pivot
+            positive = r.op("and", positive, r.op("gt", size, 0.0))
+            root = r.op("sqrt", size)
+            L[j, j] = Pair(root, 0.0) if isinstance(pivot, Pair) else root
+            for i in range(j + 1, n):
+                products = (b.mul(u, b.conj(v)) for u, v in zip(L[i, :j], L[j, :j], strict=True))
+                L[i, j] = b.div(reduce(b.sub, products, A[i, j]), L[j, j])
+        L[...] = elementwise(lambda v, ok=positive: b.select(ok, v, math.nan), L)
+    return elementwise(lambda v: b.add(v, 0.0), lower) if isinstance(b, ComplexBuilder) else lower
+
+
+def triangular_solve(b, eqn, a, rhs):
+    """``x`` with ``a x = rhs``, or ``x a = rhs``, by substitution."""
+    params = eqn.params
+    if params["transpose_a"] and params["conjugate_a"]:
+        a = elementwise(b.conj, a)
+    if params["transpose_a"] == params["left_side"]:
+        a = a.swapaxes(-1, -2)
+    if not params["left_side"]:
+        rhs = rhs.swapaxes(-1, -2)
+    lower = params["lower"] != (params["transpose_a"] == params["left_side"])
+    n, x = a.shape[-1], rhs.copy()
+    order = range(n) if lower else range(n)[::-1]
+    for A, X in zip(_matrices(a), _matrices(x), strict=True):
+        for done, i in enumerate(order):
+            for k in range(X.shape[1]):
+                rest = reduce(b.sub, (b.mul(A[i, j], X[j, k]) for j in order[:done]), X[i, k])
+                X[i, k] = rest if params["unit_diagonal"] else b.div(rest, A[i, i])
+    return x if params["left_side"] else x.swapaxes(-1, -2)
+
+
+# -- sorting ----------------------------------------------------------------------------------------------------------
+
+
+def before(b, kind: str, x: Scalar, y: Scalar) -> Scalar:
+    """Whether x stands before y where numbers are in order: NaN is the last."""
+    less = b.op("lt", x, y)
+    return less if kind != "f" else b.op("or", less, b.op("and", b.op("ne", y, y), b.op("eq", x, x)))
+
+
+def _network(n: int):
+    """Pairs of places to be compared: neighbours, which keeps the order of what is alike; or Batcher's [Knuth]."""
+    if n <= SHORT_SORT:
+        yield from ((j, j + 1) for i in range(n) for j in range(n - 1 - i))
+        return
+    t = (n - 1).bit_length()
+    p = 1 << (t - 1)
+    while p:
+        q, rest, d = 1 << (t - 1), 0, p
+        while True:
+            yield from ((i, i + d) for i in range(n - d) if i & p == rest)
+            if q == p:
+                break
+            d, q, rest = q - p, q >> 1, p
+        p >>= 1
+
+
+def sort(b, eqn, *operands):
+    axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
+    n = operands[0].shape[axis]
+    kinds = ["f" if var.aval.dtype.kind == "f" else "i" for var in eqn.invars[:keys]]
+    moved = [np.moveaxis(x, axis, -1).copy() for x in operands]
+    for place in np.ndindex(*moved[0].shape[:-1]):
+        rows = [x[place].tolist() for x in moved]
+        key_rows, more = list(rows[:keys]), []
+        own = list(kinds)
+        if n > SHORT_SORT:  # the network does not keep the order of what is alike
+            more, own = [list(range(n))], [*kinds, "i"]
+        for i, j in _network(n):
+            swaps: Scalar = False
+            for key, kind in reversed(list(zip([*key_rows, *more], own, strict=True))):
+                other = before(b, kind, key[j], key[i])
+                alike = b.op("not", b.op("or", other, before(b, kind, key[i], key[j])))
+                swaps = b.op("or", other, b.op("and", alike, swaps))
+            for row in (*rows, *more):
+                row[i], row[j] = b.select(swaps, row[j], row[i]), b.select(swaps, row[i], row[j])
+        for x, row in zip(moved, rows, strict=True):
+            x[place] = array(row, (n,))
+    return [np.moveaxis(x, -1, axis) for x in moved]
+
+
+def total_order(op: str):
+    """``lt_to`` and ``le_to``: NaN is the last of all numbers, and -0 stands before 0."""
+
+    def rule(b, eqn, x, y):
+        kind = eqn.invars[0].aval.dtype.kind
+
+        def less(u, v):
+            if kind != "f":
+                return b.op("lt", u, v)
+            zeros = b.op("and", b.op("eq", u, 0.0), b.op("eq", v, 0.0))
+            signs = b.op("lt", b.div(1.0, u), b.div(1.0, v))
+            return b.op("or", before(b, kind, u, v), b.op("and", zeros, signs))
+
+        return elementwise(less if op == "lt" else lambda u, v: b.op("not", less(v, u)), x, y)
+
+    return rule
+
+
+# -- convolution ------------------------------------------------------------------------------------------------------
+
+
+def convolution(b, eqn, x, kernel):
+    """``conv_general_dilated``: the sum of the products that fall together."""
+    params, dims = eqn.params, eqn.params["dimension_numbers"]
+    if params["batch_group_count"] != 1:
+        raise NotImplementedError("with groups of batches")
+    x, kernel = x.transpose(dims.lhs_spec), kernel.transpose(dims.rhs_spec)
+    shape = tuple(eqn.outvars[0].aval.shape[i] for i in dims.out_spec)
+    groups, inputs = params["feature_group_count"], kernel.shape[1]
+    result = np.empty(shape, object)
+    for place in np.ndindex(*shape):
+        n, channel, at = place[0], place[1], place[2:]
+        first = channel // (shape[1] // groups) * inputs
+        products = []
+        for offset in np.ndindex(*kernel.shape[2:]):
+            source = []
+            for i, j, stride, (low, _), dilation, spread, size in zip(
+                at,
+                offset,
+                params["window_strides"],
+                params["padding"],
+                params["lhs_dilation"],
+                params["rhs_dilation"],
+                x.shape[2:],
+                strict=True,
+            ):
+                where, rest = divmod(i * stride + j * spread - low, dilation)
+                if rest or not 0 <= where < size:
+                    break
+                source.append(where)
+            else:
+                products += [b.mul(x[(n, first + c, *source)], kernel[(channel, c, *offset)]) for c in range(inputs)]
+        result[place] = reduce(b.add, products, 0.0)
+    return result.transpose(np.argsort(dims.out_spec))
+
+
+# -- special functions ------------------------------------------------------------------------------------------------
+
+BERNOULLI = [1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6, -3617 / 510, 43867 / 798, -174611 / 330]
+SHIFT = 10
+"""Terms that are summed before the asymptotic series of ``zeta`` begins."""
+
+
+def zeta(b, s: Scalar, q: Scalar) -> Scalar:
+    """Hurwitz's ``sum_k (q + k)^-s`` for s > 1 and q > 0, by Euler and Maclaurin's formula."""
+    minus = b.neg(s)
+    total = reduce(b.add, (b.pow(b.add(q, float(k)), minus) for k in range(SHIFT)))
+    at = b.add(q, float(SHIFT))
+    power = b.pow(at, minus)
+    total = b.add(total, b.add(b.div(b.mul(at, power), b.sub(s, 1.0)), b.mul(0.5, power)))
+    factor, square = b.div(b.mul(s, power), at), b.mul(at, at)
+    for j, number in enumerate(BERNOULLI, 1):
+        total = b.add(total, b.mul(number / math.factorial(2 * j), factor))
+        rising = b.mul(b.add(s, 2.0 * j - 1.0), b.add(s, 2.0 * j))
+        factor = b.div(b.mul(factor, rising), square)
+    defined = b.op("and", b.op("gt", s, 1.0), b.op("gt", q, 0.0))
+    return b.select(defined, total, math.nan)
+
+
+def polygamma(b, eqn, order, x):
+    """The derivatives of digamma, of positive arguments."""
+
+    def of_one(m, v):
+        if type(m) is str or m != int(m) or m < 1:
+            raise NotImplementedError("of an order that is no positive integer known at compile time")
+        sign = 1.0 if int(m) % 2 else -1.0
+        return b.mul(sign * math.factorial(int(m)), zeta(b, m + 1.0, v))
+
+    return elementwise(of_one, order, x)

@@ -1,0 +1,297 @@
+"""Scalar programs: instructions in order, among them calls and loops, which have several results."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from .builder import OF_TESTS, TESTS, Block, Instruction, Scalar, meaning
+
+
+@dataclass(frozen=True)
+class Program:
+    """Scalar instructions in order, each variable assigned once.
+
+    Attributes
+    ----------
+    inputs : tuple of tuple of str
+        Names of the entries of each input array, in row-major order.
+    instructions : tuple of Instruction
+    outputs : tuple of tuple of scalars
+        For each output array its entries: names, or numbers where they are constant.
+    shapes : tuple of tuple of int
+        Shapes of the output arrays.
+    """
+
+    inputs: tuple[tuple[str, ...], ...]
+    instructions: tuple[Instruction, ...]
+    outputs: tuple[tuple[Scalar, ...], ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    @property
+    def operations(self) -> Counter[str]:
+        """How many instructions there are of each kind."""
+        return Counter(str(instruction.op) for instruction in self.instructions)
+
+    def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
+        """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
+
+        With ``batch`` inputs and outputs have one axis more in front, the same for all.
+        """
+        given, front = [], ()
+        for names, x in zip(self.inputs, arrays, strict=True):
+            x = np.asarray(x, dtype=np.float64)
+            if batch:
+                front = x.shape[:1]
+                x = x.reshape(*front, len(names)).T
+            given.append(x if batch else x.ravel())
+
+        def gathered(entries, shape):
+            found = np.empty((*front, len(entries)))
+            for i, a in enumerate(entries):
+                found[..., i] = a
+            return found.reshape((*front, *shape))
+
+        return [gathered(entries, shape) for entries, shape in zip(self.run(*given), self.shapes, strict=True)]
+
+    def run(self, *given: Sequence) -> list[list]:
+        """The entries of the outputs for those of the inputs: numbers, or arrays of them for many points at once."""
+        values: dict[Scalar, Any] = {}
+        for names, entries in zip(self.inputs, given, strict=True):
+            values.update(zip(names, entries, strict=True))
+        with np.errstate(all="ignore"):
+            for target, op, args in self.instructions:
+                values[target] = meaning(op)(*(values[a] if type(a) is str else a for a in args))
+        return [[values[a] if type(a) is str else a for a in entries] for entries in self.outputs]
+
+    def degree(self, place: int) -> float:
+        """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
+
+        Parameters
+        ----------
+        place : int
+            Of the input.
+        """
+        degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
+        for target, op, args in self.instructions:
+            found = [degrees.get(a, 0) for a in args]
+            if op in ("add", "sub", "neg"):
+                degrees[target] = max(found)
+            elif op == "mul":
+                degrees[target] = sum(found)
+            elif op == "div" and not found[1]:
+                degrees[target] = found[0]
+            else:
+                degrees[target] = math.inf if any(found) else 0
+        return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
+
+    def factored(self, varying: Sequence[int]) -> Program:
+        """The same, with products ``(v a) b`` written ``v (a b)`` where a and b do not depend on some of the inputs.
+
+        In a loop over those, ``a b`` is then computed once.
+
+        Parameters
+        ----------
+        varying : sequence of int
+            Places of those inputs.
+        """
+        depends: set[Scalar] = {name for i in varying for name in self.inputs[i]}
+        products: dict[Scalar, tuple[Scalar, Scalar]] = {}
+        factors: dict[tuple[Scalar, Scalar], str] = {}
+        instructions: list[Instruction] = []
+        for instruction in self.instructions:
+            changing = [a for a in instruction.args if a in depends]
+            if changing:
+                depends.add(instruction.target)
+            if instruction.op == "mul" and len(changing) == 1:
+                first, second = instruction.args
+                v, b = (first, second) if first in depends else (second, first)
+                if v in products:
+                    v, a = products[v]
+                    if (a, b) not in factors:
+                        factors[a, b] = f"{instruction.target}_factor"
+                        instructions.append(Instruction(factors[a, b], "mul", (a, b)))
+                    b = factors[a, b]
+                products[instruction.target] = v, b
+                instruction = instruction._replace(args=(v, b))
+            instructions.append(instruction)
+        return replace(self, instructions=tuple(instructions))
+
+    def split(self, late: Sequence[int]) -> tuple[Program, Program]:
+        """What can be computed without some of the inputs, and the rest.
+
+        The second program has one more input array, at the end: the output of the first. Arrays hold numbers, so truth
+        values and integers are handed over as such.
+
+        Parameters
+        ----------
+        late : sequence of int
+            Places of those inputs.
+        """
+        waiting: set[Scalar] = {name for i in late for name in self.inputs[i]}
+        early, rest = [], []
+        for instruction in self.instructions:
+            if waiting.isdisjoint(instruction.args):
+                early.append(instruction)
+            else:
+                rest.append(instruction)
+                waiting.add(instruction.target)
+        wanted = {a for instruction in rest for a in instruction.args} | {
+            a for entries in self.outputs for a in entries
+        }
+        tables = [i for i in early if i.target in wanted and i.op in ("table", "column")]
+        for target, op, args in tables:  # no number: its entries are handed over
+            entries = args
+            if op == "column":
+                names = [f"{target}_{i}" for i in range(int(args[2]))]
+                early += [Instruction(a, "item", (args[0], int(args[1]) + i)) for i, a in enumerate(names)]
+                entries = tuple(names)
+            wanted |= set(entries)
+            rest.insert(0, Instruction(target, "table", entries))
+        unlike = {i.target for i in tables}
+        handed = [i.target for i in early if i.target in wanted and i.target not in unlike]
+        kinds = kinds_of(early)
+        others = {a: f"{a}_as_number" for a in handed if kinds[a] != "f"}
+        early += [Instruction(number, "float", (a,)) for a, number in others.items()]
+        back: dict[str, tuple[str, tuple]] = {"b": ("ne", (0.0,)), "i": ("truncate", ())}
+        rest = [Instruction(a, back[kinds[a]][0], (n, *back[kinds[a]][1])) for a, n in others.items()] + rest
+        handed = [others.get(a, a) for a in handed]
+        instructions, renamed = live(early, handed)
+        first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
+        return first, Program((*self.inputs, tuple(handed)), tuple(rest), self.outputs, self.shapes)
+
+
+@dataclass(frozen=True, eq=False)
+class While(Block):
+    """``while test(constants, carried): carried = body(constants, carried)``.
+
+    Its arguments are the constants, then what is carried at the start; its results what is carried at the end. Where
+    there are several lanes, those whose test has failed wait, unchanged, for the others.
+
+    Attributes
+    ----------
+    test, body : Program
+        Of the two arrays; the first has one truth value as its result.
+    kinds : tuple of str
+        Of what is carried.
+    """
+
+    test: Program
+    body: Program
+    kinds: tuple[str, ...]
+    name: str = field(default="while", repr=False)
+
+    def __call__(self, *args) -> list:
+        fixed = len(self.test.inputs[0])
+        constants, carried = args[:fixed], list(args[fixed:])
+        while True:
+            ((going,),) = self.test.run(constants, carried)
+            if not np.any(going):
+                return carried
+            (new,) = self.body.run(constants, carried)
+            carried = [np.where(going, after, before)[()] for after, before in zip(new, carried, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan(Block):
+    """``carried, made[i] = body(constants, carried, [table[i] for table in tables])`` for every i.
+
+    Its arguments are the constants, what is carried at the start, and the tables; its results what is carried at the
+    end, and the tables that were made, one after another.
+
+    Attributes
+    ----------
+    length : int
+    reverse : bool
+        Whether the last i is the first.
+    body : Program
+        Of three arrays, with two as its results.
+    carried, made : tuple of str
+        The kinds of what is carried, and of what is in a row that is made.
+    """
+
+    length: int
+    reverse: bool
+    body: Program
+    carried: tuple[str, ...]
+    made: tuple[str, ...]
+    name: str = field(default="scan", repr=False)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.carried + tuple(kind for kind in self.made for _ in range(self.length))
+
+    def __call__(self, *args) -> list:
+        fixed = len(self.body.inputs[0])
+        start = fixed + len(self.carried)
+        constants, carried, tables = args[:fixed], list(args[fixed:start]), args[start:]
+        made: list[list] = [[None] * self.length for _ in self.made]
+        for i in range(self.length)[::-1] if self.reverse else range(self.length):
+            carried, row = self.body.run(constants, carried, [table[i] for table in tables])
+            for column, value in zip(made, row, strict=True):
+                column[i] = value
+        return carried + [a for column in made for a in column]
+
+
+# -- what follows from instructions -----------------------------------------------------------------------------------
+
+
+def kinds_of(instructions: Sequence[Instruction]) -> dict[Scalar, str]:
+    """Whether each target is a number, an integer or true or false, ``"f"``, ``"i"`` or ``"b"``; others are numbers."""
+    blocks: dict[Scalar, Block] = {}
+    kinds: dict[Scalar, str] = {}
+
+    def kind(a: Scalar) -> str:
+        if isinstance(a, str):
+            return kinds.get(a, "f")
+        return "b" if isinstance(a, bool) else "i" if isinstance(a, int) else "f"
+
+    for target, op, args in instructions:
+        if isinstance(op, Block):
+            blocks[target] = op
+        elif op == "item":
+            kinds[target] = blocks[args[0]].kinds[int(args[1])]
+        elif op in TESTS or op == "branch":
+            kinds[target] = "b"
+        elif op in ("int", "truncate", "quotient", "wrap"):
+            kinds[target] = "i"
+        elif op in OF_TESTS or op in KEEPING:
+            found = {kind(a) for a in (args[1:] if op in ("select", "pick") else args)}
+            kinds[target] = "f" if "f" in found else "i" if "i" in found else "b"
+        else:
+            kinds[target] = "f"
+    return kinds
+
+
+KEEPING = frozenset("add sub mul neg max min abs sign rem select pick".split())
+"""Operations whose results are of the kind of their arguments."""
+
+
+def live(
+    instructions: Sequence[Instruction], results: Sequence[Scalar]
+) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
+    """The instructions that results depend on, each as late as its first use allows, and their new names.
+
+    Computing a value just before it is used keeps few alive at a time: registers are scarce.
+    """
+    defined: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
+    order: list[Instruction] = []
+    renamed: dict[Scalar, str] = {}
+    for result in results:
+        stack = [result]
+        while stack:
+            instruction = defined.get(stack[-1])
+            if instruction is None or instruction.target in renamed:
+                stack.pop()
+            elif missing := [a for a in instruction.args if a in defined and a not in renamed]:
+                stack.extend(reversed(missing))
+            else:
+                args = tuple(renamed.get(a, a) if type(a) is str else a for a in instruction.args)
+                renamed[stack.pop()] = f"t{len(order)}"
+                order.append(Instruction(f"t{len(order)}", instruction.op, args))
+    return tuple(order), renamed
