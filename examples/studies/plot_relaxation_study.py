@@ -37,10 +37,10 @@ print(study.run())
 lt.plot.study(study.results)
 
 # %%
-# The larger the rate the shorter the time, nearly in inverse proportion: weak friction moves the energy as a function of
-# the rate times the time alone. The body begins near its axis of least inertia, and stays there the longer the less the
-# middle moment differs from the least. The spots in the picture are bodies that come near their middle axis, where the
-# motion is slow, and linger.
+# The larger the rate the shorter the time, nearly in inverse proportion: weak friction moves the energy as a function
+# of the rate times the time alone. The body begins near its axis of least inertia, and stays there the longer the less
+# the middle moment differs from the least. The spots in the picture are bodies that come near their middle axis, where
+# the motion is slow, and linger.
 
 tau = study.results.tau
 print(f"tau * rate, for the least and the largest rate: {(tau * tau.rate)[25, [0, -1]].values.round(2)}")
