@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Self
@@ -40,6 +41,8 @@ with."""
 DIFFERENCE = 16.0 * EPS
 """What a change of a function may be off, relative to the size at which its values are rounded: a few roundings of
 both."""
+
+VANISHED_LENGTH = math.sqrt(VANISHED)
 
 
 class Law(NamedTuple):
@@ -247,18 +250,18 @@ class ExplicitMethod(OneStepMethod):
             return found if spheres is None else [spheres.along(end, v) for v in found]
 
         def corrected(made: int, d, ends, found) -> tuple:
-            """The displacement at last, what it misses of the levels, and the squares of the directions.
+            """The displacement at last, what it misses of the levels, and the lengths of the directions.
 
-            These are lengths by which what is missed becomes one like d: where parts of a state have units of their
-            own, as entropies beside a momentum, those by which a function changes most in d.
+            These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
+            of their own, as entropies beside a momentum, those by which a function changes most in d.
             """
             missed = misses(d, ends)
             if len(blocks) == 1:
-                squares = jnp.stack([jnp.dot(v, v) for v in found])
+                lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
             else:
-                moved = jnp.sum(d * d)
+                moved = jnp.linalg.norm(d)
                 most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
-                squares = jnp.stack(most) ** 2 / jnp.where(moved > 0.0, moved, 1.0)
+                lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
 
             def again() -> tuple:
                 better = directions(d, ends) if 0 < made < 3 else found  # the last time they are as good as they get
@@ -266,16 +269,15 @@ class ExplicitMethod(OneStepMethod):
                 return corrected(made + 1, nearer, gradients(nearer), better)
 
             if made >= self.corrections:
-                return d, missed, squares
+                return d, missed, lengths
             if made == 0:
                 return again()
             # of a short step one is enough
-            return jax.lax.cond(done(d, missed, squares), lambda: (d, missed, squares), again)
+            return jax.lax.cond(done(d, missed, lengths), lambda: (d, missed, lengths), again)
 
-        def done(d, missed, squares) -> jax.Array:
-            none = squares <= VANISHED
-            share = missed * (missed / jnp.where(none, 1.0, squares))  # no product of four small numbers, which is zero
-            return ((share <= EPS**2 * jnp.dot(d, d)) | none).all()
+        def done(d, missed, lengths) -> jax.Array:
+            small = jnp.abs(missed) <= EPS * lengths * jnp.linalg.norm(d)
+            return (small | (lengths <= VANISHED_LENGTH)).all()
 
         def hidden() -> jax.Array:
             """What rounding of the values may make of what is missed: nothing where there is a closed form."""
@@ -283,10 +285,10 @@ class ExplicitMethod(OneStepMethod):
 
         d = landed(d)
         ends = gradients(d)
-        d, missed, squares = corrected(0, d, ends, directions(d, ends))
-        rounding = jax.lax.cond(done(d, missed, squares), lambda: jnp.zeros_like(missed), hidden)
-        lengths = jnp.sqrt(jnp.where(squares <= VANISHED, 1.0, squares))
-        return d, jnp.max(jnp.where(squares <= VANISHED, 0.0, jnp.maximum(jnp.abs(missed) - rounding, 0.0) / lengths))
+        d, missed, lengths = corrected(0, d, ends, directions(d, ends))
+        rounding = jax.lax.cond(done(d, missed, lengths), lambda: jnp.zeros_like(missed), hidden)
+        vanished, beyond = lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(missed) - rounding, 0.0)
+        return d, jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, lengths)))
 
     def _laws(self, system: System) -> list[Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
