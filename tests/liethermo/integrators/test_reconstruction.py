@@ -229,6 +229,41 @@ def test_friction_inside_keeps_the_momentum_in_space(name, method):
         assert momentum_drift(name, None, method, 50, unfollowed, holds=False) > 1e4 * SPATIAL
 
 
+EVERY = [mf.SO(2), mf.SO(3), mf.SO(4), mf.SO(5), mf.SE(2), mf.SE(3), mf.SU(2), mf.SU(3), mf.SL(2)]
+EVERY += [mf.Sp(1), mf.Sp(2), mf.GL(2), mf.Heisenberg(1), mf.Heisenberg(2)]
+FOLLOWED = {"SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "Sp(1)", "GL(2)", "Heisenberg(1)"}
+FOLLOWED |= {"Heisenberg(2)"}
+"""Groups in which the end of collocation is an adjoint action: see :class:`liethermo.WithAttitude`."""
+
+
+@pytest.mark.sampled("SO(3)", "GL(2)")
+@pytest.mark.parametrize("group", [pytest.param(group, id=group.name) for group in EVERY])
+def test_the_momentum_in_space_of_a_body_that_heats_over_every_group(group):
+    """To rounding, 1e-15 measured, where the group can keep it; else to the order of the method, and so is it told."""
+    n = group.dim
+    root = np.random.default_rng(0).standard_normal((n, n)) / n
+    system = lt.LiePoissonSystem(
+        group.algebra,
+        lt.Quadratic(np.eye(n) + root @ root.T + np.diag(np.linspace(0.0, 1.0, n))),
+        dissipation=lt.DoubleBracket(0.05),
+        group=group,
+        baths=lt.HeatBaths(2.0, 1.5),
+    )
+    start = np.array([0.3, 1.0, -0.7]) if n == 3 else np.random.default_rng(1).standard_normal(n)
+    drifts = []
+    for step in (0.04, 0.02):
+        run = lt.integrate(system, start / np.linalg.norm(start), (0.0, 1.0), step, engine="array")
+        (row,) = [row for row in run.audit().rows if row.law == "drift of momentum in space"]
+        assert row.passed is (True if group.name in FOLLOWED else None)
+        assert np.abs(run.energy - run.energy[0]).max() <= 4e-15 * np.abs(run.energy).max()
+        assert run.entropy[-1] > run.entropy[0] or n == 1  # of SO(2) nothing moves the momentum
+        drifts.append(row.value)
+    if group.name in FOLLOWED:
+        assert max(drifts) < 5e-15
+    else:
+        assert 1e-12 < drifts[1] < 0.3 * drifts[0] < 1e-3
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", [name for name in GROUPS if name not in SURFACES])
 def test_explicit_methods_elsewhere_keep_it_to_their_order(name):
