@@ -168,7 +168,7 @@ class WithAttitude(OneStepMethod):
         if system.pushed_by:
             p, p_low = compensated(system.in_space(x), system.in_space(low) + local.in_space(step))
             if follows:
-                p, p_low = _on_orbit(system.momenta, p, new[:n]), jnp.zeros_like(p)
+                p, p_low = _on_orbit(system.momenta, p, new), jnp.zeros_like(p)
         else:  # that of the start of the run, since the roundings of steps would add up
             p = k[LEVELS, system.body.dim : system.body.dim + n]
         if follows:
@@ -301,13 +301,15 @@ it. A step leaves the square of the misfit, or this share of it."""
 
 
 def _on_orbit(momenta, p, mu) -> jax.Array:
-    """The dual vector next to p that has the Casimirs of mu."""
-    size = jnp.max(jnp.abs(mu))
+    """The dual vector next to p, of the group, that has the Casimirs of a state mu; other momenta of it stay."""
+    n = len(p)
+    size = jnp.max(jnp.abs(mu[:n]))
     size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.casimirs_of_momenta().values()
-    p, mu = p / size, mu / size
+    p, mu = p / size, mu[: momenta.algebra.dim] / size
     for _ in range(TURNS):
-        missed = jnp.stack([C.value(mu) - C.value(p) for C in casimirs])
-        p = p + towards([C.gradient(p) for C in casimirs], missed)
+        whole = jnp.concatenate([p, mu[n:]])
+        missed = jnp.stack([C.value(mu) - C.value(whole) for C in casimirs])
+        p = p + towards([C.gradient(whole)[:n] for C in casimirs], missed)
     return size * p
 
 

@@ -81,6 +81,28 @@ def test_the_ledger_and_the_impulse(torque, method):
     assert "change of mu1**2 + mu2**2 + mu3**2" in str(run.audit())
 
 
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("method", ["midpoint", "gauss2", "rk4"])
+def test_a_torque_on_a_body_with_a_wheel(method):
+    """On so(3) + R with the group of the first: the momentum in space is that of the first three components."""
+    inverse = np.zeros((4, 4))
+    inverse[:3, :3] = np.diag(1.0 / (INERTIA - [0.0, 0.1, 0.0]))
+    inverse[3, 3] = 10.0 + inverse[1, 1]
+    inverse[1, 3] = inverse[3, 1] = -inverse[1, 1]
+    gravity = TORQUES["gravity gradient"]
+    system = lt.LiePoissonSystem(
+        mf.direct_sum(mf.so(3), mf.abelian(1)),
+        lt.Quadratic(inverse),
+        torque=lambda t, mu, attitude: jnp.append(gravity(t, mu, attitude), 0.0),
+        group=SO3,
+    )
+    run = lt.integrate(system, [*START, 0.02], SPAN, 0.05, METHODS[method], engine="compiled")
+    assert run.audit().passed, run.audit()
+    assert run.audit().energy_drift <= LAW
+    assert row(run, "drift of momentum in space less the impulse").value <= LAW
+    assert np.ptp(run.casimirs["work"]) > 0.01
+
+
 def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     """Control: the power of a torque by the gradient of H where it acts, and not by the discrete one of the step."""
     energy = lambda mu: jnp.sum(mu**2 / INERTIA) / 2 + 0.1 * jnp.sum(mu**4)  # noqa: E731
