@@ -297,7 +297,7 @@ def _missing(group, g) -> jax.Array:
 
 TURNS, DAMPING = 3, 1e-8
 """Newton steps of :func:`_carrying`, and what is added to the diagonal of a matrix that may be singular, relative to
-it. A step leaves the square of the misfit, or this share of it."""
+its largest entry. A step leaves the square of the misfit, or this share of it."""
 
 
 def _on_orbit(momenta, p, mu) -> jax.Array:
@@ -325,9 +325,9 @@ def _carrying(group, g, p, new) -> jax.Array:
         m = group.Ad_star(g, p)
         missed, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
         square = moved @ moved.T
-        diagonal = jnp.diagonal(square)
-        damping = jnp.where(diagonal > 0.0, DAMPING * diagonal, 1.0)  # what does not move m does not turn either
-        eta = solve_near_identity(square + jnp.diag(damping), (moved @ missed)[:, None])[:, 0]
+        most = jnp.max(jnp.diagonal(square))
+        damping = jnp.where(most > 0.0, DAMPING * most, 1.0)  # what moves m by rounding alone does not turn either
+        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (moved @ missed)[:, None])[:, 0]
         g = g @ group.exp_map(algebra, eta)
         if made == TURNS:
             return g

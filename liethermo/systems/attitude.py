@@ -213,7 +213,7 @@ class AttitudeSystem(System):
     @property
     def blocks(self):
         n, m = self.body.dim, self.dim - (self.group.dim if self.pushed_by else 0)
-        return *self.body.blocks, slice(n, m), *([slice(m, None)] if m < self.dim else [])
+        return *_bounded(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
         return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
@@ -232,6 +232,11 @@ class AttitudeSystem(System):
     @property
     def _parts(self) -> int:
         return 2 if jnp.iscomplexobj(self.group.identity) else 1
+
+
+def _bounded(body: System) -> list[slice]:
+    """The blocks of the states of a body, as those of the first part of longer states."""
+    return [slice(*block.indices(body.dim)) for block in body.blocks]
 
 
 def _at_states(function: Callable, system: AttitudeSystem, x):
@@ -310,7 +315,7 @@ class TurningSystem(System):
     @property
     def blocks(self):
         n, m = self.whole.body.dim, self.whole.body.dim + self.whole.group.dim
-        return *self.whole.body.blocks, slice(n, m), *([slice(m, None)] if self.pushed_by else [])
+        return *_bounded(self.whole.body), slice(n, m), *([slice(m, None)] if self.pushed_by else [])
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
