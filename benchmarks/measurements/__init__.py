@@ -4,6 +4,7 @@ NAMES = (
     "single_body",
     "isolated_body",
     "general",
+    "functions",
     "variational",
     "spin",
     "fluids",

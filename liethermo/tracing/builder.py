@@ -135,6 +135,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
             np.float64(np.float32(a)) if np.ndim(a) == 0 else np.asarray(a, np.float32).astype(np.float64)
         ),
         "pick": _picked,
+        "lookup": lambda place, table: _picked(place, *table),
         "item": lambda results, i: results[i],
         "column": lambda results, start, length: results[start : start + length],
         "table": lambda *entries: list(entries),
@@ -153,6 +154,9 @@ TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 
 OF_TESTS = {"and", "or", "xor", "not", "branch"}
 """Those on truth values."""
+
+FEW = 16
+"""Entries among which one is picked by choices; more are a table."""
 
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
@@ -314,7 +318,11 @@ class Builder:
         if type(place) is not str:
             return entries[min(max(place, 0), len(entries) - 1)]
         alike = all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries)
-        return entries[0] if alike else self.op("pick", place, *entries)
+        if alike:
+            return entries[0]
+        return (
+            self.op("pick", place, *entries) if len(entries) <= FEW else self.op("lookup", place, self.table(entries))
+        )
 
     def conj(self, a):
         """Its complex conjugate: itself."""

@@ -254,8 +254,10 @@ def kinds_of(instructions: Sequence[Instruction]) -> dict[Scalar, str]:
     for target, op, args in instructions:
         if isinstance(op, Block):
             blocks[target] = op
-        elif op == "item":
+        elif op in ("item", "column"):
             kinds[target] = blocks[args[0]].kinds[int(args[1])]
+        elif op == "lookup":
+            kinds[target] = kinds[args[1]]
         elif op in TESTS or op == "branch":
             kinds[target] = "b"
         elif op in ("int", "truncate", "quotient", "wrap"):
@@ -268,7 +270,7 @@ def kinds_of(instructions: Sequence[Instruction]) -> dict[Scalar, str]:
     return kinds
 
 
-KEEPING = frozenset("add sub mul neg max min abs sign rem select pick".split())
+KEEPING = frozenset("add sub mul neg max min abs sign rem select pick table".split())
 """Operations whose results are of the kind of their arguments."""
 
 

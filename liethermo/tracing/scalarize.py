@@ -311,7 +311,7 @@ def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
     return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
 
 
-LONG, SHORT = 4_000, 32
+LONG, SHORT = 500, 32
 """Instructions of an unrolled loop from which it stays a loop; and passes up to which it never does."""
 
 

@@ -31,11 +31,16 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> Results:
     return _call(writer, block, args)
 
 
+def inside(writer: Any, place: ir.Value, length: int) -> ir.Value:
+    """A place, or the nearest one of a table of some length."""
+    build, last = writer.builder, writer.constant(length - 1)
+    place = build.select(build.icmp_signed("<", place, writer.constant(0)), writer.constant(0), place)
+    return build.select(build.icmp_signed(">", place, last), last, place)
+
+
 def picked(writer: Any, place: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
     """The entry at a place, by the bits of its number: of one that lies outside the nearest."""
-    build, last = writer.builder, writer.constant(len(entries) - 1)
-    place = build.select(build.icmp_signed("<", place, writer.constant(0)), writer.constant(0), place)
-    place = build.select(build.icmp_signed(">", place, last), last, place)
+    build, place = writer.builder, inside(writer, place, len(entries))
     entries, bit = list(entries), 0
     while len(entries) > 1:
         odd = build.trunc(build.lshr(place, writer.constant(bit)), writer.test)
@@ -99,6 +104,7 @@ class Table:
 
     def __init__(self, writer: Any, kind: ir.Type, values: Sequence[ir.Value] = (), length: int = 0):
         self.build, self.kind, self.writer = writer.builder, kind, writer
+        self.length = max(len(values), length)
         self.widened = writer.kinds["i"] if kind == writer.kinds["b"] else None  # bits are awkward in memory
         if values and not self.widened and all(isinstance(value, ir.Constant) for value in values):
             rows, module = ir.ArrayType(self.kind, len(values)), self.build.module
@@ -107,13 +113,28 @@ class Table:
             self.start = self.build.bitcast(fixed, self.kind.as_pointer())
             return
         with self.build.goto_entry_block():
-            self.start = self.build.alloca(self.widened or self.kind, max(len(values), length))
+            self.start = self.build.alloca(self.widened or self.kind, self.length)
         for i, value in enumerate(values):
             self.write(writer.whole_number(i), value)
 
     def read(self, i: ir.Value) -> ir.Value:
         found = self.build.load(self.build.gep(self.start, [i]))
         return self.build.trunc(found, self.kind) if self.widened else found
+
+    def of_each_lane(self, places: ir.Value) -> ir.Value:
+        """What each lane has at a place of its own, or at the nearest."""
+        build, lanes, places = self.build, self.writer.lanes, inside(self.writer, places, self.length)
+        if lanes == 1:
+            return self.read(places)
+        kind = self.widened or self.kind
+        start = build.bitcast(self.start, kind.element.as_pointer())
+        found = ir.Constant(kind, ir.Undefined)
+        for lane in range(lanes):
+            at = ir.Constant(PLACE, lane)
+            own = build.mul(build.extract_element(places, at), self.writer.whole_number(lanes))
+            value = build.load(build.gep(start, [build.add(own, self.writer.whole_number(lane))]))
+            found = build.insert_element(found, value, at)
+        return build.trunc(found, self.kind) if self.widened else found
 
     def write(self, i: ir.Value, value: ir.Value) -> None:
         value = self.build.zext(value, self.widened) if self.widened else value

@@ -300,6 +300,9 @@ class _Written:
                 table(writer, [self.value(a) for a in args]) if whole else self.blocks[args[0]].column(int(args[1]))
             )
             return
+        if op == "lookup":
+            self.values[target] = self.tables[args[1]].of_each_lane(self.value(args[0]))
+            return
         if op == "wrap":
             self.values[target] = writer.wrapped(self.value(args[0]), int(args[1]), bool(args[2]))
             return

@@ -261,6 +261,14 @@ LOOPS = {
 }  # fmt: skip
 
 INDICES = {
+    "gather, among many": (
+        lambda a: [
+            jnp.interp(a, jnp.linspace(-3.0, 3.0, 40), jnp.sin(jnp.linspace(-3.0, 3.0, 40))),
+            jnp.outer(a, a).ravel()[jnp.argsort(a)],
+            (jnp.outer(a, a).ravel() > 0.0)[5 * jnp.argsort(a)],
+        ],
+        w,
+    ),
     "gather, at run time": (
         both(
             lambda a, b: [
