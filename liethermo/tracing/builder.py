@@ -399,9 +399,7 @@ def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray
 
 
 def integers(x: np.ndarray) -> np.ndarray:
-    """An array of scalars as the integers they must be to serve as indices."""
-    if any(type(i) is str for i in x.flat):
-        raise NotImplementedError("with indices known only at run time")
+    """An array of indices that are known: see :mod:`.indexing` for others."""
     return x.astype(np.int64)
 
 

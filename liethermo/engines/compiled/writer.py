@@ -153,14 +153,7 @@ class Writer:
         skip = ir.Constant(ir.IntType(32), 0)
         kinds = [NUMBER] * SPECIAL[op][1] + [skip.type]
         function = declared(self.builder.module, op, NUMBER, kinds)
-        if self.lanes == 1:
-            return self.builder.call(function, [*args, skip])
-        result = ir.Constant(self.number, ir.Undefined)
-        for lane in range(self.lanes):
-            place = ir.Constant(ir.IntType(32), lane)
-            own = [self.builder.extract_element(a, place) for a in args]
-            result = self.builder.insert_element(result, self.builder.call(function, [*own, skip]), place)
-        return result
+        return self._by_lanes(lambda own: self.builder.call(function, [*own, skip]), args)
 
     def fused(self, op: str, place: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]) -> ir.Value:
         """A sum or difference whose term at a place is a product."""
@@ -237,13 +230,16 @@ class Writer:
         return self.builder.call(self._declared(name, result, args), args)
 
     def of_each_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
+        return self._by_lanes(lambda own: self.builder.call(self._declared(name, NUMBER, own), own), args)
+
+    def _by_lanes(self, call: Callable[[Sequence[ir.Value]], ir.Value], args: Sequence[ir.Value]) -> ir.Value:
+        """What a call for one number makes of each lane."""
         if self.lanes == 1:
-            return self.builder.call(self._declared(name, NUMBER, args), args)
+            return call(args)
         result = ir.Constant(self.number, ir.Undefined)
         for lane in range(self.lanes):
             place = ir.Constant(ir.IntType(32), lane)
-            own = [self.builder.extract_element(a, place) for a in args]
-            found = self.builder.call(self._declared(name, NUMBER, own), own)
+            found = call([self.builder.extract_element(a, place) for a in args])
             result = self.builder.insert_element(result, found, place)
         return result
 
