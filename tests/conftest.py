@@ -5,6 +5,7 @@ examples each time, and prints how to repeat one that fails.
 """
 
 import gc
+import os
 import resource
 from collections import defaultdict
 from pathlib import Path
@@ -25,9 +26,24 @@ gc.set_threshold(200_000, 20, 100)
 """Tracing makes many small objects that live: looking through them ever again costs a tenth of the time."""
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_configure(config):
     slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
     hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
+    if hasattr(config, "cache"):
+        _keep_what_is_compiled(config.cache.mkdir("compiled"))
+
+
+def _keep_what_is_compiled(folder: Path) -> None:
+    """By XLA and by the library, for later runs and for all processes of this one; ``--cache-clear`` forgets it."""
+    os.environ["LIETHERMO_CACHE"] = str(folder / "liethermo")
+    for name, value in {
+        "jax_compilation_cache_dir": str(folder / "xla"),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }.items():
+        os.environ[name.upper()] = str(value)  # for processes that a test starts
+        jax.config.update(name, value)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -82,15 +98,6 @@ def pytest_make_collect_report(collector):
             f"{collector.nodeid} compiles {count} programs when it is read, more than {COMPILED_BY_READING}: "
             "build systems where they are used (tests.cases.BuiltOnUse, functools.cache)"
         )
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _own_cache(tmp_path_factory):
-    """Compiled modules of this test run, for all its processes."""
-    with pytest.MonkeyPatch.context() as patch:
-        base = tmp_path_factory.getbasetemp()
-        patch.setenv("LIETHERMO_CACHE", str((base.parent if base.name.startswith("popen") else base) / "liethermo"))
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -27,11 +27,6 @@ from liethermo.engines.rules import RULES
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path_factory.getbasetemp() / "liethermo"))
-
-
 @pytest.fixture
 def bare(monkeypatch):
     """A machine without a C compiler and without the peers that the library does not need itself."""

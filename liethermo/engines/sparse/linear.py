@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -154,27 +154,16 @@ def _widest_level(pattern: scipy.sparse.csr_array) -> int:
 def _coloured(pattern: scipy.sparse.csr_array) -> np.ndarray:
     """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
     columnwise = scipy.sparse.csc_array(pattern)
-    return _compiled_greedy()(pattern.indptr, pattern.indices, columnwise.indptr, columnwise.indices)
-
-
-@functools.cache
-def _compiled_greedy() -> Callable:
-    from numba import njit  # which takes a while to import and is not always needed
-
-    return njit(_greedy)
-
-
-def _greedy(starts, columns, column_starts, rows):
-    n = len(column_starts) - 1
-    colour = np.full(n, -1)
-    taken = np.full(n + 1, -1)  # taken[c] == j: a column that j shares a row with has the colour c
-    for j in range(n):
-        for i in rows[column_starts[j] : column_starts[j + 1]]:
-            for other in columns[starts[i] : starts[i + 1]]:
-                if colour[other] >= 0:
-                    taken[colour[other]] = j
-        free = 0
-        while taken[free] == j:
-            free += 1
-        colour[j] = free
-    return colour
+    rows = columnwise.indices.tolist()
+    taken = [0] * pattern.shape[0]  # by each row: a bit for every colour that one of its columns has
+    colours = []
+    for start, end in itertools.pairwise(columnwise.indptr.tolist()):
+        of_column = rows[start:end]
+        used = 0
+        for row in of_column:
+            used |= taken[row]
+        free = ~used & (used + 1)  # the lowest bit that is not set
+        for row in of_column:
+            taken[row] |= free
+        colours.append(free.bit_length() - 1)
+    return np.array(colours, dtype=int)
