@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 
 from manifolds.matrices.linear import inverse
 
@@ -120,13 +122,16 @@ def solve_stages(
     first = fixed_point(slopes, guess, scale, rules)
     # a branch, since what is carried to a loop, and back, is copied
     return jax.lax.cond(
-        first.converged, lambda: first, lambda: _by_newton(slopes, guess, scale, inverted, noise, rules, first)
+        first.converged, lambda: first, lambda: by_newton(slopes, guess, scale, inverted, noise, rules, first)
     )
 
 
-def _by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solved) -> Solved:
+def by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solved | None = None) -> Solved:
     """The second attempt; of trajectories side by side it does nothing for those that the first has solved."""
-    measure, done, size = rules.size(guess.shape[-1]), first.converged, noise()
+    measure, size = rules.size(guess.shape[-1]), noise()
+    done, iterations = (
+        (False, jnp.zeros((), dtype=jnp.int64)) if first is None else (first.converged, first.fixed_point)
+    )
 
     def misfit(k):
         return slopes(k) - k
@@ -135,7 +140,7 @@ def _by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solve
         return (s.made >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
 
     def unsolved(s: Iteration, found):
-        return ~done & ~s.settled(scale(s.k), rules, measure(found), size)
+        return jnp.logical_not(done) & ~s.settled(scale(s.k), rules, measure(found), size)
 
     def improved(k, step, size, plateau, damped):
         """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
@@ -183,7 +188,7 @@ def _by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solve
     s, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
     converged = ~unsolved(s, found) & jnp.isfinite(jnp.sum(s.k))
     size = jnp.where(s.settled(scale(s.k), rules), 0.0, size)
-    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, first.fixed_point, s.made, size)
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, iterations, s.made, size)
 
 
 def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -191,22 +196,38 @@ def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Arr
 
     Far out Newton may wander.
     """
-    starts = jnp.stack([guess, jnp.zeros_like(guess)])
-    found = jax.lax.map(misfit, starts)
-    predicted = jnp.linalg.norm(found[0]) <= jnp.linalg.norm(found[1])
-    return jnp.where(predicted, starts[0], starts[1]), jnp.where(predicted, found[0], found[1])
+    rest, none = jnp.zeros_like(guess), jnp.zeros((), dtype=jnp.int64)
+
+    def tried(carry):
+        tries, k, found, size = carry
+        start = jnp.where(tries == 0, rest, guess)
+        missed = misfit(start)
+        new = jnp.linalg.norm(missed)
+        better = (tries == 0) | (new <= size)
+        return tries + 1, *(jnp.where(better, a, b) for a, b in ((start, k), (missed, found), (new, size)))
+
+    # a loop, so that programs hold the equations once
+    return jax.lax.while_loop(lambda carry: carry[0] < 2, tried, (none, rest, rest, jnp.zeros(())))[1:3]
 
 
-@jax.custom_batching.custom_vmap
-def _inverse(matrix):
-    """For Newton's method, which corrects what an inverse loses."""
-    return jnp.linalg.inv(matrix)
+_inverse = Primitive("inverse")
+"""The inverse of a square matrix, for Newton's method, which corrects what it loses."""
 
 
-@_inverse.def_vmap
-def _inverses(axis_size, batched, matrices):
+@_inverse.def_abstract_eval
+def _same_shape(matrix):
+    return jax.core.ShapedArray(matrix.shape, matrix.dtype)
+
+
+def _inverses(arguments, axes):
     # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrices.linear.solve
-    return inverse(matrices), True
+    (matrices,), (axis,) = arguments, axes
+    return inverse(jnp.moveaxis(matrices, axis, 0)), 0
+
+
+_inverse.def_impl(jnp.linalg.inv)
+batching.primitive_batchers[_inverse] = _inverses
+mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results=False))
 
 
 def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules = RULES) -> Solved:
@@ -219,14 +240,24 @@ def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules =
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
 
 
-def newton_steps(system: System, method: OneStepMethod, x, low, h, rules: Rules = RULES) -> Callable:
-    """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there."""
+def newton_steps(
+    system: System, method: OneStepMethod, x, low, h, rules: Rules = RULES, columns: Callable | None = None
+) -> Callable:
+    """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there.
+
+    ``columns``, of a linear function and vectors, makes the columns of a Jacobian matrix that the method leaves to
+    others; by default it is the method's own.
+    """
 
     def linearised(k) -> Callable:
-        if k.shape[-1] > rules.large:
+        if columns is None and k.shape[-1] <= rules.large:
+            matrix = method.jacobian(system, x, low, h, k)
+        else:
             product = jax.linearize(lambda d: method.change(system, x, low, h, k, d), jnp.zeros_like(k))[1]
-            return lambda found: krylov(product, found, rules)
-        inverse = _inverse(method.jacobian(system, x, low, h, k))
+            if columns is None:
+                return lambda found: krylov(product, found, rules)
+            matrix = columns(lambda d: product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)).T
+        inverse = _inverse.bind(matrix)
         return lambda found: (inverse @ found.ravel()).reshape(k.shape)
 
     return linearised

@@ -113,23 +113,24 @@ def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rul
         solved = explicit(system, method, state.x, state.low, h, state.k, rules)
     else:
         inverted = newton_steps(system, method, state.x, state.low, h, rules)
-        solved = solve_stages(*equations(system, method, state, h, rules), inverted, noise, rules)
+        given = state.x, state.low, h, state.k, state.before
+        solved = solve_stages(*equations(system, method, *given, rules), inverted, noise, rules)
     return back(conclude(system, method, state, h, solved, rules))
 
 
 def equations(
-    system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES
+    system: System, method: OneStepMethod, x, low, h, k, before, rules: Rules = RULES
 ) -> tuple[Callable, jax.Array, Callable]:
     """What a step has to solve, ``k = slopes(k)``: the slopes, a guess of k, and the size of what is rounded."""
 
+    own = method.judged(system, x)[1]
+    measure = rules.size(own.size)
+    whole = measure(own) / h  # once a step
+
     def slopes(k):
-        return method.slopes(system, state.x, state.low, h, k)
+        return method.slopes(system, x, low, h, k)
 
-    x = method.judged(system, state.x)[1]
-    measure = rules.size(x.size)
-    whole = measure(x) / h  # once a step
-
-    return slopes, method.predict(state.k, state.before), lambda k: whole + measure(k) + rules.vanished
+    return slopes, method.predict(k, before), lambda k: whole + measure(k) + rules.vanished
 
 
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved, rules: Rules = RULES) -> State:

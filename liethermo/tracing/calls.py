@@ -121,6 +121,7 @@ FUNCTIONS = {
         lambda n: [((n, n), False), ((n,), True)],
         lambda sizes, a: scipy.linalg.eigh(a, driver="evd")[::-1],
     ),
+    "inverse": Function(lambda n: [(n, n)], lambda n: [((n, n), False)], lambda sizes, a: [np.linalg.inv(a)]),
     "lu": Function(lambda m, n: [(m, n)], lambda m, n: [((m, n), False), ((min(m, n),), True)], _lu),
     "qr": Function(
         lambda m, n, columns: [(m, n)],
@@ -132,6 +133,7 @@ FUNCTIONS = {
         lambda m, k, n: [(m, k), (k, n)], lambda m, k, n: [((m, n), False)], lambda sizes, a, b: [a @ b]
     ),
 }
-"""``eigh``: eigenvectors and eigenvalues, from the lower triangle; ``lu``: factors in one matrix, and the row that each
+"""``eigh``: eigenvectors and eigenvalues, from the lower triangle; ``inverse``, NaN of a singular
+matrix; ``lu``: factors in one matrix, and the row that each
 row is exchanged with; ``qr``: with as many columns as are asked for; ``svd``: singular values, left vectors, and right
 ones as rows; ``matmul``: the product of real matrices."""

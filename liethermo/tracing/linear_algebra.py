@@ -124,6 +124,11 @@ def lu(b, eqn, a):
     return _each(b, eqn, a, of_one)
 
 
+def inverse(b, eqn, a):
+    """The primitive is the library's own: see :func:`..engines.stages.newton_steps`."""
+    return _each(b, eqn, a, lambda x: called(b, "inverse", (len(x),), x))
+
+
 def qr(b, eqn, a):
     if eqn.params["pivoting"]:
         raise NotImplementedError("with pivoting")

@@ -353,6 +353,7 @@ RULES: dict[str, Rule] = {
     "conj": lambda b, eqn, x: elementwise(b.conj, x),
     "complex": lambda b, eqn, x, y: elementwise(Pair, x, y),
     "eigh": algebra.eigh,
+    "inverse": algebra.inverse,
     "lu": algebra.lu,
     "qr": algebra.qr,
     "svd": algebra.svd,

@@ -311,15 +311,16 @@ def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
     return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
 
 
-LONG, SHORT = 500, 32
-"""Instructions of an unrolled loop from which it stays a loop; and passes up to which it never does."""
+LONG, SHORT, HEAVY = 500, 32, 20_000
+"""Instructions of an unrolled loop from which it stays a loop; passes up to which it is short, and instructions from
+which a short one stays a loop: what is known of single passes, such as zeros, makes unrolled code the faster one."""
 
 
 def _scan(b, eqn, *arguments):
     """A loop of known length: unrolled, or kept where it is long."""
     params = eqn.params
     inner, consts, carried = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
-    if params["length"] > SHORT:
+    if params["length"] > 2:
         kept = _kept_scan(b, eqn, arguments[:consts], arguments[consts:carried], arguments[carried:])
         if kept is not None:
             return kept
@@ -352,7 +353,7 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
         own, results = inside.unrolled(b.limit, closed, [*given, *carried.arrays, *row])
         if not carried.released(results[: len(start)]):
             break
-    if len(own.instructions) * length <= LONG:
+    if len(own.instructions) * length <= (LONG if length > SHORT else HEAVY):
         return None
     moving, new, made = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
     inputs = [

@@ -22,7 +22,7 @@ NUMBERS = NUMBER.as_pointer()
 PREFIX = "liethermo_"
 """How the names of functions begin that are bound here."""
 
-ROUTINES = "dsyevd zheevd dgetrf zgetrf dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
+ROUTINES = "dsyevd zheevd dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
 
 SPECIAL = {
     "lgamma": ("gammaln", 1),
@@ -120,6 +120,17 @@ class _Kernel:
         for i in self._range(least):  # LAPACK counts from one
             place = self.build.sub(self.build.load(self.build.gep(pivots, [i])), ir.Constant(INTEGER, 1))
             self.build.store(self.build.sitofp(place, NUMBER), self._out(1, i))
+
+    def _inverse(self, n: int) -> None:
+        z, a, rows, pivots = self.call.is_complex, self._entered(0, n, n), self._integer(n), self._integers(n)
+        size = 64 * n
+        first = [rows, rows, a, rows, pivots]
+
+        def invert() -> None:
+            rest = [rows, a, rows, pivots, self._numbers(size * self.parts), self._integer(size)]
+            self._checked("zgetri" if z else "dgetri", rest, lambda: self._leave(0, a, n, n))
+
+        self._checked("zgetrf" if z else "dgetrf", first, invert)
 
     def _qr(self, m: int, n: int, columns: int) -> None:
         least, width, z = min(m, n), max(n, columns), self.call.is_complex

@@ -23,12 +23,12 @@ from ...tracing.remembered import Latest, remembered
 from ...tracing.scalarize import scalarize
 from ..array import portion_of
 from ..rules import RULES, Rules
-from ..stages import Iteration, Solved, explicit, scale_of
-from ..stepping import State, conclude, first_state
+from ..stages import Iteration, Solved, by_newton, explicit, newton_steps, noise_of, scale_of
+from ..stepping import State, conclude, equations, first_state
 from .form import Form, numbers_of
-from .loop import Layout, Piece, step_loop
+from .loop import SOLVED, Layout, Piece, step_loop
 from .machine_code import MachineCode
-from .newton import newton_pieces, solver
+from .newton import solver
 
 FIELDS = State._fields
 ITERATION = ("guess", "update", "best", "stalled", "previous", "made")
@@ -157,11 +157,18 @@ class Stepper:
             solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
             return conclude(*driven(p, dW), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
 
-        self._both, self._driven, self._scale = both, driven, scale
+        def newton(p, dW, x, low, h, k, before):
+            system, method = driven(p, dW)
+            given = equations(system, method, x, low, h, k, before, rules)
+            inverted = newton_steps(system, method, x, low, h, rules, jax.lax.map)
+            found = by_newton(*given, inverted, lambda: noise_of(system, method, x, rules), rules)
+            return found.k, found.residual, found.converged, found.defined, found.newton, found.noise
+
+        self._both, self._by_newton = both, newton
         self._explicit, self._increments = method.explicit, method.increments
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
         self._shapes["dW"] = (method.increments,)
-        self._shapes |= dict.fromkeys(("k", "guess", "old", "new", "direction", "changes"), (stages, unknowns))
+        self._shapes |= dict.fromkeys(("k", "guess"), (stages, unknowns))
         self._shapes["before"] = (0 if method.explicit else stages, unknowns)
 
         after = ("converged", "going")
@@ -358,11 +365,8 @@ class Stepper:
         """The address of Newton's method, which is compiled when a step first needs it."""
         with self._lock:
             if self._newton is None:
-                pieces = newton_pieces(self._both, self._driven, self._scale, self._piece, self._rules)
-                linear = {"linear": pieces["linearise"].program.shapes[0]}
-                names = {name for piece in pieces.values() for name in (*piece.arguments, *piece.results)} - {"p"}
-                shapes = {name: self._shapes.get(name, ()) for name in sorted(names)} | linear
-                self._newton = solver(pieces, shapes, self._layout, self._varies, self.lanes)
+                piece = self._piece(self._by_newton, "p dW x low h k before", SOLVED)
+                self._newton = solver(piece, self._layout, self._varies, self.lanes)
             return self._newton.address("solve")
 
 

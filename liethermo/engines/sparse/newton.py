@@ -167,7 +167,12 @@ class SparseEngine:
 
 @program
 def _fixed_point(system: System, method: OneStepMethod, state: State, h) -> Solved:
-    return fixed_point(*equations(system, method, state, h, PATIENT), rules=PATIENT)
+    slopes, guess, scale = _given(system, method, state, h)
+    return fixed_point(slopes, guess, scale, PATIENT)
+
+
+def _given(system: System, method: OneStepMethod, state: State, h):
+    return equations(system, method, state.x, state.low, h, state.k, state.before, PATIENT)
 
 
 @program
@@ -180,7 +185,7 @@ def _equations(system: System, method: OneStepMethod, state: State, h):
 
     With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
     """
-    slopes, guess, scale = equations(system, method, state, h, PATIENT)
+    slopes, guess, scale = _given(system, method, state, h)
 
     def misfit(k):
         middle = state.x + (state.low + 0.5 * method.increment(h, k))

@@ -148,7 +148,7 @@ def test_parameters_are_arguments(monkeypatch):
 
 def unsupported():
     def energy(mu):
-        return jnp.sum(jnp.sort(mu) ** 2 * jnp.array([1.0, 2.0, 3.0]))
+        return jnp.sum(jnp.abs(jnp.fft.fft(mu)) ** 2 * jnp.array([1.0, 2.0, 3.0]))
 
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), validate=False)
 
@@ -170,7 +170,7 @@ def slope_of_fourth_power(mu):
 @slope_of_fourth_power.defjvp
 def _slope_rule(primals, tangents):
     ((mu,), (d,)) = primals, tangents
-    return mu**3, 3.0 * mu**2 * d + 0.0 * jnp.sum(jnp.sort(mu))
+    return mu**3, 3.0 * mu**2 * d + 0.0 * jnp.sum(jnp.fft.fft(mu).real)
 
 
 @jax.custom_jvp
