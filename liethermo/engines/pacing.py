@@ -191,10 +191,12 @@ def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
     return jnp.where(done < full, pace.wish, last), jnp.where(arrives, pace.stop, pace.base + (done + 1.0) * pace.wish)
 
 
-def attempted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, rules: Rules = RULES) -> Pace:
-    """One attempt."""
+def attempted(
+    system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, rules: Rules = RULES, second=None
+) -> Pace:
+    """One attempt; ``second`` as for :func:`.stepping.take_step`."""
     h, reached = fitted(pacing, pace)
-    return judged(system, method, pacing, pace, h, reached, take_step(system, method, pace.state, h, rules))
+    return judged(system, method, pacing, pace, h, reached, take_step(system, method, pace.state, h, rules, second))
 
 
 def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h, reached, new: State) -> Pace:

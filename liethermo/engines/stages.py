@@ -41,6 +41,16 @@ class Solved(NamedTuple):
     noise: jax.Array
 
 
+class Equations(NamedTuple):
+    """What a step has to solve, ``k = slopes(k)``, and what is needed for it."""
+
+    slopes: Callable
+    guess: jax.Array
+    scale: Callable  # from k to the size that the plateau is measured against
+    inverted: Callable  # from k to a function from ``slopes - k`` to what Newton's method takes off k
+    noise: Callable = lambda: jnp.zeros(())  # the size at which the slopes are rounded, where it has to be known
+
+
 class Iteration(NamedTuple):
     """An iteration on the stage equations under way."""
 
@@ -88,14 +98,15 @@ class Iteration(NamedTuple):
         return settled & finite, ~settled & ~slow & finite & (self.made < rules.fixed_point)
 
 
-def fixed_point(slopes: Callable, guess: jax.Array, scale: Callable, rules: Rules = RULES) -> Solved:
-    """The first attempt on ``k = slopes(k)``: fixed-point iteration, given up where it is slow."""
+def fixed_point(equations: Equations, rules: Rules = RULES) -> Solved:
+    """The first attempt: fixed-point iteration, given up where it is slow."""
 
-    def goes_on(s: Iteration):
-        return (s.made == 0) | s.stands(scale(s.k), rules)[1]
+    def iterate(carry):
+        s = carry[0].after(equations.slopes(carry[0].k), rules)
+        return s, *s.stands(equations.scale(s.k), rules)
 
-    s = jax.lax.while_loop(goes_on, lambda s: s.after(slopes(s.k), rules), Iteration.begin(guess))
-    converged = s.stands(scale(s.k), rules)[0]
+    begin = Iteration.begin(equations.guess), jnp.asarray(False), jnp.asarray(True)
+    s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, begin)
     return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), jnp.zeros(()))
 
 
@@ -105,33 +116,18 @@ def noise_of(system: System, method: OneStepMethod, x, rules: Rules = RULES) -> 
     return rules.size(x.size)(with_rounding(system.vector_field, x)[1])
 
 
-def solve_stages(
-    slopes: Callable,
-    guess: jax.Array,
-    scale: Callable,
-    inverted: Callable,
-    noise: Callable = lambda: jnp.zeros(()),
-    rules: Rules = RULES,
-) -> Solved:
-    """Solve ``k = slopes(k)`` from ``guess``.
-
-    ``scale(k)`` is the size that the plateau is measured against, ``inverted(k)`` a function from ``slopes - k`` to
-    what Newton's method takes off k, and ``noise()`` the size at which the slopes are rounded, asked for where
-    fixed-point iteration fails.
-    """
-    first = fixed_point(slopes, guess, scale, rules)
+def solve_stages(equations: Equations, rules: Rules = RULES) -> Solved:
+    """The solution by either attempt."""
+    first = fixed_point(equations, rules)
     # a branch, since what is carried to a loop, and back, is copied
-    return jax.lax.cond(
-        first.converged, lambda: first, lambda: by_newton(slopes, guess, scale, inverted, noise, rules, first)
-    )
+    return jax.lax.cond(first.converged, lambda: first, lambda: by_newton(equations, rules, first))
 
 
-def by_newton(slopes, guess, scale, inverted, noise, rules: Rules, first: Solved | None = None) -> Solved:
+def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -> Solved:
     """The second attempt; of trajectories side by side it does nothing for those that the first has solved."""
-    measure, size = rules.size(guess.shape[-1]), noise()
-    done, iterations = (
-        (False, jnp.zeros((), dtype=jnp.int64)) if first is None else (first.converged, first.fixed_point)
-    )
+    slopes, guess, scale, inverted, noise = equations
+    measure, size, none = rules.size(guess.shape[-1]), noise(), jnp.zeros((), dtype=jnp.int64)
+    done, iterations = (False, none) if first is None else (first.converged, first.fixed_point)
 
     def misfit(k):
         return slopes(k) - k

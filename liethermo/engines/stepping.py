@@ -13,7 +13,7 @@ from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
 from .rules import EPS, RULES, Rules
-from .stages import Solved, explicit, newton_steps, noise_of, solve_stages
+from .stages import Equations, Solved, explicit, fixed_point, newton_steps, noise_of, solve_stages
 
 
 class State(NamedTuple):
@@ -102,35 +102,39 @@ def in_order(
     return found.system, method.pulled(found), turned(state, found.there), lambda s: turned(s, found.back)
 
 
-def take_step(system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES) -> State:
-    """One step; where it fails the state is left as it was, with a status."""
+def take_step(
+    system: System, method: OneStepMethod, state: State, h, rules: Rules = RULES, second: Callable | None = None
+) -> State:
+    """One step; where it fails the state is left as it was, with a status.
+
+    ``second(first, x, low, h, k, before)`` is asked in place of Newton's method, with what the first attempt on the
+    equations has come to, by an engine that has it elsewhere.
+    """
     system, method, state, back = in_order(system, method, state, rules)
-
-    def noise():
-        return noise_of(system, method, state.x, rules)
-
+    given = state.x, state.low, h, state.k, state.before
     if method.explicit:
-        solved = explicit(system, method, state.x, state.low, h, state.k, rules)
+        solved = explicit(system, method, *given[:4], rules)
+    elif second is None:
+        solved = solve_stages(equations(system, method, *given, rules), rules)
     else:
-        inverted = newton_steps(system, method, state.x, state.low, h, rules)
-        given = state.x, state.low, h, state.k, state.before
-        solved = solve_stages(*equations(system, method, *given, rules), inverted, noise, rules)
+        solved = second(fixed_point(equations(system, method, *given, rules), rules), *given)
     return back(conclude(system, method, state, h, solved, rules))
 
 
 def equations(
-    system: System, method: OneStepMethod, x, low, h, k, before, rules: Rules = RULES
-) -> tuple[Callable, jax.Array, Callable]:
-    """What a step has to solve, ``k = slopes(k)``: the slopes, a guess of k, and the size of what is rounded."""
-
+    system: System, method: OneStepMethod, x, low, h, k, before, rules: Rules = RULES, columns: Callable | None = None
+) -> Equations:
+    """What a step from a state has to solve, with a guess from the slopes of the steps before."""
     own = method.judged(system, x)[1]
     measure = rules.size(own.size)
     whole = measure(own) / h  # once a step
-
-    def slopes(k):
-        return method.slopes(system, x, low, h, k)
-
-    return slopes, method.predict(k, before), lambda k: whole + measure(k) + rules.vanished
+    return Equations(
+        slopes=lambda k: method.slopes(system, x, low, h, k),
+        guess=method.predict(k, before),
+        scale=lambda k: whole + measure(k) + rules.vanished,
+        inverted=newton_steps(system, method, x, low, h, rules, columns),
+        noise=lambda: noise_of(system, method, x, rules),
+    )
 
 
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved, rules: Rules = RULES) -> State:

@@ -10,7 +10,7 @@ import numpy as np
 from manifolds._precision import by_own_settings
 
 from ..engines import implicit
-from ..engines.stages import explicit, newton_steps, noise_of, scale_of, solve_stages
+from ..engines.stages import Equations, explicit, newton_steps, noise_of, scale_of, solve_stages
 from ..engines.stepping import finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
@@ -125,13 +125,14 @@ def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Arra
 
     def solve(dynamic, guess):
         system, method, x, low, h = eqx.combine(dynamic, static)
-        solved = solve_stages(
-            lambda k: slopes(dynamic, k),
-            guess,
-            lambda k: scale_of(method.judged(system, x)[1], h, k),
-            newton_steps(system, method, x, low, h),
-            lambda: noise_of(system, method, x),
+        own = Equations(
+            slopes=lambda k: slopes(dynamic, k),
+            guess=guess,
+            scale=lambda k: scale_of(method.judged(system, x)[1], h, k),
+            inverted=newton_steps(system, method, x, low, h),
+            noise=lambda: noise_of(system, method, x),
         )
+        solved = solve_stages(own)
         return jnp.where(solved.converged, solved.k, jnp.nan)
 
     return implicit.solution(solve, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from jax.extend.core import Primitive
 
 from .builder import Block
 
@@ -75,6 +76,29 @@ class Call(Block):
         for x, (_, real) in zip(found, self.results, strict=True):
             parts += [x.real.ravel(), x.imag.ravel()] if self.is_complex and not real else [np.real(x).ravel()]
         return np.concatenate(parts).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Deferred(Block):
+    """What the writer of the code has to fill in, from all arguments: by itself the first of them, as they are.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        Of its results, and of as many arguments.
+    """
+
+    kinds: tuple[str, ...]
+    name: str = "deferred"
+
+    def __call__(self, *args) -> list:
+        return list(args[: len(self.kinds)])
+
+
+deferred = Primitive("deferred")
+"""Makes one: ``deferred.bind(*arrays, results=n)`` gives the first n of the arrays, or what takes their place."""
+deferred.multiple_results = True
+deferred.def_abstract_eval(lambda *avals, results: list(avals[:results]))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ import numpy as np
 from . import indexing
 from . import linear_algebra as algebra
 from .builder import ELEMENTARY, Pair, Scalar, array, constant, elementwise, entries_along, integers, pair
+from .calls import Deferred
+from .complex_numbers import arranged, flat, kinds
 
 Rule = Callable[..., "np.ndarray | list[np.ndarray]"]
 
@@ -46,6 +48,12 @@ def _move(function: Callable[..., Any]) -> Rule:
 
 def _alike(b, eqn, *arrays):
     return list(arrays)
+
+
+def _deferred(b, eqn, *arrays):
+    avals = [var.aval for var in eqn.outvars]
+    found = b.block(Deferred(kinds(avals)), *flat(arrays))
+    return arranged(iter(found), avals)
 
 
 def _divide(b, eqn, x, y):
@@ -353,6 +361,7 @@ RULES: dict[str, Rule] = {
     "conj": lambda b, eqn, x: elementwise(b.conj, x),
     "complex": lambda b, eqn, x, y: elementwise(Pair, x, y),
     "eigh": algebra.eigh,
+    "deferred": _deferred,
     "inverse": algebra.inverse,
     "lu": algebra.lu,
     "qr": algebra.qr,
@@ -372,7 +381,7 @@ PARAMETERS = """
 accuracy algorithm axes axis batch_group_count broadcast_dimensions compute_uv conjugate_a dimension dimension_numbers
 dimensions dtype feature_group_count fill_value full_matrices index_dtype indices_are_sorted input_dtype is_stable
 left_side lhs_dilation limit_indices lower memory_space mode name new_dtype new_sizes num_keys out_sharding padding
-padding_config permutation pivoting platforms precision preferred_element_type reps reverse rhs_dilation
+padding_config permutation pivoting platforms precision preferred_element_type reps results reverse rhs_dilation
 rounding_method shape sharding sizes slice_sizes sort_eigenvalues start_indices strides subset_by_index transpose_a
 unique_indices unit_diagonal update_consts update_jaxpr use_magma weak_type window_strides y
 """

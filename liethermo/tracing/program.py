@@ -38,6 +38,12 @@ class Program:
         """How many instructions there are of each kind."""
         return Counter(str(instruction.op) for instruction in self.instructions)
 
+    @property
+    def size(self) -> int:
+        """How many instructions there are, those inside loops among them."""
+        inner = (getattr(i.op, name, None) for i in self.instructions for name in ("test", "body"))
+        return len(self.instructions) + sum(program.size for program in inner if isinstance(program, Program))
+
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
         """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
 

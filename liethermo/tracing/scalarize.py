@@ -300,7 +300,7 @@ def _while(b, eqn, *arguments):
     new = flat(results)
     loop = While(
         _program(testing, inputs, [[goes_on]], [()]),
-        _program(making, inputs, [[new[i] for i in carried.moving]], [(len(carried.moving),)]),
+        _program(making, inputs, [[new[i] for i in carried.moving]], [(len(carried.moving),)]).factored([1]),
         carried.kinds,
     )
     return carried.after(b.block(loop, *inside.outer, *(carried.start[i] for i in carried.moving)))

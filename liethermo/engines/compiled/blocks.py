@@ -9,7 +9,7 @@ from typing import Any
 from llvmlite import ir
 
 from ...tracing.builder import Block
-from ...tracing.calls import Call
+from ...tracing.calls import Call, Deferred
 from ...tracing.program import Scan, While
 from .lapack import kernel
 
@@ -27,6 +27,8 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> Results:
         return _while(writer, block, args)
     if isinstance(block, Scan):
         return _scan(writer, block, args)
+    if isinstance(block, Deferred):
+        return Results(writer.deferred(args, len(block.kinds)))
     assert isinstance(block, Call)
     return _call(writer, block, args)
 
@@ -65,22 +67,36 @@ def _reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
 
 
 def _while(writer: Any, loop: While, args: Sequence[ir.Value]) -> Results:
+    """Until the test fails in every lane that is :attr:`.Writer.active`.
+
+    A pass need not wait for the test that tells which lanes the one before has left: those go on too, and what they
+    come to is not kept. They wait where a loop inside might not end for them.
+    """
     build, fixed = writer.builder, len(loop.test.inputs[0])
     constants, slots = args[:fixed], _slots(writer, loop.kinds, args[fixed:])
-    going: list[ir.Value] = []
+    apart = writer.lanes > 1 and not any(isinstance(i.op, Block) for i in loop.body.instructions)
+    kept = _slots(writer, loop.kinds, args[fixed:]) if apart else slots
+    outer = writer.active
+    (going,) = _slots(writer, "b", [writer.constant(True) if outer is None else outer])
 
     def goes_on() -> ir.Value:
         carried = [build.load(slot) for slot in slots]
         ((test,),) = writer.values(loop.test, _reader(constants, carried))
-        going[:] = [writer.cast(test, "b")]
-        return writer.any(going[0])
+        build.store(build.and_(build.load(going), writer.cast(test, "b")), going)
+        return writer.any(build.load(going))
 
     with writer.repeated(goes_on):
         before = [build.load(slot) for slot in slots]
+        writer.active = build.load(going)
         (new,) = writer.values(loop.body, _reader(constants, before))
-        for slot, kind, after, old in zip(slots, loop.kinds, new, before, strict=True):
-            build.store(build.select(going[0], writer.cast(after, kind), old), slot)
-    return Results([build.load(slot) for slot in slots])
+        for slot, out, kind, after in zip(slots, kept, loop.kinds, new, strict=True):
+            value = writer.cast(after, kind)
+            if writer.lanes > 1:
+                build.store(build.select(writer.active, value, build.load(out)), out)
+            if apart or writer.lanes == 1:
+                build.store(value, slot)
+        writer.active = outer
+    return Results([build.load(slot) for slot in kept])
 
 
 def _scan(writer: Any, loop: Scan, args: Sequence[Any]) -> Results:

@@ -52,7 +52,6 @@ def step_loop(
     state: Sequence[str],
     varies: np.ndarray,
     lanes: int,
-    explicit: bool,
     kept: Sequence[str],
 ) -> MachineCode:
     """The functions ``advance`` and ``begin`` of :class:`_Steps` as machine code.
@@ -60,16 +59,13 @@ def step_loop(
     Parameters
     ----------
     pieces : mapping
-        ``begin``, the state of a run about to start; ``prepare``, from the state to a guess; ``iterate``, one
-        iteration; ``conclude``, the state after the step.
+        ``begin``, the state of a run about to start, and ``step``, the state after a step.
     layout : Layout
         Of a block, each row with a number for each lane.
     state : sequence of str
         The arrays that stay from step to step.
     varies : array of bool, shape (p,)
         Which parameters lie in the block, under the name "p"; the others are the same for all.
-    explicit : bool
-        Of a method that has nothing to solve: what its one iteration does not do, Newton's method cannot.
     kept : sequence of str
         The arrays that are written down at each save.
     """
@@ -77,9 +73,9 @@ def step_loop(
     kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, NUMBERS, POINTER]
     function = ir.Function(module, ir.FunctionType(WHOLE, kinds), "advance")
     function.args[0].add_attribute("noalias")
-    _Steps(function, pieces, layout, state, varies, lanes, explicit, kept).write_loops()
+    _Steps(function, pieces, layout, state, varies, lanes, kept).write_loops()
     begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "begin")
-    _Steps(begin, pieces, layout, state, varies, lanes, explicit, kept).write_begin()
+    _Steps(begin, pieces, layout, state, varies, lanes, kept).write_begin()
     return MachineCode(module)
 
 
@@ -92,19 +88,15 @@ class _Steps(Writer):
     block, and another call goes on there; otherwise it returns the number of blocks.
     """
 
-    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, explicit: bool, kept):
+    def __init__(self, function: ir.Function, pieces, layout: Layout, state, varies, lanes: int, kept):
         super().__init__(ir.IRBuilder(function.append_basic_block("entry")), lanes)
-        self.pieces, self.layout, self.state, self.explicit, self.kept = pieces, layout, state, explicit, kept
+        self.pieces, self.layout, self.state, self.kept = pieces, layout, state, kept
         names = "p blocks done count saves every out most noise newton" if len(function.args) > 3 else "p blocks count"
         self.argument = dict(zip(names.split(), function.args, strict=True))
         own = np.cumsum(varies) - 1
         self.own = [int(own[i]) if v else None for i, v in enumerate(varies)]
-        slots = [name for name in layout.sizes if name != "p"]
-        self.slots = {name: self._slots(name) for name in slots}
-        needed = {*pieces["conclude"].arguments, *SOLVED} if lanes > 1 and not explicit else ()
-        self.outcome = {name: self._slots(name) for name in pieces["iterate"].results if name in needed}
-        self.truth = {name: self.builder.alloca(self.test, name=name) for name in ("running", "active")}
-        self.block = self.builder.alloca(NUMBERS)
+        self.slots = {name: self._slots(name) for name in layout.sizes if name not in ("p", DEFERRED)}
+        self.block, self.number_of_block = self.builder.alloca(NUMBERS), self.builder.alloca(WHOLE)
 
     def _slots(self, name: str) -> list[ir.Value]:
         return [self.builder.alloca(self.number, name=f"{name}_{i}") for i in range(self.layout.sizes[name])]
@@ -123,14 +115,14 @@ class _Steps(Writer):
             end = build.select(build.icmp_signed("<", total, limit), total, limit)
             self.load(self.state)
 
-            def goes_on():
-                build.store(build.fcmp_ordered("==", self.value("status"), self.constant(0.0)), self.truth["running"])
-                running = self.any(build.load(self.truth["running"]))
-                return build.and_(running, build.icmp_signed("<", build.load(done), end))
+            def running() -> ir.Value:
+                return build.fcmp_ordered("==", build.load(self.slots["status"][0]), self.constant(0.0))
 
-            with self.repeated(goes_on):
+            with self.repeated(lambda: build.and_(self.any(running()), build.icmp_signed("<", build.load(done), end))):
                 self.drive(build.add(build.mul(i, total), build.load(done)))
-                self.step(i)
+                self.active = running()
+                self.run("step")
+                self.active = None
                 build.store(build.add(build.load(done), self.whole_number(1)), done)
                 with build.if_then(
                     build.icmp_signed("==", build.srem(build.load(done), argument["every"]), self.whole_number(0))
@@ -152,29 +144,7 @@ class _Steps(Writer):
         """Work on block i from here on."""
         size = self.builder.mul(i, self.whole_number(self.layout.height * self.lanes))
         self.builder.store(self.builder.gep(self.argument["blocks"], [size]), self.block)
-
-    def step(self, i: ir.Value) -> None:
-        """One step of every lane that is running; where one fails its state stays and a status says why."""
-        build, truth = self.builder, self.truth
-        self.run("prepare")
-        build.store(build.load(truth["running"]), truth["active"])
-
-        if self.explicit:
-            self.run("iterate")
-        else:
-            with self.repeated(lambda: self.any(build.load(truth["active"]))):
-                active = build.load(truth["active"])
-                self.run("iterate", *((active, self.outcome) if self.lanes > 1 else ()))
-                going = build.fcmp_ordered("==", self.value("going"), self.constant(1.0))
-                build.store(build.and_(active, going), truth["active"])
-            for name, ends in self.outcome.items():
-                for slot, end in zip(self.slots[name], ends, strict=True):
-                    build.store(build.load(end), slot)
-            solved = build.fcmp_ordered("==", self.value("converged"), self.constant(1.0))
-            hard = build.and_(build.load(truth["running"]), build.not_(solved))
-            with build.if_then(self.any(hard), likely=False):
-                self.newton(i, hard)
-        self.run("conclude", build.load(truth["running"]))
+        self.builder.store(i, self.number_of_block)
 
     def drive(self, number: ir.Value) -> None:
         """The increments of a step, from the row of ``noise`` with this number."""
@@ -184,44 +154,48 @@ class _Steps(Writer):
             start = build.gep(self.argument["noise"], [build.add(row, self.whole_number(j * self.lanes))])
             build.store(build.load(build.bitcast(start, self.number.as_pointer()), align=8), slot)
 
-    def newton(self, i: ir.Value, hard: ir.Value) -> None:
-        """Newton's method for the lanes that need it; the loop is left where there is none."""
+    def deferred(self, args: Sequence[ir.Value], results: int) -> list[ir.Value]:
+        """Newton's method for the lanes that have not converged; the loop is left where there is none.
+
+        It finds its arguments in the block, and leaves its results there.
+        """
         build, argument = self.builder, self.argument
-        self.save((*self.state, "dW"))
-        with build.if_then(build.icmp_unsigned("==", argument["newton"], ir.Constant(POINTER, None))):
-            build.ret(i)
-        solve = ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE])
-        function = build.bitcast(argument["newton"], solve.as_pointer())
-        block = build.load(self.block)
-        self.save(SOLVED)
-        for lane in range(self.lanes):
-            needed = hard if self.lanes == 1 else build.extract_element(hard, ir.Constant(ir.IntType(32), lane))
-            with build.if_then(needed):
-                build.call(function, [argument["p"], block, self.whole_number(lane)])
-        self.load(SOLVED)
+        unsolved = build.fcmp_ordered("==", args[CONVERGED], self.constant(0.0))
+        hard = unsolved if self.active is None else build.and_(self.active, unsolved)
+        with build.goto_entry_block():
+            found = [build.alloca(self.number) for _ in range(results)]
+        for slot, value in zip(found, args, strict=False):
+            build.store(value, slot)
+        with build.if_then(self.any(hard), likely=False):
+            with build.if_then(build.icmp_unsigned("==", argument["newton"], ir.Constant(POINTER, None))):
+                self.save(self.state)
+                build.ret(build.load(self.number_of_block))
+            solve = ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE])
+            function = build.bitcast(argument["newton"], solve.as_pointer())
+            places = [self.place(self.layout.rows[DEFERRED] + i) for i in range(len(args))]
+            for place, value in zip(places, args, strict=True):
+                build.store(value, place, align=8)
+            for lane in range(self.lanes):
+                needed = hard if self.lanes == 1 else build.extract_element(hard, ir.Constant(ir.IntType(32), lane))
+                with build.if_then(needed):
+                    build.call(function, [argument["p"], build.load(self.block), self.whole_number(lane)])
+            for slot, place in zip(found, places, strict=False):
+                build.store(build.load(place, align=8), slot)
+        return [build.load(slot) for slot in found]
 
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
-    def run(self, name: str, where: ir.Value | None = None, apart: Mapping[str, list] | None = None) -> None:
-        """Run a piece; its results take the place of what there was, in the lanes where a test holds.
-
-        Or they do in all lanes, and those of some names are kept ``apart`` where the test holds: so no iteration has to
-        wait until it is known which lanes the one before has left.
-        """
-        piece, build = self.pieces[name], self.builder
+    def run(self, name: str) -> None:
+        """Run a piece; its results take the place of what there was, in the lanes that are active."""
+        piece, build, where = self.pieces[name], self.builder, self.active
 
         def read(i: int, j: int) -> ir.Value:
             array = piece.arguments[i]
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
         for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
-            masked = self.slots if apart is None else apart
-            if array in masked:
-                for slot, value in zip(masked[array], values, strict=True):
-                    build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
-            if apart is not None:
-                for slot, value in zip(self.slots[array], values, strict=True):
-                    build.store(value, slot)
+            for slot, value in zip(self.slots[array], values, strict=True):
+                build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
 
     def parameter(self, i: int) -> ir.Value:
         own, build = self.own[i], self.builder
@@ -236,9 +210,6 @@ class _Steps(Writer):
         one = build.insert_element(ir.Constant(self.number, ir.Undefined), number, zero)
         order = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
         return build.shuffle_vector(one, ir.Constant(self.number, ir.Undefined), order)
-
-    def value(self, name: str) -> ir.Value:
-        return self.builder.load(self.slots[name][0])
 
     def place(self, row: int) -> ir.Value:
         start = self.builder.gep(self.builder.load(self.block), [self.whole_number(row * self.lanes)])
@@ -265,5 +236,9 @@ class _Steps(Writer):
             build.store(build.load(slot), place, align=8)
 
 
-SOLVED = ("guess", "update", "converged", "defined", "newtons", "noise")
-"""What Newton's method leaves in a block."""
+DEFERRED = "deferred"
+"""Rows of a block that hold what Newton's method is given, and what it leaves: the latter is what the former begins
+with."""
+
+CONVERGED = 0
+"""Which of them says whether the equations are solved."""

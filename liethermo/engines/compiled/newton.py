@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from llvmlite import ir
 
-from .loop import NUMBERS, Layout, Piece
+from ...tracing.program import Program
+from .loop import DEFERRED, NUMBERS, Layout
 from .machine_code import MachineCode
 from .writer import WHOLE, Writer
 
 
-def solver(piece: Piece, block: Layout, varies: np.ndarray, lanes: int) -> MachineCode:
+def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> MachineCode:
     """The function ``solve(p, block, lane)``: a program on the arrays of one lane, as machine code.
 
     Parameters
     ----------
-    piece : Piece
-        Of :func:`..stages.by_newton`, on arrays in the block and the parameters p.
+    program : Program
+        :func:`..stages.by_newton`, of the parameters p and of what is :data:`.loop.DEFERRED`, whose first rows it
+        replaces.
     block : Layout
     varies : array of bool, shape (p,)
         Which parameters lie in the block; the others are the same for all.
@@ -24,19 +28,17 @@ def solver(piece: Piece, block: Layout, varies: np.ndarray, lanes: int) -> Machi
     module = ir.Module("newton")
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "solve")
     build, (p, w, lane), own = ir.IRBuilder(function.append_basic_block()), function.args, np.cumsum(varies) - 1
-    writer = Writer(build, 1)
+    writer, first = Writer(build, 1), block.rows[DEFERRED]
 
     def place(row: int) -> ir.Value:
         return build.gep(w, [build.add(writer.whole_number(row * lanes), lane)])
 
     def read(i: int, j: int) -> ir.Value:
-        name = piece.arguments[i]
-        if name == "p" and not varies[j]:
-            return build.load(build.gep(p, [writer.whole_number(j)]))
-        return build.load(place(block.rows[name] + int(own[j] if name == "p" else j)))
+        if i:
+            return build.load(place(first + j))
+        return build.load(place(block.rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.whole_number(j)]))
 
-    for name, values in zip(piece.results, writer.write(piece.program, read), strict=True):
-        for j, value in enumerate(values):
-            build.store(value, place(block.rows[name] + j))
+    for i, value in enumerate(itertools.chain.from_iterable(writer.write(program, read))):
+        build.store(value, place(first + i))
     build.ret_void()
     return MachineCode(module)

@@ -7,16 +7,15 @@ import numpy as np
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.scalarize import UnsupportedPrimitive
-from ..pacing import TOLD, Pace, Pacing, begun, fitted, judged, shape_seen
+from ..pacing import TOLD, Pace, Pacing, attempted, begun, shape_seen
 from ..rules import RULES, Rules
 from ..searching import NONE
 from ..stepping import State
 from .form import Form, numbers_of
-from .stepper import FIELDS, ITERATION, Spec, Stepper, key_of, remembered_stepper
+from .stepper import FIELDS, Stepper, key_of, remembered_stepper
 
 OWN = tuple(name for name in Pace._fields if name != "state")
 NAMES = (*FIELDS, *OWN)
-assert not {*NAMES} & {*ITERATION}
 
 
 class PacedStepper(Stepper):
@@ -32,44 +31,28 @@ class PacedStepper(Stepper):
         As for :class:`.stepper.Stepper`.
     """
 
-    names, passed = NAMES, ("reached", "length")
-    kept = TOLD
+    names, kept = NAMES, TOLD
+    begins, given = ("t", "stop", "length"), ("p", "dW")
 
     def __init__(self, form: Form, own: Form, way: Form, parameters, method, seen: tuple, lanes, varies, rules):
-        self._way, self._seen, self._skip = way, seen, form.size + own.size
+        self._way, self._skip, self._seen = way, form.size + own.size, seen
         super().__init__(form, own, parameters, method, lanes, varies, rules)
 
-    def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
-        self._shapes |= {"seen": self._seen, "search": NONE.shape}
-        both, way, skip = self._both, self._way, self._skip
+    def shape(self, name: str) -> tuple[int, ...]:
+        return {"seen": self._seen, "search": NONE.shape}.get(name) or super().shape(name)
 
-        def joined(fields) -> Pace:
-            named = dict(zip(NAMES, fields, strict=True))
-            return Pace(State(*(named[name] for name in FIELDS)), *(named[name] for name in OWN))
+    def begun(self, p, x, *others) -> tuple:
+        return split(begun(*self.both(p), self._way.build(p[self._skip :]), x, *others))
 
-        def split(found: Pace) -> tuple:
-            return *found.state, *found[1:]
+    def step(self, p, dW, *fields) -> tuple:
+        """The fields after an attempt."""
+        pace = Pace(State(*fields[: len(FIELDS)]), *fields[len(FIELDS) :])
+        pacing = self._way.build(p[self._skip :])
+        return split(attempted(*self.both(p), pacing, pace, self._rules, self._second(dW)))
 
-        def begin(p, x, t, stop, length):
-            return split(begun(*both(p), way.build(p[skip:]), x, t, stop, length))
 
-        def prepare(p, k, before, *fields):
-            return *programs["prepare"].function(p, k, before), *fitted(way.build(p[skip:]), joined(fields))
-
-        def conclude(p, reached, *rest):
-            given = rest[: -len(OWN)]
-            h, state = given[0], State(*given[-len(FIELDS) :])
-            before = Pace(state, *rest[-len(OWN) :])
-            new = State(*programs["conclude"].function(p, *given))
-            return split(judged(*both(p), way.build(p[skip:]), before, h, reached, new))
-
-        fields, solved = " ".join(NAMES), programs["conclude"].arguments.removeprefix("p ")
-        return {
-            "begin": Spec(begin, "p x t stop length", NAMES),
-            "prepare": Spec(prepare, f"p k before {fields}", (*programs["prepare"].results, "h", "reached")),
-            "iterate": programs["iterate"],
-            "conclude": Spec(conclude, f"p reached {solved} {' '.join(OWN)}", NAMES),
-        }
+def split(pace: Pace) -> tuple:
+    return *pace.state, *pace[1:]
 
 
 def paced_stepper_of(

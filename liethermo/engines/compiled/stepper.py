@@ -9,9 +9,11 @@ finds it.
 from __future__ import annotations
 
 import ctypes
+import itertools
+import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,19 +21,23 @@ import numpy as np
 
 from ...integrators import OneStepMethod
 from ...systems import System
+from ...tracing.calls import deferred
 from ...tracing.remembered import Latest, remembered
 from ...tracing.scalarize import scalarize
 from ..array import portion_of
 from ..rules import RULES, Rules
-from ..stages import Iteration, Solved, by_newton, explicit, newton_steps, noise_of, scale_of
-from ..stepping import State, conclude, equations, first_state
+from ..stages import Solved, by_newton
+from ..stepping import State, equations, first_state, take_step
 from .form import Form, numbers_of
-from .loop import SOLVED, Layout, Piece, step_loop
+from .loop import DEFERRED, Layout, Piece, step_loop
 from .machine_code import MachineCode
 from .newton import solver
 
 FIELDS = State._fields
-ITERATION = ("guess", "update", "best", "stalled", "previous", "made")
+GIVEN = ("dW", "x", "low", "h", "k", "before")
+"""What it is given."""
+SOLVED = ("converged", "defined", "residual", "newton", "noise", "k")
+"""What Newton's method may make better of :class:`..stages.Solved`."""
 
 
 class CompiledEngine:
@@ -81,14 +87,6 @@ class CompiledEngine:
         return self._stepper.state_in(blocks)
 
 
-class Spec(NamedTuple):
-    """A function that becomes a program, and the names of its arguments and results."""
-
-    function: Callable
-    arguments: str
-    results: tuple[str, ...]
-
-
 class Stepper:
     """The step loop of one method on systems of one form, compiled; parameters are arguments.
 
@@ -120,104 +118,84 @@ class Stepper:
         self._lock = threading.Lock()
         self._functions: tuple[Callable, Callable] | None = None
         self._newton: MachineCode | None = None
-        system, size = form.build(parameters), form.size
-        n, stages, unknowns = system.dim, method.stages, method.unknowns(system)
-
-        def both(p) -> tuple[System, OneStepMethod]:
-            return form.build(p[:size]), own.build(p[size:])
-
-        def scale(x, h, k):
-            return scale_of(method.judged(system, x)[1], h, k, rules)
-
-        def begin(p, x):
-            return first_state(*both(p), x)
-
-        def prepare(p, k, before):
-            zero, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
-            iteration = both(p)[1].predict(k, before), infinite, infinite, zero, infinite, zero
-            return *iteration, zero, zero + 1.0, zero  # of Newton's method: iterations, defined, noise
-
-        def driven(p, dW) -> tuple[System, OneStepMethod]:
-            system, method = both(p)
-            return system, method.driven_by(dW)
-
-        def iterate(p, dW, x, low, h, *iteration):
-            system, method = driven(p, dW)
-            if method.explicit:
-                solved = explicit(system, method, x, low, h, iteration[0], rules)
-                _, _, best, stalled, previous, made = iteration
-                s = Iteration(solved.k, solved.residual, best, stalled, previous, made + 1.0)
-                return *s, jnp.where(solved.converged, 1.0, 0.0), jnp.zeros(())
-            s = Iteration(*iteration).after(method.slopes(system, x, low, h, iteration[0]), rules)
-            converged, going = s.stands(scale(x, h, s.k), rules)
-            return *s, jnp.where(converged, 1.0, 0.0), jnp.where(going, 1.0, 0.0)
-
-        def concluded(p, h, guess, update, converged, defined, made, newtons, noise, dW, *state):
-            defined = jnp.isfinite(update) & (defined > 0.0)
-            solved = Solved(guess, converged > 0.0, defined, update, made, newtons, noise)
-            return conclude(*driven(p, dW), State(**dict(zip(FIELDS, state, strict=True))), h, solved)
-
-        def newton(p, dW, x, low, h, k, before):
-            system, method = driven(p, dW)
-            given = equations(system, method, x, low, h, k, before, rules)
-            inverted = newton_steps(system, method, x, low, h, rules, jax.lax.map)
-            found = by_newton(*given, inverted, lambda: noise_of(system, method, x, rules), rules)
-            return found.k, found.residual, found.converged, found.defined, found.newton, found.noise
-
-        self._both, self._by_newton = both, newton
-        self._explicit, self._increments = method.explicit, method.increments
-        self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "p": parameters.shape}
-        self._shapes["dW"] = (method.increments,)
-        self._shapes |= dict.fromkeys(("k", "guess"), (stages, unknowns))
-        self._shapes["before"] = (0 if method.explicit else stages, unknowns)
-
-        after = ("converged", "going")
-        solved = "h guess update converged defined made newtons noise dW"
-        programs = {
-            "begin": Spec(begin, "p x", FIELDS),
-            "prepare": Spec(prepare, "p k before", (*ITERATION, "newtons", "defined", "noise")),
-            "iterate": Spec(iterate, f"p dW x low h {' '.join(ITERATION)}", (*ITERATION, *after)),
-            "conclude": Spec(concluded, f"p {solved} {' '.join(FIELDS)}", FIELDS),
-        }
-        self._pieces = {name: self._piece(*spec) for name, spec in self._programs(programs).items()}
-        loop = self._pieces["iterate"]
-        still = ("p", "h") if method.explicit else [name for name in loop.arguments if name not in ITERATION]
-        changing = [i for i, name in enumerate(loop.arguments) if name not in still]
-        self._pieces["iterate"] = loop._replace(program=loop.program.factored(changing))
-        own_size = int(varies.sum())
-        working = (*ITERATION, *after, "defined", "newtons", "noise")
-        shapes = {name: self._shapes.get(name, ()) for name in (*self.names, "h", "dW", *self.passed)} | {
-            "p": (own_size,)
-        }
-        shapes |= {name: self._shapes.get(name, ()) for name in working}
-        # Newton's method is handed these in the block; without it they stay in registers
-        self._layout = Layout(shapes, working if method.explicit else ())
+        self._form, self._own, self._own_start = form, own, form.size
+        system = form.build(parameters)
+        n, slopes = system.dim, (method.stages, method.unknowns(system))
+        self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "k": slopes, "p": parameters.shape}
+        self._shapes |= {"before": (0 if method.explicit else method.stages, slopes[1]), "dW": (method.increments,)}
+        step = self._piece(self.step, (*self.given, *self.names), self.names)
+        if method.explicit:
+            step = step._replace(
+                program=step.program.factored([i for i, a in enumerate(step.arguments) if a not in "ph"])
+            )
+        begin = self._piece(self.begun, ("p", "x", *self.begins), self.names)
+        self._pieces = {"step": step, "begin": begin}
+        handed = 0 if method.explicit else sum(math.prod(self.shape(name)) for name in (*SOLVED, *GIVEN))
+        names = (*self.names, *self.begins, *self.given[1:])
+        shapes = {name: self.shape(name) for name in names} | {"p": (int(varies.sum()),), DEFERRED: (handed,)}
+        self._layout = Layout(shapes)
         rows, sizes = self._layout.rows, self._layout.sizes
         self._places = [(rows[name], rows[name] + sizes[name], self.shape(name)) for name in FIELDS]
+
+    # -- what is compiled -----------------------------------------------------------------------------------------
+
+    def both(self, p) -> tuple[System, OneStepMethod]:
+        """System and method with the parameters p."""
+        return self._form.build(p[: self._own_start]), self._own.build(p[self._own_start :])
+
+    def begun(self, p, x, *others) -> tuple:
+        """The fields of a run about to start at x."""
+        assert not others
+        return first_state(*self.both(p), x)
+
+    def step(self, p, dW, h, *fields) -> tuple:
+        """The fields after a step."""
+        system, method = self.both(p)
+        return take_step(system, method.driven_by(dW), State(*fields), h, self._rules, self._second(dW))
+
+    def _second(self, dW) -> Callable:
+        """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
+
+        def second(first: Solved, *given) -> Solved:
+            handed = [1.0 * getattr(first, name) for name in SOLVED]
+            found = deferred.bind(*handed, dW, *(jnp.asarray(a) for a in given), results=len(SOLVED))
+            solved = first._replace(**dict(zip(SOLVED, found, strict=True)))
+            return solved._replace(converged=solved.converged > 0.0, defined=solved.defined > 0.0)
+
+        return second
+
+    def _by_newton(self, p, handed) -> tuple:
+        """What takes the place of what is handed over."""
+        system, method = self.both(p)
+        shapes = [self.shape(name) for name in (*SOLVED, *GIVEN)]
+        ends = itertools.accumulate(map(math.prod, shapes))
+        parts = [handed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
+        dW, x, low, h, k, before = parts[len(SOLVED) :]
+        own = equations(system, method.driven_by(dW), x, low, h, k, before, self._rules, jax.lax.map)
+        found = by_newton(own, self._rules)
+        return tuple(1.0 * getattr(found, name) for name in SOLVED)
 
     names: tuple[str, ...] = FIELDS
     """The fields of a trajectory."""
 
-    passed: tuple[str, ...] = ()
-    """What its programs hand to each other besides."""
+    begins: tuple[str, ...] = ()
+    """What a run that begins is told besides its x."""
+
+    given: tuple[str, ...] = ("p", "dW", "h")
+    """What a step is given besides them."""
 
     kept: tuple[str, ...] = ("x", "energy", "entropy")
     """The fields that are written down at each save."""
 
-    def _programs(self, programs: dict[str, Spec]) -> dict[str, Spec]:
-        """The programs of a step, for what makes more of them."""
-        return programs
-
     @property
     def operations(self) -> int:
         """Scalar operations of a step with one iteration."""
-        return sum(len(piece.program.instructions) for name, piece in self._pieces.items() if name != "begin")
+        return self._pieces["step"].program.size
 
-    def _piece(self, function: Callable, arguments: str, results: tuple[str, ...]) -> Piece:
-        names = arguments.split()
-        shapes = [jax.ShapeDtypeStruct(self._shapes.get(a, ()), jnp.float64) for a in names]
+    def _piece(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> Piece:
+        shapes = [jax.ShapeDtypeStruct(self.shape(a), jnp.float64) for a in names]
         known = [self._known if a == "p" else None for a in names]
-        return Piece(scalarize(jax.make_jaxpr(function)(*shapes), known), tuple(names), results)
+        return Piece(scalarize(jax.make_jaxpr(function)(*shapes), known), tuple(names), tuple(results))
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
@@ -317,7 +295,8 @@ class Stepper:
         of empty lanes, and undefined after a failure. It is written to ``out``, if there is one.
         """
         lanes, count, width = self.lanes, len(blocks), self.width
-        self.part(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
+        if "h" in self._layout.rows:
+            self.part(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
         out = np.empty((count, saves, width * lanes)) if out is None else out
         done = np.zeros(count, dtype=np.int64)
@@ -343,9 +322,9 @@ class Stepper:
 
     def _in_blocks(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
         """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
-        if noise is None or not self._increments:
-            return np.zeros((count, steps, self._increments, self.lanes))
-        padded = np.zeros((count * self.lanes, steps, self._increments))
+        if noise is None or not self._shapes["dW"][0]:
+            return np.zeros((count, steps, self._shapes["dW"][0], self.lanes))
+        padded = np.zeros((count * self.lanes, steps, self._shapes["dW"][0]))
         padded[: len(noise)] = noise
         return np.ascontiguousarray(padded.reshape(count, self.lanes, steps, -1).transpose(0, 2, 3, 1))
 
@@ -355,8 +334,8 @@ class Stepper:
         """The functions ``begin`` and ``advance``, compiled or found compiled."""
         with self._lock:
             if self._functions is None:
-                state = (*self.names, "h")
-                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self._explicit, self.kept)
+                state = [name for name in (*self.names, "h") if name in self._layout.rows]
+                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self.kept)
                 self._loaded = code  # unloaded with this object
                 self._functions = BEGIN(code.address("begin")), ADVANCE(code.address("advance"))
             return self._functions
@@ -365,8 +344,9 @@ class Stepper:
         """The address of Newton's method, which is compiled when a step first needs it."""
         with self._lock:
             if self._newton is None:
-                piece = self._piece(self._by_newton, "p dW x low h k before", SOLVED)
-                self._newton = solver(piece, self._layout, self._varies, self.lanes)
+                self._shapes[DEFERRED] = (self._layout.sizes[DEFERRED],)
+                program = self._piece(self._by_newton, ("p", DEFERRED)).program
+                self._newton = solver(program, self._layout, self._varies, self.lanes)
             return self._newton.address("solve")
 
 

@@ -38,6 +38,11 @@ class Writer:
     fused with the sum, and rounded once, on processors that can; which ones are does not depend on the lanes. What one
     side of a branch alone needs is jumped over where no lane takes that side. Each lane chooses for itself, so that its
     numbers do not depend on the others.
+
+    Attributes
+    ----------
+    active : value or None
+        The lanes that what is being written is for; None where it is for all.
     """
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
@@ -46,6 +51,7 @@ class Writer:
             kind if lanes == 1 else ir.VectorType(kind, lanes) for kind in (NUMBER, TEST, WHOLE)
         )
         self.kinds = {"f": self.number, "b": self.test, "i": self.whole}
+        self.active: ir.Value | None = None
 
     def write(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
         """The values of the outputs, array by array.
@@ -141,6 +147,10 @@ class Writer:
         zero, minus = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
         found = build.sdiv(x, build.select(build.or_(zero, minus), one, n))
         return build.select(zero, self.constant(-1), build.select(minus, build.neg(x), found))
+
+    def deferred(self, args: Sequence[ir.Value], results: int) -> list[ir.Value]:
+        """What takes the place of the first arguments: see :class:`...tracing.calls.Deferred`."""
+        raise NotImplementedError(f"nothing fills in {results} of {len(args)} values here")
 
     def wrapped(self, x: ir.Value, bits: int, signed: bool) -> ir.Value:
         """An integer as so many bits hold it."""
@@ -326,11 +336,12 @@ class _Written:
             if not side:
                 continue
             before, outside = build.block, self.values
-            inside = self.values = outside.new_child()
-            with build.if_then(writer.any(taken)):
+            inside, active = outside.new_child(), writer.active
+            self.values, writer.active = inside, taken if active is None else build.and_(active, taken)
+            with build.if_then(writer.any(writer.active)):
                 self.all(side)
                 after = build.block
-            self.values = outside
+            self.values, writer.active = outside, active
             for a in dict.fromkeys(choice.args[place] for choice in branch.choices):
                 if isinstance(a, str) and a in inside.maps[0] and a not in self.places:
                     outside[a] = build.phi(inside[a].type)

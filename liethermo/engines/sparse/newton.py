@@ -22,7 +22,7 @@ from ...systems import System
 from ...tracing.programs import program
 from ..codes import Code
 from ..rules import RULES
-from ..stages import Iteration, Solved, better_start, fixed_point
+from ..stages import Equations, Iteration, Solved, better_start, fixed_point
 from ..stepping import State, begin, conclude, equations
 from .linear import Compression, Inverse
 
@@ -167,11 +167,10 @@ class SparseEngine:
 
 @program
 def _fixed_point(system: System, method: OneStepMethod, state: State, h) -> Solved:
-    slopes, guess, scale = _given(system, method, state, h)
-    return fixed_point(slopes, guess, scale, PATIENT)
+    return fixed_point(_given(system, method, state, h), PATIENT)
 
 
-def _given(system: System, method: OneStepMethod, state: State, h):
+def _given(system: System, method: OneStepMethod, state: State, h) -> Equations:
     return equations(system, method, state.x, state.low, h, state.k, state.before, PATIENT)
 
 
@@ -185,7 +184,7 @@ def _equations(system: System, method: OneStepMethod, state: State, h):
 
     With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
     """
-    slopes, guess, scale = _given(system, method, state, h)
+    slopes, guess, scale, *_ = _given(system, method, state, h)
 
     def misfit(k):
         middle = state.x + (state.low + 0.5 * method.increment(h, k))

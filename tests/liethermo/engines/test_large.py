@@ -13,7 +13,7 @@ from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array
 from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
-from liethermo.engines.stages import solve_stages
+from liethermo.engines.stages import Equations, solve_stages
 from liethermo.engines.stepping import begin
 
 COUNT = 5_000
@@ -87,7 +87,7 @@ def solved(slopes, guess, rules=RULES):
 
     n = guess.shape[1]
     measure = rules.size(n)
-    return solve_stages(slopes, guess, lambda k: 1.0 + measure(k), inverted, rules=rules)
+    return solve_stages(Equations(slopes, guess, lambda k: 1.0 + measure(k), inverted), rules)
 
 
 @pytest.mark.slow
