@@ -16,7 +16,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
-from .compiled.paced import lane_pace
+from .compiled.paced import lane_pace, paced_stepper_for
 from .compiled.stepper import CompiledEngine
 from .paced import OnePace, SinglePaces
 from .pacing import Pacing
@@ -99,7 +99,7 @@ class Chosen:
     def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int, noise: Noise | None = None):
         self.system, self.method, self.asked, self.steps, self.noise = system, method, asked, steps, noise
         self._engine: Engine = ArrayEngine(system, method)
-        self._begun = False
+        self._chosen = False
 
     @property
     def name(self) -> str:
@@ -110,13 +110,8 @@ class Chosen:
         return self._engine.portion
 
     def begin(self, x) -> State:
-        if not self._begun:
-            self._engine, self._begun = self._choose(), True
-        try:
-            return self._engine.begin(x)
-        except UnsupportedPrimitive as error:
-            self._fall_back(error)
-            return self._engine.begin(x)
+        self._choose(lambda compiled: compiled.operations)
+        return self._attempt(lambda engine, _: engine.begin(x))
 
     def advance(self, state: State, h, saves: int, every: int) -> tuple[State, tuple]:
         noise = self._noise(state, int(saves) * int(every), h)
@@ -127,17 +122,14 @@ class Chosen:
         return self._attempt(lambda engine, state: engine.step(state, h, noise), state)
 
     def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        try:
-            return self._engine.ends(x, h)
-        except UnsupportedPrimitive as error:
-            self._fall_back(error)
-            return self._engine.ends(x, h)
+        return self._attempt(lambda engine, _: engine.ends(x, h))
 
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
 
     def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> OnePace:
         """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
+        self._choose(lambda _: paced_stepper_for(self.system, self.method, pacing)[0].operations)
         if isinstance(self._engine, CompiledEngine):
             return _Compiled(self, pacing, x, t, stop, length)
         return self._single(pacing).begin(x, t, stop, length)
@@ -146,7 +138,13 @@ class Chosen:
         step = self._engine.step if self._engine.name == "sparse" else None
         return SinglePaces(self.system, self.method, pacing, step)
 
-    def _choose(self) -> Engine:
+    def _choose(self, operations: Callable[[CompiledEngine], int]) -> None:
+        """Choose an engine when the run begins; ``operations`` tells how many the compiled one would need a step."""
+        if not self._chosen:
+            self._engine = self._choice(operations)
+            self._chosen = True
+
+    def _choice(self, operations: Callable[[CompiledEngine], int]) -> Engine:
         system, method, auto = self.system, self.method, self.asked == "auto"
         if self.asked == "sparse" and self.noise is not None:
             raise InputError("the sparse engine takes no steps with noise: leave out engine")
@@ -164,23 +162,25 @@ class Chosen:
                 )
         long = self.steps >= COMPILED_STEPS
         if self.asked == "compiled" or (auto and is_small(system, COMPILED_DIM if long else SMALL_DIM)):
+            compiled = CompiledEngine(system, method)
             try:
-                compiled = CompiledEngine(system, method)
+                if operations(compiled) <= SMALL_PROGRAM or not auto or long:
+                    return compiled
             except UnsupportedPrimitive as error:
                 if not (auto and error.too_large):  # as little of a surprise as one that is too long to be worth it
                     self._fall_back(error)
-            else:
-                if not auto or long or compiled.operations <= SMALL_PROGRAM:
-                    return compiled
         return ArrayEngine(system, method)
 
-    def _attempt(self, call: Callable[[Engine, State], Any], state: State) -> Any:
+    def _attempt(self, call: Callable[[Engine, Any], Any], state: State | None = None) -> Any:
+        """What an engine makes of a state; the array engine where the compiled one cannot."""
         try:
             return call(self._engine, state)
         except UnsupportedPrimitive as error:
             self._fall_back(error)
-            like = self._engine.begin(jnp.asarray(state.x))
-            return call(self._engine, jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, like))
+            if state is not None:
+                like = self._engine.begin(jnp.asarray(state.x))
+                state = jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, like)
+            return call(self._engine, state)
 
     def _fall_back(self, error: UnsupportedPrimitive) -> None:
         if self.asked != "auto":

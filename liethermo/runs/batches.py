@@ -26,7 +26,7 @@ from ..tracing.programs import program
 from .family import Family
 from .fluctuations import Paths
 from .record import Record
-from .timetable import CHUNK_STEPS, Course
+from .timetable import CHUNK_STEPS
 
 LANES = 8
 """Trajectories in a block of the compiled engine: one AVX-512 vector or two of AVX2."""
@@ -130,8 +130,8 @@ def run_compiled(
             blocks = stepper.begin(lanes.parameters(chosen, number), record.x0[chosen])
             before = {name: value[:number].copy("K") for name, value in stepper.fields(blocks, KEPT_BEFORE).items()}
             record.begin(chosen, before["x"], before["energy"], before["entropy"])
-        taken = 0
-        for h, saves, every, place in calls(course, CHUNK_STEPS * 16 // max(number, LANES)):
+        taken, place = 0, 1
+        for h, saves, every, kept in course.calls(CHUNK_STEPS * 16 // max(number, LANES)):
             if stop.is_set():
                 break
             increments = None if noise is None else noise.rows(chosen, taken, saves * every, h)
@@ -139,8 +139,9 @@ def run_compiled(
                 stepper.run(lanes.first, blocks, h, saves, every, increments)[:number],
                 taken + saves * every,
             )
-            if place is not None:
+            if kept:
                 record.keep(chosen, place, states)
+                place += saves
             tally.add(number * saves * every / course.steps)
         with turn:
             after = {name: value[:number] for name, value in stepper.fields(blocks, TELLING).items()}
@@ -160,18 +161,6 @@ def follow_compiled(family: Family, method: OneStepMethod, x: np.ndarray, h: np.
     states = lanes.stepper.run(lanes.first, blocks, np.resize(h, len(blocks) * LANES), steps, 1)
     after = {name: values[:number] for name, values in lanes.stepper.fields(blocks).items()}
     return after, np.asarray(states)[:number, :, :-2]
-
-
-def calls(course: Course, limit: int):
-    """The calls ``(h, saves, every)`` of an engine, and the place of the first state that is kept of each, if any."""
-    place = 1
-    for part in course.parts:
-        done = 0
-        for h, saves, every in part.calls(limit):
-            done += saves * every
-            kept = part.every is not None or done >= part.steps
-            yield h, saves, every, place if kept else None
-            place += saves if kept else 0
 
 
 # -- the array engine -------------------------------------------------------------------------------------------------
@@ -198,16 +187,17 @@ def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tall
         state = before = begin_all(family.form, parameters, axes, method, jnp.asarray(record.x0[chosen]))
         first = {name: np.asarray(value) for name, value in before._asdict().items()}
         record.begin(chosen, first["x"], first["energy"], first["entropy"])
-        taken = 0
+        taken, place = 0, 1
         try:
-            for h, saves, every, place in calls(course, limit):
+            for h, saves, every, keep in course.calls(limit):
                 numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
                 increments = None if noise is None else array.rows(noise.rows(chosen, taken, saves * every, h))
                 state, kept = advance_all(family.form, parameters, axes, method, state, *numbers, increments)
                 taken += saves * every
-                if place is not None:
+                if keep:
                     columns = [kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])]
                     record.keep(chosen, place, np.concatenate(columns, axis=-1))
+                    place += saves
                 tally.add(number * saves * every / course.steps)
         except KeyboardInterrupt:
             interrupted = True

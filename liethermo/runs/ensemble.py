@@ -26,8 +26,7 @@ from .preparation import as_family, as_run, begun, check_choice, decided, laws_o
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
-from .stepwise import stops_of
-from .timetable import Course
+from .timetable import Course, stops_of
 
 __all__ = ["THREADS", "Ensemble", "ensemble"]
 

@@ -19,7 +19,7 @@ from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from .preparation import as_run, begun, check_choice, decided, prepared
 from .progress import Progress
 from .run import Run
-from .timetable import Timetable
+from .timetable import Course, stops_of
 from .watch import Watch
 
 UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
@@ -128,16 +128,21 @@ def integrate(
             "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
             "are for runs without"
         )
-    table = Timetable(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, save_every)
-    x = begun(system, x0, table.start, attitude)
+    h = t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step
+    course = Course(t_span, h, save_every)
+    if save_at is not None:
+        course = Course(t_span, h, None, stops_of(save_at, course.start, course.end))
+    x = begun(system, x0, course.start, attitude)
     if reason := system.outside(x):
         raise InputError(f"the run cannot start at this x0: {reason}")
-    run = Run(system, method, x, table, save_to, engine, noise)
-    with Progress((table.start, table.end), progress) as bar:
-        if looks:
-            run.by_single_steps(bar, step if adaptive else table.h, save_at, until, dense)
+    run = Run(system, method, x, course, save_to, engine, noise, dense)
+    with Progress((course.start, course.end), progress) as bar:
+        if isinstance(method, Reference):
+            run.by_scipy(bar)
+        elif adaptive or until is not None:
+            run.by_paces(bar, step if adaptive else course.h, until)
         else:
-            (run.by_scipy if isinstance(method, Reference) else run.by_steps)(bar)
+            run.by_steps(bar)
     solution = run.solution()
     if save_to is not None:
         try:

@@ -19,14 +19,13 @@ from ..results.dense import Dense
 from ..results.solution import Solution
 from ..results.status import Stats, Status
 from ..tracing.interpret import at_points
-from .adaptive import Adaptive
+from .adaptive import Adaptive, pacing_of
 from .ending import STOPPED, given_up, stats_of, status_of, stopped_by
 from .events import Event
 from .fluctuations import Fluctuations, Path
 from .presented import Again, presented, provenance_of
-from .stepwise import MOST_KEPT, Steps, stops_of
-from .stepwise import run as run_stepwise
-from .timetable import Timetable
+from .stepwise import MOST_KEPT, Steps, follow
+from .timetable import Course
 from .watch import Watch
 
 MOST_LISTED = 1_000
@@ -39,22 +38,32 @@ CHECKPOINT_SECONDS = 60.0
 class Run:
     """A run under way: what has been saved, and how it stands."""
 
-    def __init__(self, system, method, x0, table: Timetable, save_to, engine, noise: Fluctuations | None = None):
-        self.system, self.method, self.table = system, method, table
+    def __init__(
+        self,
+        system,
+        method,
+        x0,
+        course: Course,
+        save_to,
+        engine: str,
+        noise: Fluctuations | None = None,
+        dense: bool = False,
+    ):
+        self.system, self.method, self.course = system, method, course
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
-        self.times = [np.array([table.start])]
+        self.times = [np.array([course.start])]
         self.states = [np.asarray(x0)[None]]
         self.values: list[np.ndarray] = []  # energies and entropies of the states
         self.status: Status | None = None
         self.stats = Stats()
-        self.step: float | Adaptive = table.h
+        self.step: float | Adaptive = course.h
         self.event_time: float | None = None
-        self.dense: Dense | None = None
+        self.path = [(self.times[0], self.states[0])] if dense else None  # all states
         self.taken: list[np.ndarray] = []  # sizes of steps that are looked at, and whether states after them are kept
         self.noise = noise
         path = None if noise is None or not method.increments else Path(noise, method.increments)
-        self.engine = Chosen(system, method, engine, table.steps, path)
+        self.engine = Chosen(system, method, engine, course.steps, path)
 
     @property
     def now(self) -> float:
@@ -69,67 +78,63 @@ class Run:
         try:
             state = self.engine.begin(self.states[0][0])
             self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-            for h, saves, every in self.table.calls(saves=self.engine.portion):
-                state = self._advance(state, h, saves, every)
-                bar.update(self.now)
+            for h, saves, every, kept in self.course.calls(saves=self.engine.portion, each=self.path is not None):
+                state = self._advance(state, h, saves, every, kept)
+                bar.update(float(self.course.reached(np.asarray(int(state.step)))))
                 if int(state.status) != Code.COMPLETED:
                     break
                 self._checkpoint(state)
         except STOPPED as error:
             stopped = stopped_by(error)
         if state is None:
-            self.values = [self._energies(self.states[0])]
-            self.status = Status(Code.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.table.start)
+            self._not_begun(stopped)
             return
         step = int(state.step)
-        now, h = self.table.time(step), self.table.last if step >= self.table.full else self.table.h
+        now, h = float(self.course.reached(np.asarray(step))), self.course.size(step)
+        if now > self.now:  # it ended between two states that are kept
+            self._keep(
+                np.array([now]), np.asarray(state.x)[None], np.array([[float(state.energy), float(state.entropy)]])
+            )
         self.stats, self.status = stats_of(state), status_of(self.engine, state, now, h, stopped)
 
-    def by_single_steps(self, bar, step: float | Adaptive, save_at, until, dense: bool) -> None:
-        """Look at every step: adaptive ones, events, outputs at given times, dense output."""
-        start, end, every = self.table.start, self.table.end, self.table.every or 1
-        stops, watch = stops_of(save_at, start, end), until if isinstance(until, Watch) else None
+    def _not_begun(self, stopped: str) -> None:
+        self.values = [self._energies(self.states[0])]
+        self.status = Status(Code.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.course.start)
+
+    def by_paces(self, bar, step: float | Adaptive, until) -> None:
+        """Look at every step: adaptive ones, and those with events."""
+        start, end, every = self.course.start, self.course.end, self.course.every or 1
+        at_stops, watch = self.course.every is None, until if isinstance(until, Watch) else None
+        stops = np.array([part.end for part in self.course.parts])
         event = None if until is None or watch else Event(until, self.system)
-        self.step, all_times, all_states, last = step, [self.times[0]], [self.states[0]], None
+        self.step, last = step, None
 
         def keep(steps: Steps):
             nonlocal last
             ends = steps.t[1:]
-            kept = np.isin(ends, stops) if save_at is not None else steps.number % every == 0
+            kept = np.isin(ends, stops) if at_stops else steps.number % every == 0
             self._append(steps, kept)
             self.taken.append(np.stack([steps.h, kept]))
             last = None if kept[-1] else steps
-            if dense:
-                all_times.append(ends)
-                all_states.append(steps.x)
+            if self.path is not None:
+                self.path.append((ends, steps.x))
             bar.update(ends[-1])
             self._checkpoint(steps.after)
 
-        state = None
+        pacing = pacing_of(step, self.method, end - start, event)
         try:
-            state = self.engine.begin(self.states[0][0])
+            paces = self.engine.paces(pacing, self.states[0][0], start, float(stops[0]), end - start)
         except STOPPED as error:
-            self.values = [self._energies(self.states[0])]
-            self.status = Status(Code.INTERRUPTED, f"stopped {stopped_by(error)} before the first step", 0, start)
+            self._not_begun(stopped_by(error))
             return
+        state = paces.state()
         self.values = [np.array([[float(state.energy), float(state.entropy)]])]
-        numbers = self.system.dim * ((1 if save_at is None else 0) / every + (1 if dense else 0))
-        outcome = run_stepwise(
-            self.engine,
-            state,
-            (start, end),
-            step,
-            stops,
-            event,
-            keep,
-            most_kept=MOST_KEPT / max(numbers, 1e-9),
-            watch=watch,
-        )
+        numbers = self.system.dim * ((0 if at_stops else 1) / every + (self.path is not None))
+        room = MOST_KEPT / max(numbers, 1e-9)
+        outcome = follow(self.engine, paces, pacing, stops, keep, room, watch)
         if last is not None:
             self._append(last, slice(-1, None))
         self.event_time = outcome.event_time
-        if dense:
-            self.dense = Dense(np.concatenate(all_times), np.concatenate(all_states), self.engine.ends)
         state, now = outcome.state, self.now
         self.stats = dataclasses.replace(stats_of(state), rejected=outcome.rejected)
         steps = int(state.step)
@@ -153,31 +158,32 @@ class Run:
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:
-        values = np.column_stack([steps.energy, steps.entropy])[kept]
-        times, states = steps.t[1:][kept], steps.x[kept]  # before any is kept: there may be no memory left
-        self.times.append(times)
-        self.states.append(states)
-        self.values.append(values)
+        self._keep(steps.t[1:][kept], steps.x[kept], np.column_stack([steps.energy, steps.entropy])[kept])
 
-    def _advance(self, state, h, saves, every):
+    def _advance(self, state, h, saves, every, kept: bool):
         before = int(state.step)
         state, (x, energy, entropy, reached) = self.engine.advance(state, h, saves, every)
-        kept = int(np.asarray(reached).sum())
-        states, steps = np.asarray(x)[:kept], before + every * np.arange(1, kept + 1)
-        values = np.stack([np.asarray(energy)[:kept], np.asarray(entropy)[:kept]], axis=1)
-        if int(state.step) > before + every * kept:  # it failed between two saves: keep what there is
-            states, steps = np.concatenate([states, np.asarray(state.x)[None]]), np.append(steps, int(state.step))
-            values = np.append(values, [[float(state.energy), float(state.entropy)]], axis=0)
-        self.states.append(states)
-        self.values.append(values)
-        self.times.append(self.table.reached(steps))
+        number = int(np.asarray(reached).sum())
+        steps, x = before + every * np.arange(1, number + 1), np.asarray(x)[:number]
+        times, values = self.course.reached(steps), np.column_stack([energy, entropy])[:number]
+        if self.path is not None:
+            self.path.append((times, x))
+            chosen = np.isin(steps, self.course.counts)
+            times, x, values = times[chosen], x[chosen], values[chosen]
+        if kept:
+            self._keep(times, x, values)
         return state
+
+    def _keep(self, times: np.ndarray, x: np.ndarray, values: np.ndarray) -> None:
+        self.times.append(times)
+        self.states.append(x)
+        self.values.append(values)
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
 
     def by_scipy(self, bar) -> None:
         """One call of the reference solver, its output at the times a fixed step would have."""
-        times = self.table.times
+        times = self.course.times
         self.values = [self._energies(self.states[0])]
         x, evaluations, message, interrupted = self.method.trajectory(self.system, self.states[0][0], times)
         self.times, self.states = [times[: len(x)]], [x]
@@ -216,13 +222,19 @@ class Run:
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),
             event_time=self.event_time,
-            dense=self.dense,
+            dense=self._dense(),
         )
+
+    def _dense(self) -> Dense | None:
+        if self.path is None:
+            return None
+        times, states = zip(*self.path, strict=True)
+        return Dense(np.concatenate(times), np.concatenate(states), self.engine.ends)
 
     def _longest(self, number: int) -> np.ndarray:
         """The longest of the steps after each state that is kept."""
         if not self.taken:
-            return np.full(number, self.table.h if self.table.full else self.table.last)
+            return self.course.longest[:number]
         h, kept = np.concatenate(self.taken, axis=1)
         return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, kept[:-1])))[:number]
 
@@ -237,7 +249,9 @@ class Run:
 
     def _provenance(self) -> dict[str, Any]:
         return {
-            **provenance_of(self.system, self.method, self.step, (self.table.start, self.table.end), self.table.every),
+            **provenance_of(
+                self.system, self.method, self.step, (self.course.start, self.course.end), self.course.every
+            ),
             "engine": None if isinstance(self.method, Reference) else self.engine.name,
             "noise": None if self.noise is None else self.noise.listed(),
             "x0": np.asarray(self.states[0][0]).tolist() if self.system.dim <= MOST_LISTED else None,

@@ -14,14 +14,10 @@ import numpy as np
 
 from ..engines.choice import Chosen
 from ..engines.codes import Code
-from ..engines.paced import Guide
-from ..engines.pacing import FINISHED, TOLD
+from ..engines.paced import Guide, OnePace
+from ..engines.pacing import FINISHED, TOLD, Pacing
 from ..engines.stepping import State
-from ..errors import InputError
-from .adaptive import Adaptive, pacing_of
 from .ending import STOPPED, stopped_by
-from .events import Event
-from .timetable import Timetable
 from .watch import Watch
 
 TOGETHER = 64
@@ -73,48 +69,37 @@ class Steps(NamedTuple):
 Keep = Callable[[Steps], None]
 
 
-def run(
+def follow(
     engine: Chosen,
-    state: State,
-    span: tuple[float, float],
-    step: float | Adaptive,
+    paces: OnePace,
+    pacing: Pacing,
     stops: np.ndarray,
-    event: Event | None,
     keep: Keep,
     most_kept: float = MOST_KEPT,
     watch: Watch | None = None,
 ) -> Outcome:
-    """Step from the start of the span to its end, an event, a failure or Ctrl-C.
+    """Follow a run from its start to its end, an event, a failure or Ctrl-C.
 
     Parameters
     ----------
-    state : State
-        As the engine's ``begin`` gives it.
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
     keep : function of Steps
-        Told of every step taken, of many adaptive ones together.
+        Told of every step taken, of many together.
     most_kept : float
-        Adaptive steps after which there is no room for more.
+        Steps after which there is no room for more.
     watch : Watch, optional
         Looks at each step, and may end the run in it.
     """
-    outcome, stops = Outcome(state), stops[stops > span[0]]
+    outcome = Outcome(paces.state())
     try:
-        if isinstance(step, Adaptive) or event is not None or watch is not None:
-            _paced(engine, outcome, span, step, stops, event, keep, most_kept, watch)
-        else:
-            _fixed(engine, outcome, span, step, stops, keep)
+        _follow(engine, paces, pacing, outcome, stops, keep, most_kept, watch)
     except STOPPED as error:
         outcome.stopped = stopped_by(error)
     return outcome
 
 
-def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, watch: Watch | None) -> None:
-    """Adaptive steps or events, by the paces that ensembles have too, so many attempts together."""
-    length = span[1] - span[0]
-    pacing = pacing_of(step, engine.method, length, event)
-    paces = engine.paces(pacing, np.asarray(outcome.state.x), span[0], float(stops[0]), length)
+def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None) -> None:
     guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
     outcome.jumps = guide.jumps
 
@@ -156,33 +141,6 @@ def _paced(engine, outcome: Outcome, span, step, stops, event, keep, most_kept, 
         outcome.limit = "sight" if told("cause") == Code.COMPLETED else ""
 
 
-def _fixed(engine, outcome: Outcome, span, step: float, stops, keep) -> None:
-    t = span[0]
-    for stop in map(float, stops):
-        table, since = Timetable((t, stop), step, None), int(outcome.state.step)
-        while t < table.end:
-            n, state = int(outcome.state.step) - since, outcome.state
-            h, reached = table.h if n < table.full else table.last, table.time(n + 1)
-            new = engine.step(state, h)
-            if int(new.status) != Code.COMPLETED:
-                outcome.state = new
-                return
-            keep(_single(t, reached, h, state, new))
-            t, outcome.state = reached, new
-
-
 def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:
     x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in TOLD[:4])
     return Steps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)
-
-
-def stops_of(save_at, start: float, end: float) -> np.ndarray:
-    """The times at which steps have to end, the end of the span among them."""
-    if save_at is None:
-        return np.array([end])
-    times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
-    if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
-        raise InputError(f"save_at is a list of times, not {save_at!r}")
-    if times.min() < start or times.max() > end:
-        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
-    return np.unique([*times, end])

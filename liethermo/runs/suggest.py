@@ -16,9 +16,9 @@ from ..engines.pacing import DEADBAND, rate_of
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..systems import System
-from .adaptive import Adaptive
+from .adaptive import Adaptive, pacing_of
 from .preparation import begun, of_steps
-from .stepwise import Outcome, Steps, run
+from .stepwise import Outcome, Steps, follow
 
 
 @by_own_settings
@@ -154,17 +154,18 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
         if len(taken) == 30:
             raise _EnoughError
 
-    def follow(rate: float) -> Outcome:
+    def tried(rate: float) -> Outcome:
         """Over a span in which what goes at this rate goes far."""
         taken.clear()
         iterations[1:] = []
-        return run(engine, state, (0.0, 1e6 / rate), Adaptive(rtol), np.array([1e6 / rate]), None, keep)
+        length = 1e6 / rate
+        pacing = pacing_of(Adaptive(rtol), used, length, None)
+        return follow(engine, engine.paces(pacing, x, 0.0, length, length), pacing, np.array([length]), keep)
 
     with contextlib.suppress(_EnoughError):
         engine, rate = Chosen(system, used, "auto", 1), speed / max(size, 1e-300)
-        state = engine.begin(x)
-        if follow(rate).underflow is not None and (growth := rate_of(system, used, x)) > rate:
-            follow(growth)  # from near a rest, where steps are short beside the time that the state takes
+        if tried(rate).underflow is not None and (growth := rate_of(system, used, x)) > rate:
+            tried(growth)  # from near a rest, where steps are short beside the time that the state takes
     if len(taken) < 2:
         raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < DEADBAND[1] * a), len(taken) - 1)

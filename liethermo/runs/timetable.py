@@ -71,16 +71,24 @@ class Timetable:
         """The times at :attr:`counts`."""
         return self.reached(self.counts)
 
-    def calls(self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES) -> Iterator[tuple[float, int, int]]:
+    @property
+    def longest(self) -> float:
+        """The longest of the steps."""
+        return self.h if self.full else self.last
+
+    def calls(
+        self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES, each: bool = False
+    ) -> Iterator[tuple[float, int, int]]:
         """The run in calls ``(h, saves, every)`` of an engine: so many saves, each after so many steps of size h.
 
-        None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save.
+        None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save. With ``each``
+        every state is saved.
         """
-        done = 0
+        done, own = 0, 1 if each else self.every
         while done < self.full:
             left = self.full - done
-            every = min(self.every or limit, left)
-            kept = 1 if self.every is None else max(1, min(saves, limit // every, left // every))
+            every = min(own or limit, left)
+            kept = 1 if own is None else max(1, min(saves, limit // every, left // every))
             yield self.h, kept, every
             done += kept * every
         if self.last:
@@ -111,6 +119,35 @@ class Course:
             ends = [float(t) for t in stops if t > self.start]
             self.parts = [Timetable(part, step, None) for part in itertools.pairwise([self.start, *ends])]
 
+    def calls(
+        self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES, each: bool = False
+    ) -> Iterator[tuple[float, int, int, bool]]:
+        """The run in calls of an engine as those of :meth:`Timetable.calls`, and whether what they save is kept."""
+        for part in self.parts:
+            done = 0
+            for h, kept, every in part.calls(limit, saves, each):
+                done += kept * every
+                yield h, kept, every, each or part.every is not None or done >= part.steps
+
+    def part_of(self, step: int) -> Timetable:
+        """The part that the step after so many belongs to."""
+        for part in self.parts[:-1]:
+            if step < part.steps:
+                return part
+            step -= part.steps
+        return self.parts[-1]
+
+    def size(self, step: int) -> float:
+        """The size of the step after so many."""
+        part = self.part_of(step)
+        before = sum(other.steps for other in self.parts[: self.parts.index(part)])
+        return part.last if step - before >= part.full else part.h
+
+    @property
+    def longest(self) -> np.ndarray:
+        """The longest of the steps after each state that is kept."""
+        return np.concatenate([np.full(len(part.counts) - 1, part.longest) for part in self.parts])
+
     @property
     def steps(self) -> int:
         """How many steps there are."""
@@ -136,6 +173,18 @@ class Course:
         starts, ends = (np.array([getattr(part, name) for part in self.parts])[place] for name in ("start", "end"))
         last = steps >= before[place + 1]
         return np.where(last, ends, np.minimum(starts + (steps - before[place]) * self.h, ends))
+
+
+def stops_of(save_at, start: float, end: float) -> np.ndarray:
+    """The times at which steps have to end, the end of the span among them."""
+    if save_at is None:
+        return np.array([end])
+    times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
+    if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
+        raise InputError(f"save_at is a list of times, not {save_at!r}")
+    if times.min() < start or times.max() > end:
+        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
+    return np.unique([*times, end])
 
 
 def _checked_span(span) -> tuple[float, float]:

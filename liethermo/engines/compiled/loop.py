@@ -31,19 +31,12 @@ class Piece(NamedTuple):
 
 
 class Layout:
-    """Where arrays lie one after another: their first rows by name, and how many rows there are.
+    """Where arrays of some shapes lie one after another: their first rows by name, and how many rows there are."""
 
-    Parameters
-    ----------
-    shapes : mapping
-    passing : sequence of str
-        Those at the end that are never written down, and have no rows.
-    """
-
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], passing: Sequence[str] = ()):
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
         self.sizes = {name: math.prod(shape) for name, shape in shapes.items()}
         ends = list(itertools.accumulate(self.sizes.values(), initial=0))
-        self.rows, self.height = dict(zip(self.sizes, ends, strict=False)), ends[-1 - len(passing)]
+        self.rows, self.height = dict(zip(self.sizes, ends, strict=False)), ends[-1]
 
 
 def step_loop(

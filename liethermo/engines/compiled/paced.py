@@ -135,10 +135,14 @@ class LanePaces:
         self.blocks, self.number = self.stepper.of_rows(self._rows(chosen)), len(chosen)
 
 
+def paced_stepper_for(system: System, method: OneStepMethod, pacing: Pacing) -> tuple[PacedStepper, np.ndarray]:
+    """The stepper for one trajectory of a system, and the parameters of all three."""
+    return paced_stepper_of(Form.of(system), numbers_of(system, method), method, pacing)
+
+
 def lane_pace(
     system: System, method: OneStepMethod, pacing: Pacing, x, t: float, stop: float, length: float
 ) -> LanePaces:
     """One trajectory, a block by itself."""
-    parameters = numbers_of(system, method)
-    stepper, whole = paced_stepper_of(Form.of(system), parameters, method, pacing)
+    stepper, whole = paced_stepper_for(system, method, pacing)
     return LanePaces(stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)

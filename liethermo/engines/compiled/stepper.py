@@ -22,7 +22,7 @@ import numpy as np
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.calls import deferred
-from ...tracing.remembered import Latest, remembered
+from ...tracing.remembered import Latest
 from ...tracing.scalarize import scalarize
 from ..array import portion_of
 from ..rules import RULES, Rules
@@ -52,8 +52,13 @@ class CompiledEngine:
     name = "compiled"
 
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
-        self._stepper, self._parameters = stepper_for(system, method, rules)
-        self.portion = portion_of(system)
+        self._parameters, self.portion = numbers_of(system, method), portion_of(system)
+        self._form, self._method, self._rules = Form.of(system), method, rules
+
+    @property
+    def _stepper(self) -> Stepper:
+        """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
+        return stepper_of(self._form, self._parameters, self._method, rules=self._rules)
 
     @property
     def operations(self) -> int:
@@ -125,9 +130,8 @@ class Stepper:
         self._shapes |= {"before": (0 if method.explicit else method.stages, slopes[1]), "dW": (method.increments,)}
         step = self._piece(self.step, (*self.given, *self.names), self.names)
         if method.explicit:
-            step = step._replace(
-                program=step.program.factored([i for i, a in enumerate(step.arguments) if a not in "ph"])
-            )
+            changing = [i for i, a in enumerate(step.arguments) if a not in ("p", "h")]
+            step = step._replace(program=step.program.factored(changing))
         begin = self._piece(self.begun, ("p", "x", *self.begins), self.names)
         self._pieces = {"step": step, "begin": begin}
         handed = 0 if method.explicit else sum(math.prod(self.shape(name)) for name in (*SOLVED, *GIVEN))
@@ -395,10 +399,3 @@ def key_of(forms: Sequence[Form], parameters: np.ndarray, varies: np.ndarray, la
 def remembered_stepper(key: tuple, make: Callable[[], Any]) -> Any:
     """The stepper with a key, made where there is none."""
     return _steppers.find(key, make)
-
-
-@remembered
-def stepper_for(system: System, method: OneStepMethod, rules: Rules = RULES) -> tuple[Stepper, np.ndarray]:
-    """The stepper for one trajectory of a system, and the parameters of both."""
-    parameters = numbers_of(system, method)
-    return stepper_of(Form.of(system), parameters, method, rules=rules), parameters
