@@ -78,6 +78,7 @@ from .studies.study import Study
 from .systems import (
     AttitudeSystem,
     ChartSystem,
+    ChetaevSystem,
     ComposedSystem,
     ContactSystem,
     Copies,
@@ -106,6 +107,7 @@ __all__ = [
     "AxiomError",
     "CasimirError",
     "ChartSystem",
+    "ChetaevSystem",
     "ComposedSystem",
     "ContactSystem",
     "ConvergenceError",

@@ -11,6 +11,7 @@ from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
 from .algebras.invariants import TracePolynomial
+from .algebras.killing import trilinear_form
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.polynomial import Polynomial
@@ -166,6 +167,7 @@ __all__ = [
     "sp",
     "su",
     "testing",
+    "trilinear_form",
     "u",
 ]
 

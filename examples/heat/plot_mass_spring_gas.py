@@ -77,7 +77,7 @@ def draw(case, runs):
 #
 # The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. As found:
 # that of scheme 1 decreases until the mass rests; that of scheme 2 is rounding where nothing rubs, and *grows* with
-# the heat to 1.5e-11, where it stays; that of scheme 3 swings below 3e-11 and settles there too. Where the mass has
+# the heat to 1.5e-11, where it stays; that of scheme 3 swings up to 3.01e-11 and settles there too. Where the mass has
 # come to rest all three have lost the same.
 
 runs = study(1)

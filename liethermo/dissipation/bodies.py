@@ -31,30 +31,53 @@ class HeatConduction(Dissipation):
     energy is constant; the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In
     metriplectic form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
 
+    The temperatures are those of the gradient that it is handed, so a discretisation has discrete ones, which keep both
+    laws for every energy. With ``factors="midpoint"`` the Fourier factors alone are taken at the point x instead, as
+    SML §6.2 prints them; the energy is constant then too, but the entropy is known to grow for quadratic energies only
+    [SML Lemma 6.2].
+
     Parameters
     ----------
     graph : Edges
         Of bodies, with their conductances (power / temperature).
+    laws : tuple of functions of (T_i, T_j, x), optional
+        In place of the weights: the conductance of each edge, >= 0.
+    factors : {"discrete", "midpoint"}
     """
 
     first: Indices = eqx.field(static=True)
     second: Indices = eqx.field(static=True)
     conductance: jax.Array
+    laws: tuple[Callable, ...]
+    factors: str = eqx.field(static=True)
 
-    def __init__(self, graph: Edges):
+    def __init__(self, graph: Edges, laws: tuple[Callable, ...] = (), factors: str = "discrete"):
         self.first, self.second = Indices(graph.first), Indices(graph.second)
-        self.conductance = graph.weight
+        self.conductance, self.laws, self.factors = graph.weight, laws, factors
+
+    @property
+    def entropy_law(self) -> Law | None:
+        return "nondecreasing" if self.factors == "discrete" else None
+
+    def conductances(self, x, T_i, T_j) -> jax.Array:
+        """Those of the edges between bodies of these temperatures, shape (edges,); NaN where one is negative."""
+        if not self.laws:
+            return self.conductance
+        found = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
+        return jnp.where(found >= 0.0, found, jnp.nan)
 
     def force(self, system, x, dH, dS, dL):
         S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
         T, along = _positive(dH[S]), dS[S]
-        heat = self.conductance * (along[i] * T[j] - along[j] * T[i])
-        return jnp.zeros_like(x).at[S[i]].add(heat / T[i]).at[S[j]].add(-heat / T[j])
+        at = T if self.factors == "discrete" else _positive(system.energy.gradient(x)[S])
+        heat = self.conductances(x, at[i], at[j]) * (along[i] * at[j] - along[j] * at[i])
+        share = heat / (at[i] * at[j])
+        return jnp.zeros_like(x).at[S[i]].add(share * T[j]).at[S[j]].add(-share * T[i])
 
     def factor(self, system, x, dH, dL):
         S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
         T = _positive(dH[S])
-        root = jnp.sqrt(self.conductance * T[i] * T[j])
+        root = jnp.sqrt(self.conductances(x, T[i], T[j]) * T[i] * T[j])
 
         def times(w):
             return jnp.zeros_like(x).at[S[i]].add(root * w / T[i]).at[S[j]].add(-root * w / T[j])
@@ -62,6 +85,8 @@ class HeatConduction(Dissipation):
         return Factor(len(i), times)
 
     def couplings(self, system):
+        if self.laws:
+            return None  # they may depend on everything
         S = _places(system).S
         return cliques(np.stack([S[np.asarray(self.first)], S[np.asarray(self.second)]], axis=1), system.dim)
 

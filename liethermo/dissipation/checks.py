@@ -75,8 +75,8 @@ def not_a_rate(form, dissipation: object, what: str) -> None:
         )
 
 
-def semidefinite(form, what: str) -> jax.Array:
-    """A form as a symmetric positive semidefinite matrix (or a traced one)."""
+def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
+    """A form as a positive semidefinite matrix (or a traced one): symmetric, or with a symmetric part that is."""
     matrix = real_array(form)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
@@ -90,9 +90,9 @@ def semidefinite(form, what: str) -> jax.Array:
         raise InputError(f"{what} must be finite, not {numbers.tolist()}")
     scale = float(np.abs(numbers).max())
     asymmetry = float(np.abs(numbers - numbers.T).max())
-    if not asymmetry <= 1e-12 * scale:
+    if symmetric and not asymmetry <= 1e-12 * scale:
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
-    lowest = float(np.linalg.eigvalsh(numbers)[0])
+    lowest = float(np.linalg.eigvalsh(0.5 * (numbers + numbers.T))[0])
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
             f"{what} {NEGATIVE}".format(value=lowest),

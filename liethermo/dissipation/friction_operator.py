@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
+from ..errors import InputError
 from .base import Dissipation
 from .checks import check_matrix, checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
@@ -29,23 +31,34 @@ class FrictionOperator(Dissipation):
     grad H. K_d is semidefinite, has dH in its kernel, keeps every other kernel vector of K that is orthogonal to grad H
     (momentum maps), and tends to K.
 
+    The remark itself takes the complement of the kernel that is orthogonal in a metric G, and the ``projection``
+    "orthogonal" does: ``P = 1 - dH (G dH)^T / (dH . G dH)``. The two differ by the turn from grad H to dH, so by
+    O(h^2) in a step, and keep the same laws; the orthogonal one moves kernel vectors of K that dH is not orthogonal to,
+    and needs no safeguard where dH turns away from grad H.
+
     Parameters
     ----------
     K : function from x, shape (n,), to a matrix (n, n), or a constant matrix
     rate : float, >= 0
     project : bool
         Take any symmetric semidefinite K, and let its projection off grad H act.
+    projection : {"oblique", "orthogonal"}
+        How the kernel is moved to the discrete gradient; G is the metric of the space.
     """
 
     K: Callable | jax.Array
     rate: jax.Array
     project: bool = eqx.field(static=True)
+    projection: str = eqx.field(static=True)
 
-    def __init__(self, K, rate=1.0, project: bool = False):
+    def __init__(self, K, rate=1.0, project: bool = False, projection: Literal["oblique", "orthogonal"] = "oblique"):
         not_a_rate(K, self, "the operator K")
         self.K = K if callable(K) else semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
         self.project = bool(project)
+        if projection not in ("oblique", "orthogonal"):
+            raise InputError(f"projection is 'oblique' or 'orthogonal', not {projection!r}")
+        self.projection = projection
 
     def prepared(self, system):
         check_matrix(self.K, system.dim, "the friction operator K")
@@ -76,10 +89,10 @@ class FrictionOperator(Dissipation):
 
         return Factor(system.dim, times).scaled(self.rate)
 
-    @staticmethod
-    def _along(system, x, dH):
+    def _along(self, system, x, dH):
         """The vector a with ``a . dH = 1`` that P projects along."""
-        gradient, raised = system.raised(x, system.energy.gradient(x)), system.raised(x, dH)
+        raised = system.raised(x, dH)
+        gradient = raised if self.projection == "orthogonal" else system.raised(x, system.energy.gradient(x))
         overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
         safe = overlap > 1e-3 * square

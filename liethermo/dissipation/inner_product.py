@@ -52,6 +52,11 @@ class InnerProductDissipation(OfBracket):
     K: Any
 
     def __init__(self, K):
+        if callable(K):
+            raise InputError(
+                "the inner product 𝒦 is a constant matrix, not a function: one that depends on the state is "
+                "lt.ProjectedMetric(cometric=...), or lt.FrictionOperator(K, project=True)"
+            )
         self.K = semidefinite(K, "the inner product 𝒦")
 
     def prepared(self, system):

@@ -13,7 +13,7 @@ from manifolds._module import Module
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
-from ..systems.simple_closed import timed
+from ..systems.ledger import timed
 from .gas_piston import GAS_CONSTANT, IdealGas
 from .parameters import positive
 

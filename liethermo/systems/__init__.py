@@ -4,6 +4,7 @@ from .attitude import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, Turning
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
+from .chetaev import ChetaevSystem
 from .composed.bodies import Copies, Subsystem
 from .composed.system import ComposedSystem
 from .driven import DrivenSystem, driven
@@ -21,6 +22,7 @@ __all__ = [
     "WITHOUT_IMPULSE",
     "AttitudeSystem",
     "ChartSystem",
+    "ChetaevSystem",
     "ComposedSystem",
     "ContactSystem",
     "Copies",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,17 @@ from manifolds.matrices.linear import solve
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
-from ..functions.checks import check_scalar, check_shape, recognised
+from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, Function, as_energy
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
-from .base import System
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component
+from .ledger import BesideLedger, WithLedger, field
 
 
-class EulerPoincareClosedSystem(System):
-    """``d/dt l_xi = ad*_xi l_xi + f(xi, S)``, ``T S' = -f·xi``, ``T = -l_S > 0``: a body that its friction heats.
+class EulerPoincareClosedSystem(WithLedger):
+    """``d/dt l_xi = ad*_xi l_xi + f + F``, ``T S' = P_H - f·xi``, ``T = -l_S > 0``: a body that its friction heats.
 
     These are the equations (2.4) of a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2
     with ``delta xi = eta' + [xi, eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is
@@ -35,15 +35,20 @@ class EulerPoincareClosedSystem(System):
     parts of a body does not touch its angular momentum. So the Casimirs of the algebra are constants, as functions of
     the body's momentum ``l_xi``, unless f changes them: these are :meth:`casimirs`.
 
-    The state is (xi, S), shape (dim + 1,).
+    The state is (xi, S), shape (dim + 1,). With an external force F or a heat power it has three more components, the
+    work W' = F . xi and the heat Q' = P_H received so far, and the time: see :class:`liethermo.SimpleClosedSystem`.
 
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
     lagrangian : function of (xi, S), xi of shape (dim,), to a scalar
         l, regular: ``l_xi xi`` has an inverse.
-    friction : function of (xi, S) to a covector, shape (dim,), optional
-        f.
+    friction : function of (xi, S), or of (xi, S, t), to a covector, shape (dim,), optional
+        f, with ``f . xi <= 0``.
+    external : function likewise, or an array of shape (dim,); optional
+        F, in the frame of the body.
+    heat_power : function likewise to a scalar, or a number; optional
+        P_H, the heat received per time (power).
     momentum_maps, validate
         As for :class:`System`; functions of (xi, S).
 
@@ -63,42 +68,74 @@ class EulerPoincareClosedSystem(System):
 
     domain: ClassVar[str] = "a positive temperature"
 
-    def __init__(self, algebra: mf.LieAlgebra, lagrangian, friction=None, momentum_maps=(), validate: bool = True):
-        n = algebra.dim
+    def __init__(
+        self,
+        algebra: mf.LieAlgebra,
+        lagrangian,
+        friction=None,
+        momentum_maps=(),
+        validate: bool = True,
+        external=None,
+        heat_power=None,
+    ):
+        n, at = algebra.dim, "(xi, S)"
         check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = settled(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
-        if friction is not None:
-            friction = check_shape(friction, ((n,), ()), (n,), "the friction", "(xi, S)")
-        self.algebra, self.lagrangian, self.friction = algebra, lagrangian, friction
-        self.invariants_of_momentum = {
+        self.algebra, self.lagrangian = algebra, lagrangian
+        self.friction = None if friction is None else field(friction, ((n,), ()), (n,), "the friction", at)
+        self.external = None if external is None else field(external, ((n,), ()), (n,), "the external force", at)
+        self.heat_power = None if heat_power is None else field(heat_power, ((n,), ()), (), "the heat power", at)
+        casimirs = {
             name: recognised(Function(OfMomentum(as_energy(C, "a Casimir"), lagrangian)), n + 1)
             for name, C in algebra.leading_casimirs()
         }
+        self.invariants_of_momentum = {name: C.on(range(n + 1)) if self.receives else C for name, C in casimirs.items()}
         structure = OnAlgebra(algebra, lagrangian)
         if not is_traced(lagrangian):
             hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
             if singular_everywhere(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
-        energy = recognised(ReducedEnergy(lagrangian), n + 1)
-        forces = None if friction is None else AlgebraFriction(friction)
-        self._build(structure, n + 1, energy, entropy_component(n + 1), forces, momentum_maps, validate)
+        given = (self.friction, self.external, self.heat_power)
+        forces = None if given == (None, None, None) else AlgebraForces(*given)
+        whole, total, energy = self._beside_ledger(structure, n + 1, recognised(ReducedEnergy(lagrangian), n + 1))
+        self._build(whole, total, energy, entropy_component(total, n), forces, momentum_maps, validate)
+
+    def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """xi, S and t of one state; t = 0 where it has none."""
+        n = self.algebra.dim
+        return x[:n], x[n], self.time_of(x)
+
+    @property
+    def structure(self) -> OnAlgebra:
+        """The Poisson structure of (xi, S)."""
+        return cast(OnAlgebra, self.poisson.inner if isinstance(self.poisson, BesideLedger) else self.poisson)
 
     def momentum(self, xi, S) -> jax.Array:
         """``l_xi`` at one point, shape (dim,)."""
         return jax.grad(self.lagrangian)(xi, S)
 
-    def friction_force(self, xi, S) -> jax.Array:
+    def friction_force(self, xi, S, t=0.0) -> jax.Array:
         """f at one point, shape (dim,)."""
-        return jnp.zeros_like(xi) if self.friction is None else jnp.asarray(self.friction(xi, S))
+        return jnp.zeros_like(xi) if self.friction is None else jnp.asarray(self.friction(xi, S, t))
+
+    def external_force(self, xi, S, t=0.0) -> jax.Array:
+        """F at one point, shape (dim,)."""
+        return jnp.zeros_like(xi) if self.external is None else jnp.asarray(self.external(xi, S, t))
+
+    def heating(self, xi, S, t=0.0) -> jax.Array:
+        """P_H."""
+        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(xi, S, t))
 
     def temperature(self, x) -> jax.Array:
         """``T = -l_S`` at a state or a batch of states, shape (...)."""
         by_S = jax.grad(self.lagrangian, argnums=1)
-        return jnp.vectorize(lambda y: -by_S(y[:-1], y[-1]), signature="(n)->()")(self.state(x, batch=True))
+        return jnp.vectorize(lambda y: -by_S(*self.parts(y)[:2]), signature="(n)->()")(self.state(x, batch=True))
 
     def momenta(self, x) -> jax.Array:
         """``l_xi``, shape (..., dim), at a state or a batch of states."""
-        return jnp.vectorize(lambda y: self.momentum(y[:-1], y[-1]), signature="(n)->(m)")(self.state(x, batch=True))
+        return jnp.vectorize(lambda y: self.momentum(*self.parts(y)[:2]), signature="(n)->(m)")(
+            self.state(x, batch=True)
+        )
 
     def casimirs(self) -> dict[str, Energy]:
         return self.invariants_of_momentum
@@ -108,7 +145,8 @@ class EulerPoincareClosedSystem(System):
         return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
-        force, xi = self.friction_force(x[:-1], x[-1]), x[:-1]
+        xi, S, t = self.parts(x)
+        force = self.friction_force(xi, S, t)
         size = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
         return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(size > 0.0, size, 1.0)}
 
@@ -158,21 +196,29 @@ class OnAlgebra(mf.PoissonStructure):
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
 
-class AlgebraFriction(SkewFriction):
-    """The force f and the heat that it makes, for discrete gradients too."""
+class AlgebraForces(SkewFriction):
+    """Friction and the heat that it makes, external force and heat power, for discrete gradients too."""
 
-    friction: Callable
+    friction: Callable | None
+    external: Callable | None
+    heat_power: Callable | None
 
     @property
     def entropy_law(self) -> Law | None:
-        return "nondecreasing"
+        if self.heat_power is not None:
+            return None
+        return "conserved" if self.friction is None else "nondecreasing"
 
     def force(self, system, x, dH, dS, dL):
-        _, W, by_S = system.poisson.rates(x)
-        xi = solve(W, dH[:-1, None])[:, 0]
-        T, f = dH[-1] - jnp.dot(by_S, xi), self.friction(xi, x[-1])
-        S_dot = -jnp.dot(f, xi) / jnp.where(T > 0.0, T, jnp.nan)
-        return jnp.append(solve(W, (f - by_S * S_dot)[:, None])[:, 0], S_dot)
+        n = system.algebra.dim
+        _, S, t = system.parts(x)
+        _, W, by_S = system.structure.rates(x[: n + 1])
+        xi = solve(W, dH[:n, None])[:, 0]  # the velocity and the temperature that the gradient stands for
+        T = dH[n] - jnp.dot(by_S, xi)
+        friction, push, power = (f(xi, S, t) for f in (system.friction_force, system.external_force, system.heating))
+        S_dot = (power - jnp.dot(friction, xi)) / jnp.where(T > 0.0, T, jnp.nan)
+        xi_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
+        return jnp.concatenate([xi_dot, S_dot[None], system.entries(jnp.dot(push, xi), power)])
 
 
 def _temperature(system: EulerPoincareClosedSystem, x):

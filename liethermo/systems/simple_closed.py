@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +17,12 @@ from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.arguments import needed_arguments
-from ..functions.checks import check_shape
 from ..functions.conditions import require
-from ..functions.energy import Energy, Quadratic
+from ..functions.energy import Energy
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities
-
-LEDGER = 3
-"""Components of the ledger of a system that is not isolated: work and heat received, and the time."""
+from .ledger import BesideLedger, WithLedger, field
 
 
 class Forces(SkewFriction):
@@ -52,15 +49,14 @@ class Forces(SkewFriction):
         W, by_S = rates[:, n : 2 * n], rates[:, 2 * n]
         v = solve(W, dH[n : 2 * n, None])[:, 0]  # the velocity and the temperature that the gradient stands for
         T = dH[2 * n] - jnp.dot(by_S, v)
-        friction, push = system.friction_force(q, v, S, t), system.external_force(q, v, S, t)
+        friction, push = system.friction_at(q, v, S, t, T), system.external_force(q, v, S, t)
         power = system.heating(q, v, S, t)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
         v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
-        ledger = jnp.stack([jnp.dot(push, v), power, jnp.ones(())])[: system.dim - (2 * n + 1)]
-        return jnp.concatenate([jnp.zeros(n), v_dot, S_dot[None], ledger])
+        return jnp.concatenate([jnp.zeros(n), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
 
 
-class SimpleClosedSystem(OnVelocities):
+class SimpleClosedSystem(WithLedger, OnVelocities):
     """A simple closed system: a Lagrangian L(q, v, S), friction, an external force and heat from outside [GBY 2.4].
 
     ``d/dt L_v - L_q = F_ext + F_fr`` and ``T S' = P_H - F_fr . v``, ``T = -L_S > 0``, on R^n. The energy
@@ -82,8 +78,8 @@ class SimpleClosedSystem(OnVelocities):
     dim : int
         Components of (q, v, S), 2n + 1; known by itself of an ``lt.Quadratic``.
     friction : function of (q, v, S) or (q, v, S, t), to shape (n,); or a coefficient; optional
-        F_fr, with ``F_fr . v <= 0`` (force). A coefficient R, positive semidefinite, means ``F_fr = -R v``: a number,
-        an array of shape (n,) for a diagonal matrix, or (n, n) (mass / time).
+        F_fr, with ``F_fr . v <= 0`` (force). A coefficient R means ``F_fr = -R v``: a number, an array of shape (n,)
+        for a diagonal matrix, or (n, n), whose symmetric part is positive semidefinite (mass / time).
     external : function likewise, or an array of shape (n,); optional
         F_ext (force).
     heat_power : function likewise to a scalar, or a number; optional
@@ -122,48 +118,35 @@ class SimpleClosedSystem(OnVelocities):
         momentum_maps=(),
         validate: bool = True,
     ):
-        structure, size, energy = self._prepare(_in_one_array(lagrangian), dim)
+        structure, size, energy = self._prepare(in_one_array(lagrangian), dim)
         n = size // 2
         self.friction = _force(friction, n, "friction")
         self.external = None if external is None else _field(external, n, (n,), "the external force")
         self.heat_power = None if heat_power is None else _field(heat_power, n, (), "the heat power")
-        total = size + (LEDGER if self.receives else 0)
-        if self.receives:
-            received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
-            energy = energy.on(range(size)) + received
-        entropy = entropy_component(total, size - 1)
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else Forces(*given)
-        self._build(
-            _WithLedger(structure) if self.receives else structure,
-            total,
-            energy,
-            entropy,
-            forces,
-            momentum_maps,
-            validate,
-        )
+        self._assemble(structure, size, energy, forces, momentum_maps, validate)
+
+    def _assemble(self, structure, size: int, energy: Energy, forces: Forces | None, momentum_maps, validate) -> None:
+        whole, total, energy = self._beside_ledger(structure, size, energy)
+        entropy = entropy_component(total, size - 1)
+        self._build(whole, total, energy, entropy, forces, momentum_maps, validate)
 
     # -- the state --------------------------------------------------------------------------------------------------
 
     @property
-    def degrees_of_freedom(self) -> int:
-        return self.contact.degrees_of_freedom
+    def contact(self) -> mf.LagrangianContact:
+        structure = self.poisson.inner if isinstance(self.poisson, BesideLedger) else self.poisson
+        return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
 
     @property
-    def receives(self) -> bool:
-        """Whether work or heat comes from outside, so that the state has a ledger."""
-        return self.external is not None or self.heat_power is not None
-
-    def numbers(self, x, batch: bool = False):
-        if self.receives and np.ndim(x) > 0 and np.shape(x)[-1] == 2 * self.degrees_of_freedom + 1:
-            x = jnp.concatenate([jnp.asarray(x), jnp.zeros((*np.shape(x)[:-1], LEDGER))], axis=-1)
-        return super().numbers(x, batch)
+    def degrees_of_freedom(self) -> int:
+        return self.own_size // 2
 
     def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """q, v, S and t of one state; t = 0 where it has none."""
         n = self.degrees_of_freedom
-        return x[:n], x[n : 2 * n], x[2 * n], x[-1] if len(x) > 2 * n + 1 else jnp.zeros(())
+        return x[:n], x[n : 2 * n], x[2 * n], self.time_of(x)
 
     def legendre(self, x) -> jax.Array:
         """``FL(q, v, S) = (q, L_v, S)`` at a state or a batch of states, shape (..., 2n + 1)."""
@@ -178,13 +161,7 @@ class SimpleClosedSystem(OnVelocities):
         return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._mechanical(x))
 
     def _mechanical(self, x) -> jax.Array:
-        return self.state(x, batch=True)[..., : 2 * self.degrees_of_freedom + 1]
-
-    @property
-    def ledger(self) -> dict[str, Energy]:
-        size = 2 * self.degrees_of_freedom + 1
-        names = ("work received", "heat received") if self.receives else ()
-        return {name: Quadratic(jnp.zeros(self.dim), jnp.eye(self.dim)[size + i]) for i, name in enumerate(names)}
+        return self.state(x, batch=True)[..., : self.own_size]
 
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
@@ -199,6 +176,11 @@ class SimpleClosedSystem(OnVelocities):
     def friction_force(self, q, v, S, t) -> jax.Array:
         """F_fr, shape (n,)."""
         return jnp.zeros_like(v) if self.friction is None else jnp.asarray(self.friction(q, v, S, t))
+
+    def friction_at(self, q, v, S, t, T) -> jax.Array:
+        """F_fr where a discretisation has the temperature T, shape (n,)."""
+        del T
+        return self.friction_force(q, v, S, t)
 
     def external_force(self, q, v, S, t) -> jax.Array:
         """F_ext, shape (n,)."""
@@ -226,26 +208,6 @@ def _temperature(system: SimpleClosedSystem, x):
     return system.temperature(x)
 
 
-class _WithLedger(mf.PoissonStructure):
-    """A structure beside components that it does not move."""
-
-    inner: mf.Cosymplectic
-
-    @property
-    def contact(self) -> mf.SplitContact:
-        return self.inner.contact
-
-    @property
-    def dim(self) -> int:
-        return self.inner.dim + LEDGER
-
-    def tensor(self, x) -> jax.Array:
-        return jnp.pad(self.inner.tensor(x[:-LEDGER]), ((0, LEDGER), (0, LEDGER)))
-
-    def sharp(self, x, alpha) -> jax.Array:
-        return jnp.pad(self.inner.sharp(x[:-LEDGER], alpha[:-LEDGER]), (0, LEDGER))
-
-
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
@@ -259,24 +221,6 @@ class _Joined(Module):
         return self.function(x[:n], x[n : 2 * n], x[2 * n])
 
 
-class _Steady(Module):
-    """A function of (q, v, S) as one of (q, v, S, t)."""
-
-    function: Callable
-
-    def __call__(self, q, v, S, t):
-        del t
-        return self.function(q, v, S)
-
-
-class _Constant(Module):
-    value: jax.Array
-
-    def __call__(self, q, v, S, t):
-        del q, v, S, t
-        return self.value
-
-
 class _Linear(Module):
     """``-R v``."""
 
@@ -287,12 +231,7 @@ class _Linear(Module):
         return -(self.R @ v if self.R.ndim == 2 else self.R * v)
 
 
-def timed(function: Callable) -> Callable:
-    """A function of (q, v, S) or (q, v, S, t) as one of (q, v, S, t)."""
-    return _Steady(function) if needed_arguments(function) == 3 else function
-
-
-def _in_one_array(lagrangian):
+def in_one_array(lagrangian):
     if not callable(lagrangian) or isinstance(lagrangian, Energy):
         return lagrangian
     if needed_arguments(lagrangian) == 4:
@@ -310,7 +249,7 @@ def _force(friction, n: int, what: str) -> Callable | None:
     if R.shape not in ((n,), (n, n)):
         raise InputError(f"a coefficient of {what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
     if R.ndim == 2:
-        return _Linear(semidefinite(R, f"the coefficient of {what}"))
+        return _Linear(semidefinite(R, f"the coefficient of {what}", symmetric=False))
     require(
         R.min(), lambda r: r >= 0.0, f"a coefficient of {what} must be >= 0, not {{value:g}}: it would inject energy"
     )
@@ -319,5 +258,4 @@ def _force(friction, n: int, what: str) -> Callable | None:
 
 def _field(function, n: int, shape: tuple[int, ...], what: str) -> Callable:
     """As a function of (q, v, S, t), whose shape has been checked."""
-    found = timed(function) if callable(function) else _Constant(jnp.asarray(function, dtype=jnp.float64))
-    return check_shape(found, ((n,), (n,), (), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")
+    return field(function, ((n,), (n,), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")

@@ -5,14 +5,32 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from ..errors import (
-    LieAlgebraError,
-)
+from ..errors import LieAlgebraError, ShapeError
 from ._balance import STRUCTURE_TOLERANCE
 
 
 def killing_form_of(constants: np.ndarray) -> np.ndarray:
     return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
+
+
+def trilinear_form(algebra, form=None) -> np.ndarray:
+    """The covariant tensor ``c(x, y, z) = form(x, [y, z])`` of an inner product [BFM Remark 3.3].
+
+    Parameters
+    ----------
+    algebra : LieAlgebra
+    form : array, shape (dim, dim), optional
+        By default the Killing form, for which the tensor is totally skew.
+
+    Returns
+    -------
+    ndarray, shape (dim, dim, dim)
+        ``c[a, b, d] = form(e_a, [e_b, e_d])``.
+    """
+    form = np.asarray(algebra.killing_form() if form is None else form, dtype=np.float64)
+    if form.shape != (algebra.dim, algebra.dim):
+        raise ShapeError(f"the form on {algebra.name} has shape ({algebra.dim}, {algebra.dim}), not {form.shape}")
+    return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))
 
 
 def row_space(rows: np.ndarray) -> np.ndarray:

@@ -1,15 +1,16 @@
-"""A variational integrator for Euler-Poincaré equations with entropy, through the Cayley map."""
+"""A variational integrator for Euler-Poincaré equations with entropy, through the Cayley map or exp."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.groups.maps import cayley
+from manifolds.groups.maps import cayley, dexp, exp
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
@@ -22,12 +23,13 @@ NEWTON_STEPS = 20
 
 
 class LieVariational(OneStepMethod):
-    """``(dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1``, ``T_k s_k = -f_k·xi_k``.
+    """``(dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1``, ``T s = P_H - f·xi``.
 
     The discrete principle of GBY Definition 3.7 with ``L_d = h l(xi_k, (S_k + S_k+1)/2)`` and
-    ``g_k+1 = g_k tau(h xi_k)``, tau the Cayley map, varied along ``g_k exp(eta_k)``; without heat, the scheme of
-    Bou-Rabee & Marsden (2009). Friction acts by halves on both ends, ``F^± = h f(xi_k, S)/2``. The inverse of the
-    derivative of tau is a polynomial, ``dtau^-1_xi eta = (I - xi/2) eta (I + xi/2)``.
+    ``g_k+1 = g_k tau(h xi_k)``, tau the Cayley map or exp, varied along ``g_k exp(eta_k)``; without heat, the scheme of
+    Bou-Rabee & Marsden (2009). Forces act by halves on both ends, ``F^± = h (f + F)(xi_k, S)/2``. The inverse of the
+    derivative of the Cayley map is a polynomial, ``dtau^-1_xi eta = (I - xi/2) eta (I + xi/2)``; that of exp,
+    ``ad_xi / (exp(ad_xi) - 1)``, is there for every algebra, SU(n) among them, which the Cayley map leaves for n > 2.
 
     It runs as a one-step method on states (xi, S) of an :class:`liethermo.EulerPoincareClosedSystem`, from the momentum
     at one node, ``mu_k = l_xi``, to the next: without friction ``mu_k+1 = Ad*_{tau(h xi_k)} mu_k``. So the spatial
@@ -36,10 +38,24 @@ class LieVariational(OneStepMethod):
     the size of (xi, S) a step, solved by Newton's method.
 
     :meth:`attitudes` gives the group elements g_k of a run.
+
+    Parameters
+    ----------
+    tau : {"cayley", "exp"}
     """
 
     systems = "Euler-Poincaré systems with entropy"
     fixed: ClassVar[str] = ONE_SIZE
+
+    tau: str = eqx.field(static=True)
+
+    def __init__(self, tau: Literal["cayley", "exp"] = "cayley"):
+        if tau not in ("cayley", "exp"):
+            raise InputError(f"tau is 'cayley' or 'exp', not {tau!r}")
+        self.tau = tau
+
+    def __str__(self) -> str:
+        return "LieVariational" if self.tau == "cayley" else f"LieVariational({self.tau})"
 
     @property
     def stages(self) -> int:
@@ -54,38 +70,49 @@ class LieVariational(OneStepMethod):
         return frozenset({"entropy_law"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the Cayley map takes the algebra of the system to a group."""
+        """Raise InputError where the Cayley map is to take an algebra to a group, and does not."""
         if not isinstance(system, EulerPoincareClosedSystem):
             raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {system.kind}")
         algebra = system.algebra
+        if self.tau == "exp":
+            return
         if algebra.basis is None:
-            raise InputError(f"LieVariational needs matrices for {algebra.name}: build it with from_matrices")
+            raise InputError(
+                f"the Cayley map needs matrices for {algebra.name}: build it with from_matrices, or take "
+                "lt.LieVariational('exp')"
+            )
         X, Y = algebra.hat(np.random.default_rng(0).standard_normal((2, algebra.dim)))
         try:
             algebra.vee(X @ Y @ X)
         except mf.LieAlgebraError as error:
             raise InputError(
-                f"the Cayley map does not take {algebra.name} to a group: X Y X leaves the algebra"
+                f"the Cayley map does not take {algebra.name} to a group: X Y X leaves the algebra. Take "
+                "lt.LieVariational('exp')"
             ) from error
 
     def start(self, system: System, x) -> jax.Array:
-        return jnp.stack([system.vector_field(x), jnp.append(x[:-1], 0.0)])
+        assert isinstance(system, EulerPoincareClosedSystem)
+        n = system.algebra.dim
+        return jnp.stack([system.vector_field(x), jnp.zeros_like(x).at[:n].set(x[:n])])
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         assert isinstance(system, EulerPoincareClosedSystem)
-        state = x + low
-        xi0, S0, mu0 = state[:-1], state[-1], system.momentum(state[:-1], state[-1])
+        n = system.algebra.dim
+        xi0, S0, t = system.parts(x + low)
+        step = _Step(system, self.tau, S0, h, t)
+        mu0 = system.momentum(xi0, S0)
 
         def misfit(y):
-            return jnp.append(_motion(system, mu0, S0, h, y), _production(system, S0, h, y))
+            return jnp.append(mu0 - step.momenta(y)[0], step.production(y))
 
-        y = jnp.append(k[1, :-1], k[0, -1])
+        y = jnp.append(k[1, :n], k[0, n])
         y = y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
-        S1, (_, mu1) = S0 + h * y[-1], _momenta(system, S0, h, y)
-        guess = xi0 + h * k[0, :-1]
+        S1, mu1 = S0 + h * y[n], step.momenta(y)[1]
+        guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
-        xi_dot = k[0, :-1] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
-        return jnp.stack([jnp.append(xi_dot, y[-1]), jnp.append(y[:-1], 0.0)])
+        xi_dot = k[0, :n] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
+        rest = system.entries(*step.received(y))
+        return jnp.stack([jnp.concatenate([xi_dot, y[n:], rest]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
     def change(self, system: System, x, low, h, k, d) -> jax.Array:
         return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
@@ -104,7 +131,7 @@ class LieVariational(OneStepMethod):
         start : array, shape (m, m), optional
             g_0; the identity by default.
         """
-        steps = np.asarray(_turns(system, system.state(x, batch=True), jnp.asarray(h)))
+        steps = np.asarray(_turns(self, system, system.state(x, batch=True), jnp.asarray(h)))
         first = np.eye(steps.shape[-1]) if start is None else np.asarray(start)
         path = [first]
         for turn in steps:
@@ -112,46 +139,66 @@ class LieVariational(OneStepMethod):
         return np.array(path)
 
 
-def _dtau_inverse(algebra: mf.LieAlgebra, xi) -> jax.Array:
-    """The matrix of ``eta -> (I - xi/2) eta (I + xi/2)``, shape (dim, dim): right-trivialised; of -xi, the left one."""
-    half = 0.5 * algebra.hat(xi)
-    one = jnp.eye(len(half))
-    return jax.vmap(lambda eta: algebra.vee((one - half) @ eta @ (one + half)), out_axes=1)(jnp.asarray(algebra.basis))
+class _Step(NamedTuple):
+    """The discrete equations of a step, of y = (xi, s): the velocity in it and the slope of the entropy."""
 
+    system: EulerPoincareClosedSystem
+    tau: str
+    S0: jax.Array
+    h: jax.Array
+    t: jax.Array  # when it begins
 
-def _momenta(system: EulerPoincareClosedSystem, S0, h, y) -> tuple[jax.Array, jax.Array]:
-    """mu_k and mu_k+1 of a step with velocity and entropy slope y."""
-    xi, S = y[:-1], S0 + 0.5 * h * y[-1]
-    mu, push = system.momentum(xi, S), 0.5 * h * system.friction_force(xi, S)
-    first, second = (_dtau_inverse(system.algebra, sign * h * xi).T @ mu for sign in (1.0, -1.0))
-    return first - push, second + push
+    def _middle(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
+        return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
+    def momenta(self, y) -> tuple[jax.Array, jax.Array]:
+        """mu at its two ends."""
+        xi, S, t = self._middle(y)
+        force = self.system.friction_force(xi, S, t) + self.system.external_force(xi, S, t)
+        mu, push = self.system.momentum(xi, S), 0.5 * self.h * force
+        first, second = (self._turned(sign * self.h * xi, mu) for sign in (1.0, -1.0))
+        return first - push, second + push
 
-def _motion(system: EulerPoincareClosedSystem, mu0, S0, h, y) -> jax.Array:
-    return mu0 - _momenta(system, S0, h, y)[0]
+    def _turned(self, xi, mu) -> jax.Array:
+        """``(dtau^-1_xi)* mu``, the derivative trivialised on the right; of -xi on the left."""
+        algebra = self.system.algebra
+        if self.tau == "exp":
+            return solve(dexp(algebra, -xi).T, mu[:, None])[:, 0]
+        half = 0.5 * algebra.hat(xi)
+        one = jnp.eye(len(half))
+        basis = jnp.asarray(algebra.basis)
+        return jax.vmap(lambda eta: algebra.vee((one - half) @ eta @ (one + half)))(basis) @ mu
 
+    def production(self, y) -> jax.Array:
+        """``T s + f . xi - P_H``, which vanishes; NaN where the temperature is not positive."""
+        xi, S, t = self._middle(y)
+        T = -jax.grad(self.system.lagrangian, argnums=1)(xi, S)
+        gained = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
+        return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + gained
 
-def _production(system: EulerPoincareClosedSystem, S0, h, y) -> jax.Array:
-    xi, S = y[:-1], S0 + 0.5 * h * y[-1]
-    T = -jax.grad(system.lagrangian, argnums=1)(xi, S)
-    return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + jnp.dot(system.friction_force(xi, S), xi)
+    def received(self, y) -> tuple[jax.Array, jax.Array]:
+        """Work and heat from outside, per unit of time."""
+        middle = self._middle(y)
+        return jnp.dot(self.system.external_force(*middle), y[:-1]), self.system.heating(*middle)
 
 
 @program
-def _turns(system: EulerPoincareClosedSystem, x, h):
+def _turns(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
     """``tau(h xi_k)`` of every step, xi_k from the momentum before it."""
+    turn = cayley if method.tau == "cayley" else exp
 
     def one(before, after):
-        s, mu0 = (after[-1] - before[-1]) / h, system.momentum(before[:-1], before[-1])
+        (xi0, S0, t), (xi1, S1, _) = system.parts(before), system.parts(after)
+        step, s, mu0 = _Step(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
 
         def newton(_, xi):
-            misfit = lambda xi: _motion(system, mu0, before[-1], h, jnp.append(xi, s))  # noqa: E731
+            misfit = lambda xi: mu0 - step.momenta(jnp.append(xi, s))[0]  # noqa: E731
             return xi - solve(jax.jacfwd(misfit)(xi), misfit(xi)[:, None])[:, 0]
 
-        xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (before[:-1] + after[:-1]))
-        return cayley(system.algebra, h * xi)
+        xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (xi0 + xi1))
+        return turn(system.algebra, h * xi)
 
     return jax.vmap(one)(x[:-1], x[1:])
 
 
-register(LieVariational())
+register(LieVariational(), LieVariational("exp"))

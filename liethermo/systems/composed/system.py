@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -53,10 +53,16 @@ class ComposedSystem(System):
         V, with q the positions of all subsystems in one array and S their entropies, shape (N,). An Energy may have
         coordinates of its own (``lt.Function(e).on(...)``), such as the squared distance of two bodies.
     conductance : array, shape (N, N), or SciPy sparse matrix; or sequence of (i, j, k); or a number for two bodies
-        Symmetric and >= 0 (power / temperature).
+        Symmetric and >= 0 (power / temperature). In an edge, or for two bodies, it may be a function of the two
+        temperatures (T_i, T_j), or of (T_i, T_j, x) with the whole state x, symmetric under exchange of the bodies; a
+        step on which it is negative is refused.
     drag : likewise
         Coefficients c of friction between bodies with equally many degrees of freedom, ``-c_ij (v_i - v_j)`` on i, each
         heated by half (mass / time).
+    conduction : {"discrete", "midpoint"}
+        Fourier factors by the discrete temperatures, so that the entropy grows in each step for every energy, or by the
+        temperatures at the midpoint, as SML §6.2 prints them: then it is known to grow for quadratic energies alone,
+        and no law of it is stated.
     connected : bool
         Refuse a conductance whose graph falls into parts that exchange no heat.
     momentum_maps : dict of functions, or a sequence of them
@@ -92,14 +98,17 @@ class ComposedSystem(System):
         connected: bool = True,
         momentum_maps=(),
         validate: bool = True,
+        conduction: Literal["discrete", "midpoint"] = "discrete",
     ):
+        if conduction not in ("discrete", "midpoint"):
+            raise InputError(f"conduction is 'discrete' or 'midpoint', not {conduction!r}")
         self.labels, self.subsystems = named(subsystems)
         structure = mf.ExtendedPhaseSpace(
             tuple(n for body in self.subsystems for n in (body.degrees_of_freedom,) * body.count)
         )
         energy = check_scalar(self._energy(structure, coupling), structure.dim, "the energy", timed=True)
         entropy = entropy_component(structure.dim, structure.places.S)
-        dissipation = self._dissipation(structure, energy, conductance, drag, connected)
+        dissipation = self._dissipation(structure, energy, conductance, drag, connected, conduction)
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
@@ -141,7 +150,10 @@ class ComposedSystem(System):
         for part in () if self.dissipation is None else self.dissipation.terms:
             if isinstance(part, HeatConduction):
                 i, j = np.array(part.first, dtype=int), np.array(part.second, dtype=int)
-                factor = part.conductance * (cold[..., i] - cold[..., j])
+                k = jnp.vectorize(part.conductances, signature="(n),(e),(e)->(e)")(
+                    x, 1.0 / cold[..., i], 1.0 / cold[..., j]
+                )
+                factor = k * (cold[..., i] - cold[..., j])
                 factors = factors.at[..., i, j].set(factor).at[..., j, i].set(-factor)
         return factors
 
@@ -188,7 +200,7 @@ class ComposedSystem(System):
             ]
         return sum(terms[1:], terms[0])
 
-    def _dissipation(self, structure, energy, conductance, drag, connected) -> Dissipation | None:
+    def _dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
         found: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
         first = np.cumsum([0, *(body.count for body in self.subsystems)])
@@ -209,10 +221,11 @@ class ComposedSystem(System):
             if R is None and not (body.friction is None or isinstance(body.friction, str)):
                 found.append(LinearFriction(body.friction, body=a))
         if conductance is not None:
-            graph = edges(conductance, len(dofs), "the conductance", self.names)
+            given, laws = _by_law(conductance, len(dofs))
+            graph = edges(given, len(dofs), "the conductance", self.names)
             if connected:
                 _need_connected(graph, self.names)
-            found.append(HeatConduction(graph))
+            found.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
         if drag is not None:
             graph = edges(drag, len(dofs), "the drag", self.names)
             _need_velocities(graph, dofs, self.names)
@@ -273,6 +286,51 @@ class _Apart(Module):
 
     def __call__(self, y, *t):
         return self.V(y[: self.positions], y[self.positions :], *t)
+
+
+def _by_law(conductance, bodies: int) -> tuple[Any, tuple[Callable, ...]]:
+    """A graph of conductances and, where an edge of it has a function, one for each edge."""
+    if callable(conductance):
+        conductance = [(0, 1, conductance)]
+        if bodies != 2:
+            raise InputError(
+                f"the conductance as one function is meant for two bodies, not {bodies}: give edges (i, j, function)"
+            )
+    listed = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
+    if not listed or not any(callable(edge[-1]) for edge in conductance):
+        return conductance, ()
+    ordered = [edge if edge[0] < edge[1] else (edge[1], edge[0], _exchanged(edge[2])) for edge in conductance]
+    return [(i, j, 1.0) for i, j, _ in ordered], tuple(_as_law(k) for _, _, k in ordered)
+
+
+def _exchanged(k):
+    return Exchanged(k) if callable(k) else k
+
+
+class Exchanged(Module):
+    """A law of two bodies, told of them in the other order."""
+
+    law: Callable
+
+    def __call__(self, T_i, T_j, *x):
+        return self.law(T_j, T_i, *x)
+
+
+class OfTemperatures(Module):
+    """A law of (T_i, T_j), or a number, as one of (T_i, T_j, x)."""
+
+    law: Any
+
+    def __call__(self, T_i, T_j, x):
+        del x
+        return self.law(T_i, T_j) if callable(self.law) else self.law
+
+
+def _as_law(k) -> Callable:
+    inner = k.law if isinstance(k, Exchanged) else k
+    if callable(inner) and needed_arguments(inner) == 3:
+        return k
+    return OfTemperatures(k if callable(k) else jnp.asarray(k, dtype=jnp.float64))
 
 
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:

@@ -343,6 +343,7 @@ def test_functions_of_the_state_are_not_repaired_either(dissipation, words):
         (lambda: lt.FourBracket(np.ones((2, 2, 2, 2))), lt.InputError, r"R\[i,j,k,l\] = -R\[j,i,k,l\]"),
         (lambda: lt.FourBracket(np.ones((2, 2, 2))), lt.InputError, r"\(n, n, n, n\)"),
         (lambda: lt.FrictionOperator(-np.eye(2)), lt.IndefiniteError, "friction operator"),
+        (lambda: lt.InnerProductDissipation(lambda x: np.eye(3)), lt.InputError, "a constant matrix, not a function"),
         (lambda: lt.DoubleBracket(metric=-np.eye(2)), lt.IndefiniteError, "metric"),
     ],
 )
@@ -404,3 +405,32 @@ def test_a_rate_in_the_place_of_a_matrix_is_told_its_name(kind):
     with pytest.raises(lt.InputError, match=f"^{kind.__name__} takes .* and 0.3 is a number: for a rate say rate=0.3$"):
         kind(0.3)
     assert float(kind(np.eye(3), rate=0.3).rate) == 0.3
+
+
+def test_two_ways_to_move_the_kernel_of_a_friction_operator():
+    """BFM Remark 4.7: the orthogonal complement of the kernel, by its matrix; the oblique one differs little."""
+    root = np.random.default_rng(3).standard_normal((3, 3))
+    x, ones = np.array([0.4, -0.7, 0.9]), lt.Quadratic(np.ones(3))
+
+    def system(projection):  # where H is quadratic the discrete gradient is that at the midpoint, and both are one
+        return lt.LiePoissonSystem(
+            mf.so(3),
+            lambda m: 0.5 * m @ m + 0.3 * jnp.sum(m**4),
+            ones,
+            lt.FrictionOperator(root @ root.T, 0.3, project=True, projection=projection),
+        )
+
+    dH, dS = np.array([0.3, 1.1, -0.2]), np.array([0.5, 0.2, 0.7])
+    P_off = np.eye(3) - np.outer(dH, dH) / (dH @ dH)
+    by_hand = 0.3 * P_off @ root @ root.T @ P_off @ dS
+    orthogonal = system("orthogonal")
+    found = np.asarray(orthogonal.dissipation.force(orthogonal, jnp.asarray(x), dH, dS, ()))
+    assert np.abs(found - by_hand).max() < 1e-14
+    ends = {}
+    for h in (0.02, 0.01):
+        runs = [lt.integrate(system(p), x, (0.0, h), h, lt.MetriplecticMidpoint()) for p in ("orthogonal", "oblique")]
+        assert all(run.audit().passed for run in runs)
+        ends[h] = np.abs(runs[0].x[-1] - runs[1].x[-1]).max()
+    assert 6.0 < ends[0.02] / ends[0.01] < 10.0  # a third power: h times what the kernels differ by
+    with pytest.raises(lt.InputError, match="projection is"):
+        lt.FrictionOperator(np.eye(3), projection="skew")

@@ -7,6 +7,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
@@ -112,6 +113,70 @@ def test_without_friction_the_casimirs_and_the_energy_stay():
     error = np.abs(runs[0].energy - runs[0].energy[0])
     assert 1e-7 < error.max() < 1.2 * error[:400].max()
     assert np.abs(runs[0].x[:200] - runs[1].x[:200]).max() < 1e-12
+
+
+def forced(t, y):
+    """A body pushed and heated from outside, written out; the ledger behind it."""
+    xi, S = y[:3], y[3]
+    moments, T = np.array([2.0, 1.0, 1.5]), 0.5 * np.exp(0.5 * S)
+    friction, push = -RUBBING @ xi, np.array([0.2 * np.sin(t), 0.1, -0.1 * xi[2]])
+    heat = 0.1 + 0.3 * np.cos(t)
+    turn = (np.cross(moments * xi, xi) + friction + push) / moments
+    return np.concatenate([turn, [(heat - friction @ xi) / T, push @ xi, heat, 1.0]])
+
+
+RUBBING = np.array([[0.3, 0.1, 0.0], [-0.1, 0.2, 0.0], [0.0, 0.0, 0.1]])
+
+
+@functools.cache
+def forced_system():
+    return lt.EulerPoincareClosedSystem(
+        mf.so(3),
+        lambda xi, S: 0.5 * xi @ (jnp.array([2.0, 1.0, 1.5]) * xi) - jnp.exp(0.5 * S),
+        lambda xi, S: -RUBBING @ xi,
+        external=lambda xi, S, t: jnp.array([0.2 * jnp.sin(t), 0.1, -0.1 * xi[2]]),
+        heat_power=lambda xi, S, t: 0.1 + 0.3 * jnp.cos(t),
+    )
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [
+        (lt.LieVariational("exp"), 2.0),
+        (METHOD, 2.0),
+        (lt.MetriplecticGauss(2), 4.0),
+        (lt.MetriplecticRungeKutta(6), 6.0),
+    ],
+    ids=str,
+)
+def test_forces_and_heat_from_outside(method, order):
+    """The ledger is part of the state, so the reference checks both of its sides."""
+    system, x0 = forced_system(), np.array([0.5, 0.3, -0.4, 0.2])
+    exact = solve_ivp(forced, (0.0, 2.0), np.append(x0, np.zeros(3)), method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    runs = [lt.integrate(system, x0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
+    errors = [np.abs(run.x[-1] - exact).max() for run in runs]
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2, errors
+    assert set(system.ledger) == {"work received", "heat received"}
+    if "energy" in method.preserves:
+        assert runs[0].audit().energy_drift < 1e-14
+
+
+def test_su3_by_the_exponential():
+    """SU(3) is none of the Cayley map's; by exp the Casimir functions stay, the order is 2, and the group is kept."""
+    weights, x0 = np.linspace(1.0, 2.0, 8), np.append(np.linspace(0.1, 0.5, 8), 0.1)
+    system = lt.EulerPoincareClosedSystem(mf.su(3), lambda xi, S: 0.5 * xi @ (weights * xi) - jnp.exp(0.5 * S))
+    with pytest.raises(lt.InputError, match=r"LieVariational\('exp'\)"):
+        METHOD.check(system)
+    method, exact = lt.LieVariational("exp"), lt.integrate(system, x0, (0.0, 2.0), 0.02, lt.MetriplecticGauss(3)).x[-1]
+    runs = [lt.integrate(system, x0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
+    errors = [np.abs(run.x[-1] - exact).max() for run in runs]
+    assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.1, errors
+    for C in system.casimirs().values():
+        values = np.asarray(C(runs[0].x))
+        assert np.ptp(values) < 1e-13 * max(1.0, np.abs(values).max())
+    g = method.attitudes(system, runs[0].x, 0.1)
+    assert np.abs(g[-1] @ g[-1].conj().T - np.eye(3)).max() < 1e-13
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.sparse
 from hypothesis import given
 from hypothesis import strategies as st
@@ -321,6 +322,51 @@ def test_conductances_are_parameters():
     swept = jax.vmap(production)(jnp.array([1.0, 2.0]))
     assert np.allclose(swept[1], 2 * swept[0], rtol=1e-15)
     assert np.allclose(jax.grad(production)(3.0), swept[0], rtol=1e-14)
+
+
+def test_conductances_that_depend_on_temperatures_and_states():
+    """Fourier's law with them by hand; both laws in every step; the order in which an edge names its bodies."""
+    stone = lambda: lt.Subsystem(Warm(jnp.asarray(1.0)), 1)  # noqa: E731
+    law = lambda T_a, T_b, x: T_a + 2.0 * T_b**2 + x[0] ** 2  # noqa: E731
+    x = np.log([1.0, 3.0])
+    one = lt.ComposedSystem([stone(), stone()], conductance=[(1, 0, law)])
+    k = 3.0 + 2.0 * 1.0 + 0.0
+    assert np.allclose(one.vector_field(x), [k * 2.0 / 1.0, -k * 2.0 / 3.0], rtol=1e-14)
+    assert np.allclose(one.fourier_factors(x)[0, 1], k * (1.0 - 1.0 / 3.0), rtol=1e-14)
+    other = lt.ComposedSystem([stone(), stone()], conductance=lambda T_a, T_b: T_a * T_b)
+    assert np.allclose(other.vector_field(x), [3.0 * 2.0, -3.0 * 2.0 / 3.0], rtol=1e-14)
+    assert_both_laws(lt.integrate(one, x, (0.0, 3.0), 0.1))
+    mixed = lt.ComposedSystem([stone() for _ in range(3)], conductance=[(0, 1, law), (1, 2, 0.5)])
+    assert np.allclose(mixed.vector_field([0.0, 0.0, np.log(2.0)])[2], -0.5 / 2.0, rtol=1e-14)
+    cooling = lt.ComposedSystem([stone(), stone()], conductance=lambda T_a, T_b: -1.0 + 0.0 * T_a, validate=False)
+    assert lt.integrate(cooling, x, (0.0, 1.0), 0.1, on_failure="return").status.code == "non_finite"
+    with pytest.raises(lt.InputError, match="meant for two bodies, not 3"):
+        lt.ComposedSystem([stone() for _ in range(3)], conductance=law)
+
+
+def test_fourier_factors_as_they_are_printed():
+    """SML 6.2 by hand: K by the temperatures at the midpoint; the library's differ in the second order of the step."""
+    x, h = np.log([1.0, 3.0]), 0.1
+
+    def printed(end):
+        z = np.exp(0.5 * (x + end))
+        T = (np.exp(end) - np.exp(x)) / (end - x)
+        K = 1.0 / z[0] - 1.0 / z[1]
+        return x + h * np.array([K * T[1], -K * T[0]]) - end
+
+    expected = scipy.optimize.root(printed, x + np.array([0.1, -0.05]), tol=1e-13).x
+    bodies = [lt.Subsystem(Warm(jnp.asarray(1.0)), 1) for _ in range(2)]
+    ends = {}
+    for conduction in ("midpoint", "discrete"):
+        system = lt.ComposedSystem(bodies, conductance=1.0, conduction=conduction)
+        solution = lt.integrate(system, x, (0.0, h), h, lt.MetriplecticMidpoint())
+        ends[conduction] = solution.x[-1]
+        assert solution.audit().energy_drift < 1e-15
+        assert system.entropy_law == {"midpoint": None, "discrete": "nondecreasing"}[conduction]
+    assert np.abs(ends["midpoint"] - expected).max() < 1e-13
+    assert 1e-5 < np.abs(ends["discrete"] - expected).max() < 1e-3
+    with pytest.raises(lt.InputError, match="conduction is"):
+        lt.ComposedSystem(bodies, conductance=1.0, conduction="middle")
 
 
 @pytest.mark.slow

@@ -111,7 +111,7 @@ def _rate(system, x):
 @pytest.mark.slow
 def test_the_same_lagrangian_in_its_different_forms():
     """Three arguments, one array, and a sum of energies; a coefficient of friction and the force that it means."""
-    R = np.array([[0.5, 0.1], [0.1, 0.3]])
+    R = np.array([[0.5, 0.3], [-0.2, 0.3]])  # its symmetric part brakes, the rest turns [GBY §2]
 
     def L(q, v, S):
         return 0.5 * v @ v - 0.5 * q @ q - jnp.exp(S)
@@ -154,6 +154,7 @@ def test_friction_that_injects_energy():
         ({"dim": None}, lt.InputError, "dim"),
         ({"friction": -1.0}, lt.InputError, "inject"),
         ({"friction": np.diag([1.0, -0.1])}, lt.IndefiniteError, "negative"),
+        ({"friction": np.array([[0.1, 1.0], [0.5, 0.1]])}, lt.IndefiniteError, "negative"),
         ({"friction": np.ones(3)}, lt.InputError, "shape"),
         ({"friction": lambda q, v, S: -v[:1]}, lt.FunctionError, r"shape \(2,\), not \(1,\)"),
         ({"external": lambda q, v, S: q[5] * jnp.ones(3)}, lt.FunctionError, "external force"),

@@ -70,6 +70,7 @@ def test_killing_form_is_invariant(g, seed):
     scale = 100.0 * max(1.0, np.abs(kappa).max())
     assert close(form(x, y, z), form(y, z, x), scale)
     assert close(form(x, y, z), -form(y, x, z), scale)
+    assert close(np.einsum("abc,a,b,c", mf.trilinear_form(g), x, y, z), form(x, y, z), scale)
     assert np.allclose(kappa, [[np.trace(np.asarray(g.ad(a) @ g.ad(b))) for b in np.eye(g.dim)] for a in np.eye(g.dim)])
 
 

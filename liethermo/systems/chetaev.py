@@ -1,0 +1,170 @@
+"""Systems of the generalised Chetaev principle: a Lagrangian, and a one-form that constrains the entropy [SML §3.2]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import is_traced
+from manifolds._module import Module
+
+from ..dissipation.base import Law
+from ..errors import FunctionError, InputError
+from ..functions.arguments import needed_arguments
+from ..functions.checks import check_shape
+from ..tracing.interpret import at_points
+from .simple_closed import Forces, SimpleClosedSystem, in_one_array
+
+NEWTON_STEPS, SOLVED = 12, 1e-12
+"""For S' where the form depends on it; and the share of its terms that the constraint may miss then."""
+
+POINTS, ROUNDED = 16, 1e-12
+"""Random points at which the production is looked at, and the share of its terms that is rounding."""
+
+
+class ChetaevSystem(SimpleClosedSystem):
+    """``d/dt L_v - L_q = lambda eta_q``, ``-L_S = lambda eta_S``, ``eta_q . q' + eta_S S' = 0`` [SML Def. 3.1, 13-14].
+
+    These are the equations of the generalised Chetaev principle on Q x R, in the state (q, v, S), for a Lagrangian
+    L(q, v, S) and a semibasic one-form ``eta = eta_q dq + eta_S dS``. So ``lambda = T / eta_S`` with ``T = -L_S > 0``:
+    the form is a force ``T eta_q / eta_S``, and the heat that it makes. The energy ``E = v . L_v - L`` is constant,
+    whatever the form is, since ``E' = lambda (eta_q . v + eta_S S') = 0``. The entropy production is
+    ``S' = -eta_q . v / eta_S``; where it is not negative at random points, the second law is stated, and held to.
+
+    For ``eta = dS - L_v dq`` this is :class:`liethermo.ThermodynamicHerglotz` [SML Prop. 3.3], and for
+    ``eta = T dS - F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.
+
+    The metriplectic schemes keep the energy, and the sign of S' in each step, exactly.
+    :class:`liethermo.VariationalIntegrator` discretises the principle itself: D_1 L_d + D_2 L_d is a multiple of eta at
+    the points of its finite difference maps, on which eta vanishes.
+
+    Parameters
+    ----------
+    lagrangian, dim, momentum_maps, validate
+        As for :class:`liethermo.SimpleClosedSystem`.
+    eta : function of (q, v, S), q and v of shape (n,), to shape (n + 1,), or to shape (n,)
+        The components (eta_q, eta_S), or eta_q alone where ``eta_S = 1``. It may be a function of (q, v, S, S'): the
+        constraint is then solved for S' by Newton's method, from S' = 0.
+
+    Raises
+    ------
+    AxiomError, FunctionError, InputError
+    """
+
+    form: Form
+
+    production_name: ClassVar[str] = "S'"
+
+    def __init__(self, lagrangian, eta: Callable, dim: int | None = None, momentum_maps=(), validate: bool = True):
+        structure, size, energy = self._prepare(in_one_array(lagrangian), dim)
+        self.friction = self.external = self.heat_power = None
+        self.form = Form.of(eta, size // 2)
+        forces = ChetaevForces(None, None, None, _law_of(self.form, size))
+        self._assemble(structure, size, energy, forces, momentum_maps, validate)
+
+    def friction_at(self, q, v, S, t, T) -> jax.Array:
+        del t
+        return T * self.form.covector(q, v, S)
+
+    def friction_force(self, q, v, S, t) -> jax.Array:
+        """The force ``T eta_q / eta_S``, shape (n,)."""
+        return self.friction_at(q, v, S, t, -jax.grad(self.action, argnums=2)(q, v, S))
+
+    def own_residuals(self, x) -> dict[str, jax.Array]:
+        return super().own_residuals(x) if self.entropy_law == "nondecreasing" else {}
+
+
+class ChetaevForces(Forces):
+    """The force of a one-form, with the law of the entropy that it has."""
+
+    law: Law | None = eqx.field(static=True)
+
+    @property
+    def entropy_law(self) -> Law | None:
+        return self.law
+
+
+class Form(Module):
+    """A semibasic one-form on Q x R: its components as a function of (q, v, S, S'), shape (n + 1,)."""
+
+    function: Callable
+    implicit: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, eta, n: int) -> Form:
+        """From what a user gives, checked."""
+        if not callable(eta):
+            raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
+        implicit, at = needed_arguments(eta) == 4, "(q, v, S, S')"
+        given = eta if implicit else _Explicit(eta)
+        shapes = (n,), (n,), (), ()
+        try:
+            size = jax.eval_shape(given, *(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes)).shape
+        except (TypeError, ValueError, IndexError) as error:
+            raise FunctionError(f"eta could not be evaluated at {at}: {type(error).__name__}: {error}") from error
+        if size not in ((n,), (n + 1,)):
+            raise FunctionError(f"eta has shape ({n + 1},), or ({n},) where eta_S = 1, not {size}")
+        return cls(check_shape(given if size == (n + 1,) else _Unit(given), shapes, (n + 1,), "eta", at), implicit)
+
+    def rate(self, q, v, S) -> jax.Array:
+        """S' with ``eta_q . v + eta_S S' = 0``; NaN where none is found."""
+
+        def misfit(s):
+            found = self.function(q, v, S, s)
+            return jnp.dot(found[:-1], v) + found[-1] * s, jnp.abs(found[:-1]) @ jnp.abs(v) + jnp.abs(found[-1] * s)
+
+        def newton(_, s):
+            (missed, _), (slope, _) = jax.jvp(misfit, (s,), (jnp.ones(()),))
+            return s - missed / slope
+
+        s = jax.lax.fori_loop(0, NEWTON_STEPS if self.implicit else 1, newton, jnp.zeros(()))
+        if not self.implicit:  # linear in S'
+            return s
+        missed, size = misfit(s)
+        return jnp.where(jnp.abs(missed) <= SOLVED * size, s, jnp.nan)
+
+    def covector(self, q, v, S) -> jax.Array:
+        """``eta_q / eta_S``, shape (n,), at the S' that goes with (q, v, S)."""
+        found = self.function(q, v, S, self.rate(q, v, S) if self.implicit else jnp.zeros(()))
+        return found[:-1] / found[-1]
+
+
+class _Explicit(Module):
+    """A function of (q, v, S) as one of (q, v, S, S')."""
+
+    function: Callable
+
+    def __call__(self, q, v, S, s):
+        del s
+        return jnp.asarray(self.function(q, v, S))
+
+
+class _Unit(Module):
+    """``eta_q`` with ``eta_S = 1`` behind it."""
+
+    function: Callable
+
+    def __call__(self, *arguments):
+        return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
+
+
+def _law_of(form: Form, size: int) -> Law | None:
+    """What a form says of the entropy, from its production at random points."""
+    if is_traced(form):
+        return None
+    rates, sizes = at_points(_production, form, np.random.default_rng(0).standard_normal((POINTS, size)))
+    if (np.abs(rates) <= ROUNDED * sizes).all():
+        return "conserved"
+    return "nondecreasing" if (rates >= -ROUNDED * sizes).all() else None
+
+
+def _production(form: Form, x):
+    """S', and the size of the terms that it is the sum of."""
+    n = len(x) // 2
+    covector = form.covector(x[:n], x[n : 2 * n], x[2 * n])
+    return -jnp.dot(covector, x[n : 2 * n]), jnp.abs(covector) @ jnp.abs(x[n : 2 * n])
