@@ -14,6 +14,10 @@ import hypothesis
 import jax
 import pytest
 
+QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""Most programs of the default tier run once, and take longer to compile than to run: this takes a third off. With
+``XLA_FLAGS`` of one's own, and in the slow tier, XLA optimises as it does for users."""
+
 hypothesis.settings.register_profile(
     "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=6
 )
@@ -30,6 +34,8 @@ gc.set_threshold(200_000, 20, 100)
 def pytest_configure(config):
     slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
     hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
+    if not slow:
+        os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)
     if hasattr(config, "cache"):
         _keep_what_is_compiled(config.cache.mkdir("compiled"))
 

@@ -99,7 +99,7 @@ def body(function, dissipation=True):
     )
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled("fori_loop-explicit", "eigvalsh, complex-explicit", "lgamma-implicit", "single precision-explicit")
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)], ids=["implicit", "explicit"]
 )
@@ -124,7 +124,7 @@ def test_a_lane_is_a_single_run(name):
     assert np.array_equal(together, alone)
 
 
-@pytest.mark.parametrize("name", ["long scan", "solve"])
+@pytest.mark.parametrize("name", ["solve", pytest.param("long scan", marks=pytest.mark.slow)])
 def test_newton_has_them_too(name):
     """Steps that fixed-point iteration does not solve."""
     system = body(FUNCTIONS[name])

@@ -88,7 +88,7 @@ def test_an_entropy_with_a_constant():
     assert np.abs(run.x - plain.x).max() <= 1e4 * 64 * EPS
 
 
-@pytest.mark.parametrize("engine", ["array", "compiled"])
+@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
 def test_engines_and_adaptive_steps(engine):
     runs = [
         lt.ensemble(rubbing(c), np.array([[1.0, 0.5]]), (0.0, 20.0), lt.Adaptive(rtol=1e-8), EXPLICIT[0], engine=engine)

@@ -32,6 +32,7 @@ PROMISES = {
 }
 
 
+@pytest.mark.sampled(5)  # all but one of wheels: each takes as long as the rest together
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(6), lt.MetriplecticGauss(2)], ids=str)
 @pytest.mark.parametrize("name", PROMISES)
 def test_what_is_promised_is_held_and_has_a_row(name, method):

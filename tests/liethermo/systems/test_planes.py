@@ -137,7 +137,7 @@ def ring(**changes):
 
 
 @pytest.mark.parametrize("method", [METHODS[0], *METHODS[3:], lt.MetriplecticTaylor(4)], ids=str)
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
     system = ring()
     x0 = system.state(unit(LARGE))
@@ -197,6 +197,7 @@ def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
     assert in_order(system, lt.MetriplecticMidpoint(), first, replace(RULES, large=1))[0] is not system
 
 
+@pytest.mark.slow
 def test_derivatives_go_through():
     system, method = ring(), lt.MetriplecticMidpoint()
     x0, v = jnp.asarray(system.state(unit(LARGE))), jnp.asarray(RANDOM.standard_normal(3 * LARGE + 1))

@@ -329,6 +329,7 @@ def test_an_ensemble_over_a_parameter_is_single_runs():
         assert many.audit().passed, many.audit()
 
 
+@pytest.mark.slow
 def test_a_flow_is_differentiated_by_a_parameter():
     def end(rate):
         return lt.flow(rubbing(lt.torques.GravityGradient(INERTIA, rate), warm=False), START, (0.3, 1.3), 0.1)
@@ -418,6 +419,7 @@ def test_a_study_of_a_torque(tmp_path):
     assert np.array_equal(np.asarray(study.results["end"])[1], one.x[-1])
 
 
+@pytest.mark.slow
 def test_noise_beside_a_torque():
     """Energy less work and momentum in space less impulse are exact on every path."""
     noise = lt.Fluctuations(1e-3, 1)
