@@ -55,6 +55,9 @@ space := $(subst ,, )
 demo: .venv
 	$(BIN)/liethermo run examples/tumbling_body.toml --out demo_output
 
+# pytest keeps the tests as it has rewritten them, where Python is told to keep nothing too.
+test test-slow: export PYTHONDONTWRITEBYTECODE :=
+
 test: .venv/test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -16,6 +15,7 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.checks import recognised
 from ..functions.energy import Energy, as_energy
+from ..functions.frames import frame
 from .base import Dissipation
 from .checks import checked_rate, form_at, not_a_rate, semidefinite
 from .factor import Factor
@@ -81,9 +81,9 @@ class ProjectedMetric(Dissipation):
         if not dL and not self.normalized:
             GdH = raised(dH)
             return self.rate * (jnp.dot(GdH, dH) * raised(dS) - jnp.dot(GdH, dS) * GdH)
-        frame = _Orthonormal.of(raised, (dH, *dL))
-        projected = frame.off_images(raised(frame.off(dS)))
-        return self.rate * (projected if self.normalized else frame.gram * projected)
+        held = frame((dH, *dL), form=raised)
+        projected = held.off_images(raised(held.off(dS)))
+        return self.rate * (projected if self.normalized else math.prod(held.squares) * projected)
 
     def factor(self, system, x, dH, dL):
         """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
@@ -105,48 +105,10 @@ class ProjectedMetric(Dissipation):
         return self._projected(system, x, dH, dL, n, lambda w: root @ w)
 
     def _projected(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
-        frame = _Orthonormal.of(self._raised(system, x), (dH, *dL))
-        return Factor(size, lambda w: frame.off_images(root(w))).scaled(
-            self.rate if self.normalized else self.rate * frame.gram
-        )
+        held = frame((dH, *dL), form=self._raised(system, x))
+        rate = self.rate if self.normalized else self.rate * math.prod(held.squares)
+        return Factor(size, lambda w: held.off_images(root(w))).scaled(rate)
 
     def _raised(self, system, x):
         G = form_at(self.cometric, x)
         return lambda alpha: system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
-
-
-class _Orthonormal(NamedTuple):
-    """Orthonormal covectors in the metric G that span some gradients, and their images under G.
-
-    ``gram`` is the determinant of the products of the gradients.
-    """
-
-    pairs: list[tuple[jax.Array, jax.Array]]
-    gram: jax.Array
-
-    @classmethod
-    def of(cls, raised: Callable, gradients: Sequence[jax.Array]) -> _Orthonormal:
-        found = cls([], jnp.ones(()))
-        for gradient in gradients:
-            before = jnp.dot(raised(gradient), gradient)
-            rest = found.off(gradient)
-            square = jnp.dot(raised(rest), rest)
-            # a gradient that depends on the earlier ones adds nothing to project off
-            independent = square > 1e-24 * before
-            square = jnp.where(independent, square, 0.0)
-            e = rest * jnp.where(independent, 1.0 / jnp.sqrt(jnp.where(independent, square, 1.0)), 0.0)
-            found = cls([*found.pairs, (e, raised(e))], found.gram * square)
-        return found
-
-    def off(self, alpha):
-        """P alpha."""
-        for _ in range(2):  # the second pass removes what rounding left of the first
-            for e, Ge in self.pairs:
-                alpha = alpha - jnp.dot(Ge, alpha) * e
-        return alpha
-
-    def off_images(self, v):
-        """P^T v: as P is G-symmetric, projecting the image as well keeps K symmetric to rounding."""
-        for e, Ge in self.pairs:
-            v = v - jnp.dot(e, v) * Ge
-        return v

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,14 +24,26 @@ class Frame(NamedTuple):
     units : list of array, shape (n,)
     combinations : list of array, shape (m,)
         Unit j is ``sum_l combinations[j][l] vectors[l]``.
+    images : list of array, shape (n,)
+        Those of the units by the form in which they are orthonormal; they themselves by default.
+    squares : list of array, shape ()
+        Of what was left of each vector, zero instead of one that was left out; their product is Gram's determinant.
     """
 
     units: list[jax.Array]
     combinations: list[jax.Array]
+    images: list[jax.Array]
+    squares: list[jax.Array]
 
     def off(self, v) -> jax.Array:
         """v less its components in the span."""
         return self._split(v)[0]
+
+    def off_images(self, v) -> jax.Array:
+        """An image less its components in the span of the images: ``P^T v``, where :meth:`off` is P."""
+        for e, image in zip(self.units, self.images, strict=True):
+            v = v - jnp.dot(e, v) * image
+        return v
 
     def coefficients(self, v) -> jax.Array:
         """Those w for which ``sum_l w_l vectors[l]`` is the component of v in the span, shape (m,)."""
@@ -44,35 +56,38 @@ class Frame(NamedTuple):
     def _split(self, v) -> tuple[jax.Array, list[jax.Array]]:
         taken: list[jax.Array] = [jnp.zeros(())] * len(self.units)
         for _ in range(2):  # the second pass removes what rounding left of the first
-            for j, e in enumerate(self.units):
-                along = jnp.dot(e, v)
+            for j, (e, image) in enumerate(zip(self.units, self.images, strict=True)):
+                along = jnp.dot(image, v)
                 v, taken[j] = v - along * e, taken[j] + along
         return v, taken
 
 
-def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None) -> Frame:
-    """The frame of some vectors by Gram and Schmidt.
+def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None, form: Callable | None = None) -> Frame:
+    """The frame of some vectors by Gram and Schmidt, orthonormal in a form given as a map: from v to ``G v``.
 
     ``like`` are vectors whose dependence decides instead of the given ones. Discrete gradients of C and exp(C)
     differ by a multiple of the slope alone, and to project off both would stop the motion: the gradients tell.
     """
-    found, plain = Frame([], []), Frame([], [])
+    image_of = form or (lambda v: v)
+    found, plain = Frame([], [], [], []), Frame([], [], [], [])
     for j, vector in enumerate(vectors):
         rest, taken = found._split(vector)
-        square = jnp.dot(rest, rest)
-        independent = square > DEPENDENT * jnp.dot(vector, vector)
+        square = jnp.dot(image_of(rest), rest)
+        independent = square > DEPENDENT * jnp.dot(image_of(vector), vector)
         if like is not None:
             plain_rest = plain.off(like[j])
             plain_square = jnp.dot(plain_rest, plain_rest)
             independent = (square > 0.0) & (plain_square > DEPENDENT * jnp.dot(like[j], like[j]))
             plain.units.append(plain_rest * _inverse_root(plain_square, independent))
-            plain.combinations.append(jnp.zeros(0))
+            plain.images.append(plain.units[-1])
         scale = _inverse_root(square, independent)
         combination = jnp.asarray(np.eye(len(vectors))[j])
         for along, earlier in zip(taken, found.combinations, strict=True):
             combination = combination - along * earlier
         found.units.append(rest * scale)
         found.combinations.append(combination * scale)
+        found.images.append(image_of(found.units[-1]))
+        found.squares.append(jnp.where(independent, square, 0.0))
     return found
 
 

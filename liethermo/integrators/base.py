@@ -220,6 +220,63 @@ class OneStepMethod(Module):
         return type(self).__name__
 
 
+class Wrapping(OneStepMethod):
+    """A method made of another one, whose steps are about the same slopes: what it does not say is that of the other.
+
+    Attributes
+    ----------
+    method : OneStepMethod
+    """
+
+    method: OneStepMethod
+
+    @property
+    def stages(self) -> int:
+        return self.method.stages
+
+    @property
+    def order(self) -> int:
+        return self.method.order
+
+    @property
+    def preserves(self) -> frozenset[str]:
+        return self.method.preserves
+
+    @property
+    def explicit(self) -> bool:
+        return self.method.explicit
+
+    @property
+    def evaluations(self) -> int:
+        return self.method.evaluations
+
+    @property
+    def has_estimate(self) -> bool:
+        return self.method.has_estimate
+
+    @property
+    def increments(self) -> int:
+        return self.method.increments
+
+    def driven_by(self, dW) -> OneStepMethod:
+        return eqx.tree_at(lambda m: m.method, self, self.method.driven_by(dW))
+
+    def increment(self, h, k) -> jax.Array:
+        return self.method.increment(h, k)
+
+    def weights(self, theta) -> np.ndarray:
+        return self.method.weights(theta)
+
+    def predict(self, k, before) -> jax.Array:
+        return self.method.predict(k, before)
+
+    def missed(self, system: System, x, low, h, k) -> jax.Array:
+        return self.method.missed(system, x, low, h, k)
+
+    def check(self, system: System) -> None:
+        self.method.check(system)
+
+
 class GaussMethod(OneStepMethod):
     """What methods on the Gauss nodes share: as many stages as nodes, order 2s, slopes that extend to the next step."""
 

@@ -14,10 +14,10 @@ import manifolds as mf
 from ..errors import InputError
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System
-from .base import OneStepMethod, collocation_error
+from .base import OneStepMethod, Wrapping, collocation_error
 
 
-class InCharts(OneStepMethod):
+class InCharts(Wrapping):
     """A method as it runs on a manifold, step by step in coordinates around a point z: :class:`liethermo.ChartSystem`.
 
     The step from x to x' is one from R^dim to R^dim, from the coordinates of x to those of x'. So the laws that the
@@ -33,28 +33,10 @@ class InCharts(OneStepMethod):
 
     Attributes
     ----------
-    method : OneStepMethod
     retraction : manifolds.Retraction
     """
 
-    method: OneStepMethod
     retraction: mf.Retraction = eqx.field(static=True)
-
-    @property
-    def stages(self) -> int:
-        return self.method.stages
-
-    @property
-    def order(self) -> int:
-        return self.method.order
-
-    @property
-    def explicit(self) -> bool:
-        return self.method.explicit
-
-    @property
-    def evaluations(self) -> int:
-        return self.method.evaluations
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -63,19 +45,9 @@ class InCharts(OneStepMethod):
     def keeps(self, system: System, name: str) -> bool:
         return self.method.keeps(system, name) if self.explicit else super().keeps(system, name)
 
-    def weights(self, theta):
-        return self.method.weights(theta)
-
-    def missed(self, system: System, x, low, h, k) -> jax.Array:
-        return self.method.missed(system, x, low, h, k)
-
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
         step = self._step(system, x, low, h, k)
         return step.back(step.method.slopes(step.system, step.start, step.low, h, step.k))
-
-    def increment(self, h, k) -> jax.Array:
-        """The displacement, a tangent vector at x."""
-        return self.method.increment(h, k)
 
     def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
         """The point at the end of the step; NaN where the step is longer than the domain of the retraction."""
@@ -99,13 +71,6 @@ class InCharts(OneStepMethod):
         misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
         values = jax.lax.map(lambda shift: misfit(k.ravel() + shift), shifts)
         return ((values[1:] - values[0]) / step[:, None]).T
-
-    def check(self, system: System) -> None:
-        self.method.check(system)
-
-    @property
-    def has_estimate(self) -> bool:
-        return self.method.has_estimate
 
     def error(self, system: System, x, low, h, k) -> jax.Array:
         return self.method.error(system, x, low, h, k) if self.explicit else collocation_error(system, x, low, h, k)
@@ -156,13 +121,6 @@ class InCharts(OneStepMethod):
         own = jax.vmap(there)(own)
         begin = -0.5 * self.method.increment(h, own)
         return _Step(local, self.method.pulled(local), begin, there(low), own, jax.vmap(back_there))
-
-    @property
-    def increments(self) -> int:
-        return self.method.increments
-
-    def driven_by(self, dW) -> OneStepMethod:
-        return InCharts(self.method.driven_by(dW), self.retraction)
 
     def predict(self, k, before) -> jax.Array:
         if self.increments:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..systems import System
 from ..tracing.interpret import at_points
-from .base import OneStepMethod
+from .base import OneStepMethod, Wrapping
 from .charts import in_charts
 from .midpoint import MetriplecticMidpoint
 
@@ -21,7 +23,7 @@ MISFIT = 1e-10
 """Largest difference of ``B B^T`` from the friction matrix, relative to that."""
 
 
-class Fluctuating(OneStepMethod):
+class Fluctuating(Wrapping):
     """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [:doc:`/explanation/fluctuations`].
 
     As ``div K = sum_a (b_a . grad) b_a + b_a div b_a`` over the columns of B, the first of which is what turns
@@ -54,9 +56,7 @@ class Fluctuating(OneStepMethod):
     density: Energy | None
     dW: jax.Array
 
-    @property
-    def stages(self) -> int:
-        return 1
+    has_estimate: ClassVar[bool] = False
 
     @property
     def order(self) -> int:
@@ -115,9 +115,6 @@ class Fluctuating(OneStepMethod):
         return self.boltzmann * jnp.concatenate(
             [jnp.full(B.size, T) for T, (_, B) in zip(factors_of_k, parts, strict=True)]
         )
-
-    def increment(self, h, k) -> jax.Array:
-        return self.method.increment(h, k)
 
     def predict(self, k, before) -> jax.Array:
         """The noise of a step has nothing to do with that of those before."""

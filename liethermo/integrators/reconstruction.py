@@ -13,14 +13,14 @@ from ..errors import InputError
 from ..functions.frames import towards
 from ..functions.gradients import compensated
 from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
-from .base import OneStepMethod
+from .base import Wrapping
 from .explicit import LEVELS
 from .tableaus import gauss
 
 RECONSTRUCTIONS = ("coadjoint", "cayley", "exp")
 
 
-class WithAttitude(OneStepMethod):
+class WithAttitude(Wrapping):
     """A method for momenta, and after it ``g' = g hat(xi)``, xi_i the velocities that it moves with at its stages.
 
     The equations of a step are those of the momentum alone, and their tolerances are measured by it. The attitude is
@@ -60,45 +60,20 @@ class WithAttitude(OneStepMethod):
 
     Attributes
     ----------
-    method : OneStepMethod
     kind : {"coadjoint", "cayley", "exp"}
     """
 
-    method: OneStepMethod
     kind: str = eqx.field(static=True)
 
     def __check_init__(self):
         if self.kind not in RECONSTRUCTIONS:
             raise InputError(f"the reconstruction is {', '.join(map(repr, RECONSTRUCTIONS))}, not {self.kind!r}")
 
-    @property
-    def stages(self) -> int:
-        return self.method.stages
-
-    @property
-    def order(self) -> int:
-        return self.method.order
-
-    @property
-    def preserves(self) -> frozenset[str]:
-        return self.method.preserves
-
-    @property
-    def increments(self) -> int:
-        return self.method.increments
-
-    def driven_by(self, dW) -> OneStepMethod:
-        return WithAttitude(self.method.driven_by(dW), self.kind)
-
     def keeps(self, system, name: str) -> bool:
         if name not in (SPATIAL_MOMENTUM, WITHOUT_IMPULSE):
             return self.method.keeps(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
         return (self.explicit or follows) and self.method.transports(system.body)
-
-    @property
-    def explicit(self) -> bool:
-        return self.method.explicit
 
     def check(self, system) -> None:
         body = system.body
@@ -126,9 +101,6 @@ class WithAttitude(OneStepMethod):
         pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_low, h, k))
         found = pushed(self._torques(system, x, low, h, k))  # all stages with the torques of all
         return jnp.stack([found[i, i] for i in range(self.stages)])
-
-    def increment(self, h, k) -> jax.Array:
-        return self.method.increment(h, k)
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
@@ -240,18 +212,6 @@ class WithAttitude(OneStepMethod):
         for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
             k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
         return k
-
-    # -- what is that of the method -----------------------------------------------------------------------------------
-
-    def weights(self, theta):
-        return self.method.weights(theta)
-
-    def predict(self, k, before) -> jax.Array:
-        return self.method.predict(k, before)
-
-    @property
-    def has_estimate(self) -> bool:
-        return self.method.has_estimate
 
     def __str__(self) -> str:
         return f"{self.method} with attitudes by {self.kind}"

@@ -167,20 +167,14 @@ def ring_damper(
 
     Parameters
     ----------
-    inertia : three positive numbers
-        Principal moments of the whole, the liquid held fast (kg m**2).
-    axis : three numbers
-        The normal of the ring in body axes, of any length.
+    inertia, axis, capacity, temperature, attitude
+        As of :func:`damper_wheel`, the liquid in place of the wheel; ``axis`` is the normal of the ring.
     radius, tube : float, > 0
         R of the ring and a of the tube (m), a thin one: a is far below R.
     density : float, > 0
         rho of the liquid (kg / m**3).
     viscosity : float, > 0
         eta, the dynamic one (Pa s).
-    capacity, temperature : float, > 0
-        Of the bath: C (J / K), and T_0 (K) at y = 0.
-    attitude : bool
-        Whether runs have attitudes of the body, elements of SO(3).
 
     Raises
     ------

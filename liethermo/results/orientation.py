@@ -126,9 +126,8 @@ def precession(solution: Turned, axis=None) -> np.ndarray:
 
     Returns
     -------
-    ndarray, of the shape of :func:`nutation`
-        Angles (rad), whole turns included; less than half a turn may lie between the times kept. Those of
-        final states lie from -pi to pi.
+    ndarray
+        As of :func:`spin`.
 
     Raises
     ------
