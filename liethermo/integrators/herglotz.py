@@ -1,12 +1,14 @@
-"""The discrete Herglotz integrator of the evolution field [SML §6.3]."""
+"""Discrete Herglotz integrators of the evolution field [SML §6.3], of order 1 as printed, and of orders 2 and 4."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
@@ -16,51 +18,80 @@ from ..functions.energy import Energy, as_energy
 from ..systems import EvolutionSystem, System
 from .base import ONE_SIZE, OneStepMethod
 
+_OUTER = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
+_PROPORTIONS = {2: (1.0,), 4: (_OUTER, _OUTER, 1.0 - 4.0 * _OUTER, _OUTER, _OUTER)}
+
+PARTS: dict[int, tuple[tuple[float, bool], ...]] = {1: ((1.0, True),)} | {
+    order: tuple((0.5 * share, forward) for share in shares for forward in (True, False))
+    for order, shares in _PROPORTIONS.items()
+}
+"""What a step of an order consists of: the share of the step, and whether it is of the scheme or of its adjoint."""
+
 
 class DiscreteHerglotz(OneStepMethod):
     """``D_1 L_d(q_1, q_2, S_1) + (1 + D_S L_d(q_1, q_2, S_1)) D_2 L_d(q_0, q_1, S_0) = 0`` for q_2 [SML 40],
     ``S_1 - S_0 = (q_1 - q_0)·D_2 L_d(q_0, q_1, S_0)`` [SML 41].
 
     Run here as a one-step method on states (q, p, S) of an :class:`liethermo.EvolutionSystem`, with the momentum
-    ``p_1 = D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1). The discrete Lagrangian alone makes the step;
-    the system only says what energy and entropy are recorded.
+    ``p_1 = D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1), whatever the action S_1 is. The discrete
+    Lagrangian alone makes the step; the system only says what energy and entropy are recorded.
 
-    Nothing is kept exactly, neither the energy nor the sign of the entropy production. Order 1, since (40) and (41)
-    take the entropy at the start of the step; where L does not depend on S, a variational integrator of the order of
-    L_d. One equation of the size of q a step, solved by Newton's method; explicit where L_d is quadratic in q_2.
+    The scheme is of order 1, since (40) and (41) take the entropy at the start of the step. SML ask for more. Its
+    adjoint, the scheme backwards in time, takes the entropy at the end:
+
+        D_2 L_d(q_1, q_0, S_1; -h) = p_0,  S_1 - S_0 = (q_1 - q_0)·p_0,  p_1 = -D_1 L_d / (1 + D_S L_d).
+
+    Half a step of one and half a step of the other are symmetric, so of order 2; five such steps in the proportions of
+    Suzuki (1990) are of order 4 [Hairer, Lubich & Wanner 2006, II.4]. The step in the middle goes back in time.
+
+    Nothing is kept exactly, neither the energy nor the sign of the entropy production. Where L does not depend on S it
+    is a variational integrator. One equation of the size of q a part, solved by Newton's method; explicit where L_d is
+    quadratic in q_2.
 
     Parameters
     ----------
     discrete_lagrangian : function of (q_0, q_1, S_0, h), q of shape (n,), to a scalar
         The action of a step, such as ``h L``; :meth:`midpoint` makes one from a Lagrangian.
+    order : {1, 2, 4}
+        Orders 2 and 4 need the action of a step of size -h too.
     """
 
     systems = "evolution systems"
     fixed: ClassVar[str] = ONE_SIZE
 
     discrete_lagrangian: Callable
+    composed: int = eqx.field(static=True)
+
+    def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
+        if order not in PARTS:
+            raise InputError(f"the order is 1, 2 or 4, not {order!r}")
+        self.discrete_lagrangian, self.composed = discrete_lagrangian, order
 
     @classmethod
-    def midpoint(cls, lagrangian) -> DiscreteHerglotz:
+    def midpoint(cls, lagrangian, order: Literal[1, 2, 4] = 1) -> DiscreteHerglotz:
         """That of ``L_d(q_0, q_1, S_0) = h L((q_0 + q_1)/2, (q_1 - q_0)/h, S_0)`` [SML Example 7].
 
         Parameters
         ----------
         lagrangian : function from (q, v, S) in one array, shape (2n + 1,), to a scalar, or an Energy
+        order : {1, 2, 4}
         """
-        return cls(_Midpoint(as_energy(lagrangian, "the Lagrangian")))
+        return cls(_Midpoint(as_energy(lagrangian, "the Lagrangian")), order)
 
     @property
     def stages(self) -> int:
-        return 1
+        return len(PARTS[self.composed])
 
     @property
     def order(self) -> int:
-        return 1
+        return self.composed
 
     @property
     def preserves(self) -> frozenset[str]:
         return frozenset()
+
+    def __str__(self) -> str:
+        return "DiscreteHerglotz" if self.composed == 1 else f"DiscreteHerglotz(order={self.composed})"
 
     def state(self, q0, q1, S0, h) -> jax.Array:
         """The state (q_1, p_1, S_1) after a first step that is known, shape (2n + 1,), to start a run from."""
@@ -73,21 +104,54 @@ class DiscreteHerglotz(OneStepMethod):
         if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        n, start = len(x) // 2, x + low
-        q, p, S = start[:n], start[n : 2 * n], start[2 * n]
+    def weights(self, theta) -> np.ndarray:
+        return np.asarray(theta)[..., None] * self._shares
 
-        def misfit(q1):  # of (40)
+    @property
+    def _shares(self) -> np.ndarray:
+        return np.array([share for share, _ in PARTS[self.composed]])
+
+    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        y, found, n = x + low, [], len(x) // 2
+        for (share, forward), guess in zip(PARTS[self.composed], k, strict=True):
+            slope = (self._forward if forward else self._backward)(y, share * h, guess[:n])
+            found.append(slope)
+            y = y + (share * h) * slope
+        return jnp.stack(found)
+
+    def increment(self, h, k) -> jax.Array:
+        return h * (self._shares @ k)
+
+    def _forward(self, y, h, guess) -> jax.Array:
+        """The slope of a step of (40) and (41), after one step of Newton's method for its velocity."""
+        n = len(guess)
+        q, p, S = y[:n], y[n : 2 * n], y[2 * n]
+
+        def misfit(q1):
             by_q, by_S = jax.grad(self.discrete_lagrangian, argnums=(0, 2))(q, q1, S, h)
             return by_q + (1.0 + by_S) * p
 
-        q1 = q + h * k[0, :n]
-        velocity = k[0, :n] - solve(h * jax.jacfwd(misfit)(q1), misfit(q1)[:, None])[:, 0]
+        velocity = _improved(misfit, q, h, guess)
         p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q, q + h * velocity, S, h)
-        return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])[None]
+        return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
 
-    def increment(self, h, k) -> jax.Array:
-        return h * k[0]
+    def _backward(self, y, h, guess) -> jax.Array:
+        """The same of the adjoint."""
+        n = len(guess)
+        q, p, S = y[:n], y[n : 2 * n], y[2 * n]
+
+        def end(q1):
+            return q1, q, S + jnp.dot(q1 - q, p), -h
+
+        velocity = _improved(lambda q1: jax.grad(self.discrete_lagrangian, argnums=1)(*end(q1)) - p, q, h, guess)
+        by_q, by_S = jax.grad(self.discrete_lagrangian, argnums=(0, 2))(*end(q + h * velocity))
+        return jnp.concatenate([velocity, (-by_q / (1.0 + by_S) - p) / h, jnp.dot(velocity, p)[None]])
+
+
+def _improved(misfit: Callable, q, h, velocity) -> jax.Array:
+    """A velocity after one step of Newton's method for ``misfit(q + h velocity) = 0``."""
+    q1 = q + h * velocity
+    return velocity - solve(h * jax.jacfwd(misfit)(q1), misfit(q1)[:, None])[:, 0]
 
 
 class _Midpoint(Module):

@@ -13,7 +13,7 @@ import numpy as np
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
-from ...systems import SimpleClosedSystem, System
+from ...systems import ComposedSystem, SimpleClosedSystem, System
 from ...tracing.interpret import polynomial_degree
 from ...tracing.programs import program
 from ..base import ONE_SIZE, OneStepMethod, register
@@ -49,6 +49,14 @@ class VariationalIntegrator(OneStepMethod):
     the size of (q, S) a step, solved by Newton's method with the matrix (3.13); where the motion does not depend on
     S_k+1 and is affine in q_k+1 it is solved outright.
 
+    It runs a :class:`liethermo.ComposedSystem` too, of several entropies, by one finite difference map (schemes 1, 2
+    and their alpha family): with ``p_k = -D_1 L_d - F^-_d`` the equations are, in the variables (q, p, S),
+
+        (q_k+1 - q_k)/h = H_p,  (p_k+1 - p_k)/h = -H_q + F,  T_a (S_a,k+1 - S_a,k)/h = the heat that body a receives,
+
+    all at ``((1 - alpha) q_k + alpha q_k+1, alpha p_k + (1 - alpha) p_k+1, (1 - beta) S_k + beta S_k+1)``. The sum of
+    the entropies falls at no step, for every energy, friction and conductance.
+
     Parameters
     ----------
     phi : FiniteDifference, a sequence of them, or one of "verlet", "midpoint", "symmetrised"
@@ -57,7 +65,7 @@ class VariationalIntegrator(OneStepMethod):
         For the forces and the constraint, where they are chosen separately [GBY Remark 3.5]; phi by default.
     """
 
-    systems = "simple closed systems"
+    systems = "simple closed and composed systems"
     fixed: ClassVar[str] = ONE_SIZE
 
     phi: tuple[FiniteDifference, ...]
@@ -104,7 +112,17 @@ class VariationalIntegrator(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a variational principle of this kind."""
-        need_simple_closed(system, "VariationalIntegrator")
+        if not isinstance(system, ComposedSystem):
+            need_simple_closed(system, "VariationalIntegrator")
+        elif not (len(self.phi) == 1 and type(self.phi[0]) is FiniteDifference and self._maps_are_one):
+            raise InputError(
+                f"{self} takes means over several finite difference maps, and composed systems run by one: take "
+                "lt.VariationalIntegrator.midpoint() or .verlet()"
+            )
+
+    @property
+    def _maps_are_one(self) -> bool:
+        return self.phi == self.forces == self.constraint
 
     def discrete(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
         """L_d, F_d and P_d of a step of size h from the time t on."""
@@ -113,6 +131,8 @@ class VariationalIntegrator(OneStepMethod):
     # -- the step ---------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, low, h, k) -> jax.Array:
+        if isinstance(system, ComposedSystem):
+            return system.vector_field(x + (low + h * self._share(system) * k[0]))[None]
         assert isinstance(system, SimpleClosedSystem)
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.parts(x + low)
@@ -125,7 +145,16 @@ class VariationalIntegrator(OneStepMethod):
         ledger = jnp.stack([*discrete.received(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
         return jnp.concatenate([V, v_dot, s[None], ledger])[None]
 
+    def _share(self, system: ComposedSystem) -> np.ndarray:
+        """How far on its way each component of a composed system is looked at."""
+        (map,), (q, p, S, _) = self.phi, system.poisson.places
+        share = np.empty(system.dim)
+        share[q], share[p], share[S] = map.alpha, 1.0 - map.alpha, map.beta
+        return share
+
     def change(self, system: System, x, low, h, k, d) -> jax.Array:
+        if isinstance(system, ComposedSystem):
+            return super().change(system, x, low, h, k, d)
         return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:

@@ -369,6 +369,60 @@ def test_fourier_factors_as_they_are_printed():
         lt.ComposedSystem(bodies, conductance=1.0, conduction="middle")
 
 
+def piston():
+    """A piston between two gases, that rubs and lets heat through [GBY §1: several entropies]."""
+
+    def gases(q, S):
+        return (
+            jnp.exp(S[0]) * (1.0 + q[0]) ** (-2 / 3) + jnp.exp(S[1]) * (1.0 - q[0]) ** (-2 / 3) + 0.01 * jnp.exp(S[2])
+        )
+
+    bodies = {
+        "left": lt.Subsystem(None, 1),
+        "right": lt.Subsystem(None, 1),
+        "piston": lt.Subsystem(lt.Kinetic([1.0]), 3, friction=0.2),
+    }
+    return lt.ComposedSystem(bodies, gases, [(0, 2, 0.3), (2, 1, 0.2)], validate=False)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [
+        (lt.VariationalIntegrator.midpoint(), 2.0),
+        (lt.VariationalIntegrator.verlet(), 1.0),
+        (lt.VariationalIntegrator.midpoint(0.3), 1.0),
+    ],
+    ids=str,
+)
+def test_variational_integrators_of_several_entropies(method, order):
+    """Scheme 2 is stationary for its discrete action, by difference quotients of that; orders; no entropy falls."""
+    system, x0 = piston(), np.array([0.1, -0.2, 0.2, 0.5, 0.3])
+    exact = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticGauss(4)).x[-1]
+    runs = [lt.integrate(system, x0, (0.0, 1.0), h, method) for h in (0.02, 0.01)]
+    errors = [np.abs(run.x[-1] - exact).max() for run in runs]
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.15, errors
+    assert np.diff(runs[0].entropy).min() > 0.0
+    assert np.ptp(runs[0].energy) > 1e-7  # the energy is what the metriplectic schemes keep
+
+    # (3.12) of three nodes, L_d and the forces by hand
+    alpha, h, (first, middle, last) = method.phi[0].alpha, 0.02, runs[0].x[:3]
+    U = lambda q, S: float(  # noqa: E731
+        np.exp(S[0]) * (1 + q) ** (-2 / 3) + np.exp(S[1]) * (1 - q) ** (-2 / 3) + 0.01 * np.exp(S[2])
+    )
+
+    def action(q0, q1, a, b):  # the entropies are those of the nodes a, b
+        S = (1 - alpha) * a[[0, 1, 4]] + alpha * b[[0, 1, 4]]
+        return h * (0.5 * ((q1 - q0) / h) ** 2 - U((1 - alpha) * q0 + alpha * q1, S))
+
+    q, e = [x[2] for x in (first, middle, last)], 1e-5
+    by_middle = action(q[0], q[1] + e, first, middle) - action(q[0], q[1] - e, first, middle)
+    by_middle += action(q[1] + e, q[2], middle, last) - action(q[1] - e, q[2], middle, last)
+    friction = -0.2 * (alpha * (q[1] - q[0]) + (1 - alpha) * (q[2] - q[1]))
+    assert abs(by_middle / (2 * e) + friction) < 1e-9
+    assert abs(friction) > 1e-5
+
+
 @pytest.mark.slow
 def test_temperatures_that_are_not_positive():
     """At the start, an error that names the body; on the way, a status; at test points, left out."""

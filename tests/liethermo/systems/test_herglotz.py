@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 from tests.cases import tolerance
@@ -225,6 +226,41 @@ def test_discrete_herglotz_solves_40_and_41():
 
     for residual in residuals(q[:-2], q[1:-1], q[2:], S[:-2], S[1:-1]):
         assert np.abs(residual).max() < 1e-13
+
+
+def solved_step(method, x, h):
+    """The end of a step, its equations iterated to rounding: Newton's method is in the slopes."""
+    x = jnp.asarray(x)
+    k = jnp.zeros((method.stages, 3))
+    for _ in range(12):
+        k = method.slopes(recorder(), x, jnp.zeros(3), h, k)
+    return np.asarray(x + method.increment(h, k))
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("order", [4, 2])
+@pytest.mark.parametrize("S0", [3.7, 0.0])
+def test_discrete_herglotz_of_higher_order(order, S0):
+    """SML 6.3 asks for more than order 1: the order for any first action, against (12) by hand; symmetric in time."""
+
+    def rate(t, y):  # of quartic_action: L = v^2/2 + v^4/20 - q^4/4 - 0.3 S (1 + q/10)
+        q, v, S = y
+        p, by_q, by_S = v + 0.2 * v**3, -(q**3) - 0.03 * S, -0.3 * (1.0 + 0.1 * q)
+        return [v, (by_q + by_S * p) / (1.0 + 0.6 * v**2), p * v]
+
+    v0 = 0.4
+    x0 = np.array([1.0, v0 + 0.2 * v0**3, S0])
+    q, v, S = solve_ivp(rate, (0.0, 1.0), [1.0, v0, S0], method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    exact, method = np.array([q, v + 0.2 * v**3, S]), lt.DiscreteHerglotz(quartic_action, order=order)
+    runs = [lt.integrate(recorder(), x0, (0.0, 1.0), h, method, engine="array") for h in (0.1, 0.05)]
+    errors = [np.abs(run.x[-1] - exact).max() for run in runs]
+    assert method.order == order
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2, errors
+    assert np.abs(solved_step(method, solved_step(method, x0, 0.1), -0.1) - x0).max() < 1e-13
+    plain = lt.DiscreteHerglotz(quartic_action)
+    assert np.abs(solved_step(plain, solved_step(plain, x0, 0.1), -0.1) - x0).max() > 1e-5
+    with pytest.raises(lt.InputError, match="order is 1, 2 or 4"):
+        lt.DiscreteHerglotz(quartic_action, order=3)
 
 
 def test_discrete_herglotz_runs_evolution_systems_only():
