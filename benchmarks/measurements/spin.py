@@ -69,7 +69,7 @@ def program(rate: float) -> Body:
 
 
 def by_library(rate: float, steps: int, every: int, engine: Engine) -> Callable[[], lt.Solution]:
-    span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint()
+    span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint(retraction="midpoint")
     return functools.partial(lt.integrate, system(rate), X0, span, STEP, midpoint, save_every=every, engine=engine)
 
 

@@ -67,7 +67,7 @@ class Friction(Dissipation):
     def force(self, system, x, dH, dS, dL):
         if self.D is None:
             return -self.rate * system.raised(x, dH)
-        return -self.rate * system.tangent(x, form_at(self.D, x) @ dH)
+        return -self.rate * system.tangent(x, form_at(self.D, x) @ system.tangent(x, dH))
 
     def factor(self, system, x, dH, dL):
         if self.D is None:

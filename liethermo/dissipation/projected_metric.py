@@ -80,7 +80,10 @@ class ProjectedMetric(Dissipation):
         raised = self._raised(system, x)
         if not dL and not self.normalized:
             GdH = raised(dH)
-            return self.rate * (jnp.dot(GdH, dH) * raised(dS) - jnp.dot(GdH, dS) * GdH)
+            square = jnp.dot(GdH, dH)
+            share = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
+            image = raised(dS - share * dH)  # the rest first: near an equilibrium its image has digits of its own
+            return self.rate * (square * image - jnp.dot(image, dH) * GdH)
         held = frame((dH, *dL), form=raised)
         projected = held.off_images(raised(held.off(dS)))
         return self.rate * (projected if self.normalized else math.prod(held.squares) * projected)
@@ -111,4 +114,4 @@ class ProjectedMetric(Dissipation):
 
     def _raised(self, system, x):
         G = form_at(self.cometric, x)
-        return lambda alpha: system.raised(x, alpha) if G is None else system.tangent(x, G @ alpha)
+        return lambda alpha: system.raised(x, alpha) if G is None else system.tangent(x, G @ system.tangent(x, alpha))

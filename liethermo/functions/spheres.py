@@ -20,7 +20,7 @@ from .energy import Energy
 
 @dataclass(frozen=True)
 class Spheres:
-    """The first ``count`` vectors of three components of a state have constant lengths.
+    """A :class:`.surface.Surface`: the first ``count`` vectors of three components of a state have constant lengths.
 
     Attributes
     ----------
@@ -34,14 +34,15 @@ class Spheres:
     count: int
     name: str
     planar: bool = False
+    collocated = True
 
     def along(self, x, v) -> jax.Array:
         """v, shape (n,), less its radial components at x."""
         s, part = self._vectors(x), self._vectors(v)
         return self._replaced(v, added(part, scaled(-_quotient(dotted(s, part), dotted(s, s)), s)))
 
-    def reached(self, x, low, d) -> jax.Array:
-        """The displacement from x + low that ends where d does, but at the lengths of the start.
+    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
+        """The displacement from x + low that ends where d does, but at the lengths of the start; nothing is missed.
 
         From what the squares change by, not from their values: so it is as exact as d is small.
         """
@@ -49,7 +50,11 @@ class Spheres:
         end = added(start, step)
         share = _quotient(dotted(step, added(start, end)), dotted(end, end))
         root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
-        return self._replaced(d, added(step, scaled(-share / (1.0 + root), end)))
+        return self._replaced(d, added(step, scaled(-share / (1.0 + root), end))), jnp.zeros(())
+
+    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+        """The state as it is: the sum of the squares is steered with the other first integrals."""
+        return x, low
 
     def _vectors(self, v) -> Planes:
         return spins_of(v, self.count, self.planar)

@@ -14,9 +14,11 @@ import numpy as np
 from manifolds._module import Module
 
 from ..errors import InputError
+from ..functions.energy import Energy
 from ..functions.gradients import EPS, compensated
 from ..functions.rounding import with_rounding
 from ..systems import System
+from .levels import ended
 from .tableaus import MOST_STAGES, at_start, beyond, gauss, integrated
 
 _registry: list[OneStepMethod] = []
@@ -97,7 +99,17 @@ class OneStepMethod(Module):
 
     def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
         """The state at the end of the step as x' + low', the increment added with its rounding error caught."""
-        return compensated(x, low + self.increment(h, k))
+        d, surface = self.increment(h, k), system.surface
+        if surface is None:
+            return compensated(x, low + d)
+        if not (self.explicit or surface.collocated):
+            d = ended(system, surface, self.holds(system), x, low, d)
+        return surface.settled(*compensated(x, low + d))
+
+    def holds(self, system: System) -> tuple[Energy, ...]:
+        """The functions besides energy and entropy that an implicit step keeps."""
+        del system
+        return ()
 
     def along(self, system: System, x, v) -> jax.Array:
         """The state that a displacement v leads to from x: where the step is on its way, outside of the laws."""

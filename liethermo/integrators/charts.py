@@ -28,7 +28,7 @@ class InCharts(Wrapping):
     in the middle, z is the midpoint of x and x' [BFM 4.8]; a method of one stage takes Pi and K there as they are, and
     with the discrete gradient in the chart around z, which is (4.9)-(4.10), this is the integrator of BFM §4.4.
 
-    Made by :func:`liethermo.integrate` from the method it is given. Slopes are tangent vectors at x, as vectors of
+    Made by :func:`liethermo.integrate` from a method with a retraction. Slopes are tangent vectors at x, as vectors of
     shape (n,).
 
     Attributes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Self
@@ -16,11 +15,11 @@ import manifolds as mf
 from ..dissipation.base import portions
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import VANISHED, towards
-from ..functions.gradients import EPS, Gonzalez
+from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod
 from .charts import InCharts, in_charts
+from .levels import CORRECTIONS, LAWS, Law, corrected
 from .preserved import check_preserved, preserved_functions, seen_on
 
 SLOPE, ERROR, MISSED, LEVELS, OWN = range(5)
@@ -31,28 +30,6 @@ for the states between. Error and what is missed are over h."""
 NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
 """What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
 back, and the most that one takes back: far below what its rounding is."""
-
-
-NOISY = 1e-8
-"""As :data:`..functions.gradients.NOISY`, for a step that is not iterated: noise in what a function changes by is no
-more than its rounding, and does not add up, since the values at which one step ends are those that the next begins
-with."""
-
-DIFFERENCE = 16.0 * EPS
-"""What a change of a function may be off, relative to the size at which its values are rounded: a few roundings of
-both."""
-
-VANISHED_LENGTH = math.sqrt(VANISHED)
-
-
-class Law(NamedTuple):
-    """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
-
-    function: Energy
-    sign: float
-
-
-LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
 
 
 class Unlawful(NamedTuple):
@@ -104,8 +81,7 @@ class ExplicitMethod(OneStepMethod):
         As of :class:`.MetriplecticRungeKutta`.
     """
 
-    corrections: ClassVar[int] = 4
-    """Newton corrections of a step at most: a relative error of a twentieth is one of rounding after them."""
+    corrections: ClassVar[int] = CORRECTIONS
 
     number: int | None = eqx.field(static=True)
     functions: tuple[Energy, ...]
@@ -183,7 +159,7 @@ class ExplicitMethod(OneStepMethod):
         d, changes, error, between = self.uncorrected(system, laws, x, low, h)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
             changes = changes + self._steering(system, laws, x, low, k[LEVELS])
-        d, missed = self._corrected(system, laws, x, low, d, changes)
+        d, missed = corrected(system, laws, x, low, d, changes, self.corrections)
         return jnp.stack([d / h, error, jnp.broadcast_to(missed / h, x.shape), k[LEVELS], *between])
 
     def _steering(self, system: System, laws: list[Law], x, low, levels) -> jax.Array:
@@ -224,77 +200,11 @@ class ExplicitMethod(OneStepMethod):
 
         return system.field(x, dH, dS, dL), jnp.stack([rate(law) for law in laws])
 
-    def _corrected(self, system: System, laws: list[Law], x, low, d, changes) -> tuple[jax.Array, jax.Array]:
-        """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
-        change, spheres = Gonzalez(NOISY), system.spheres
-        functions, blocks = [law.function for law in laws], system.blocks
-        before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
-
-        def landed(d):
-            return d if spheres is None else spheres.reached(x, low, d)
-
-        def gradients(d) -> list:
-            return [f.gradient(x + (low + d)) for f in functions]
-
-        def misses(d, ends) -> jax.Array:
-            """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
-            along = [
-                change(f, x, d, low) if first is None else 0.5 * (first + last)
-                for f, first, last in zip(functions, before, ends, strict=True)
-            ]
-            return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
-
-        def directions(d, ends) -> list:
-            end = x + (low + d)
-            found = [system.raised(end, gradient) for gradient in ends]
-            return found if spheres is None else [spheres.along(end, v) for v in found]
-
-        def corrected(made: int, d, ends, found) -> tuple:
-            """The displacement at last, what it misses of the levels, and the lengths of the directions.
-
-            These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
-            of their own, as entropies beside a momentum, those by which a function changes most in d.
-            """
-            missed = misses(d, ends)
-            if len(blocks) == 1:
-                lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
-            else:
-                moved = jnp.linalg.norm(d)
-                most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
-                lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
-
-            def again() -> tuple:
-                better = directions(d, ends) if 0 < made < 3 else found  # the last time they are as good as they get
-                nearer = landed(d + towards(better, missed, passes=min(len(blocks), 2)))
-                return corrected(made + 1, nearer, gradients(nearer), better)
-
-            if made >= self.corrections:
-                return d, missed, lengths
-            if made == 0:
-                return again()
-            # of a short step one is enough
-            return jax.lax.cond(done(d, missed, lengths), lambda: (d, missed, lengths), again)
-
-        def done(d, missed, lengths) -> jax.Array:
-            small = jnp.abs(missed) <= EPS * lengths * jnp.linalg.norm(d)
-            return (small | (lengths <= VANISHED_LENGTH)).all()
-
-        def hidden() -> jax.Array:
-            """What rounding of the values may make of what is missed: nothing where there is a closed form."""
-            return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
-
-        d = landed(d)
-        ends = gradients(d)
-        d, missed, lengths = corrected(0, d, ends, directions(d, ends))
-        rounding = jax.lax.cond(done(d, missed, lengths), lambda: jnp.zeros_like(missed), hidden)
-        vanished, beyond = lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(missed) - rounding, 0.0)
-        return d, jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, lengths)))
-
     def _laws(self, system: System) -> list[Law]:
         """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
         functions = system.functions()
         laws = [Law(system.energy, LAWS[system.energy_law])] if system.energy_law in LAWS else []
-        local = set() if system.spheres is None else {system.spheres.name}
+        local = set() if system.surface is None else {system.surface.name}
         laws += [Law(functions[name], 0.0) for name in self.held if name not in local]
         laws += [Law(C, 0.0) for C in self.functions]
         if system.entropy_law in LAWS:

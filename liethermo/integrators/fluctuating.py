@@ -67,6 +67,10 @@ class Fluctuating(Wrapping):
         return self.method.preserves - {"entropy_law_quadratic"}
 
     @property
+    def retraction(self):
+        return self.method.retraction
+
+    @property
     def orderless(self) -> bool:
         return self.method.orderless
 

@@ -59,8 +59,8 @@ class MetriplecticGauss(GaussMethod):
     not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
     s is 1 or 2.
 
-    On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
-    same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the state,
+    a new one at each step: same order, same laws. See :class:`InCharts`.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class MetriplecticGauss(GaussMethod):
         Further first integrals to hold exactly, such as momentum maps. The system has to conserve them (checked when a
         run starts).
     retraction : str or manifolds.Retraction, optional
-        On a manifold: ``"exp"`` by default, or as :func:`manifolds.retraction` names them.
+        On a manifold, in whose charts to run, such as ``"exp"``: :func:`manifolds.retraction` names them.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves of its Casimirs
         and of what its dissipation is told to preserve.
@@ -249,6 +249,9 @@ class MetriplecticGauss(GaussMethod):
         functions = system.functions()
         given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | given
+
+    def holds(self, system: System) -> tuple[Energy, ...]:
+        return tuple(self._kept(system).values())
 
     def _casimirs(self, system: System) -> set[str]:
         """Names of the Casimirs among what is held."""

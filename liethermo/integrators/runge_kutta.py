@@ -38,8 +38,8 @@ class MetriplecticRungeKutta(ExplicitMethod):
     value of what each function changes by. There is nothing to iterate, but stiff systems ask for short steps. A step
     that is too long for its corrections fails with a status.
 
-    On a manifold the scheme runs in the chart ``v -> R(x, v)`` around the state, a new one at each step: same order,
-    same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the state,
+    a new one at each step: same order, same laws. See :class:`InCharts`.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
     preserve : sequence of functions or energies
         Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
     retraction : str or manifolds.Retraction, optional
-        On a manifold, with its base point where the step starts: ``"exp"`` by default.
+        On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves.
     """

@@ -59,7 +59,7 @@ class MetriplecticTaylor(ExplicitMethod):
     preserve : sequence of functions or energies
         Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
     retraction : str or manifolds.Retraction, optional
-        On a manifold, with its base point where the step starts: ``"exp"`` by default.
+        On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves.
     """

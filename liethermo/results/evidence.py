@@ -145,7 +145,7 @@ class Witness:
         count = len(self.h)
         if not count:
             return found
-        places = np.asarray(self.system.points(some)).reshape(len(some), -1)
+        places = np.asarray(self.system.points(some)).reshape(len(some), -1).view(np.float64)
         whole = WHOLE * float(np.ptp(places, axis=0).max())
         looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
         again, missed = self._worst(looked, whole)

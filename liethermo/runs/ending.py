@@ -162,6 +162,9 @@ def status_of(engine: Chosen, state, now: float, h: float, stopped: str) -> Stat
             f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). " + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)
+    if engine.system.surface is not None and (reason := engine.system.outside(_ahead(state, h))):
+        text = f"{where}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
+        return Status(Code.NON_FINITE, text, step, now, residual)
     message = (
         f"NaN or infinity in {where}: the energy, the entropy or the vector field is not finite there "
         f"({_culprit(engine, state, h)}). Check the domain of your functions along the trajectory, or try "
@@ -186,10 +189,15 @@ def _advice(engine: Chosen, state, h: float) -> str:
     )
 
 
+def _ahead(state, h: float) -> jax.Array:
+    """Where the last slopes lead to."""
+    return jnp.asarray(state.x) + h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+
+
 def _culprit(engine: Chosen, state, h: float) -> str:
     """Which function is not finite just ahead of the last good state."""
     system = engine.system
-    ahead = jnp.asarray(state.x) + h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+    ahead = _ahead(state, h)
     if reason := engine.method.explain(system, state.x, state.k, h):
         return reason
     suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}

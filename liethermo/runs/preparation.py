@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import OneStepMethod, WithAttitude
 from ..results.status import Laws
-from ..systems import AttitudeSystem, DrivenSystem, LiePoissonSystem, System, driven
+from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, LiePoissonSystem, System, driven, embedded
 from ..tracing.remembered import remembered
 from .family import Family
 from .fluctuations import Fluctuations
@@ -44,7 +44,7 @@ def as_run(
     """The system and the method as they are run, with adaptive steps of a tolerance or with given ones.
 
     With clock and work where the energy depends on time, with noise, with attitudes where there is a group, in charts
-    on a manifold.
+    on a manifold or in the space around it.
     """
     if not isinstance(method, OneStepMethod):
         if noise is not None:
@@ -60,7 +60,8 @@ def of_steps(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
     """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
-    found = driven(system)
+    charts = getattr(method, "retraction", None) is not None
+    found = driven(system if charts else embedded(system))
     method = traced_energies(method.suited(tolerance).pulled(found).on(found), found.dim)
     wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
     if wanted is None or not (attitude or system.needs_attitude):
@@ -89,7 +90,9 @@ def as_family(family: Family, system: System) -> Family:
     """The family of what the members are run as, where the system is what one of them is."""
     if isinstance(system, AttitudeSystem):
         return as_family(family, system.body).through(AttitudeSystem, system.reconstruction)
-    return family.through(DrivenSystem) if isinstance(system, DrivenSystem) else family
+    if isinstance(system, EmbeddedSystem):
+        return family.through(EmbeddedSystem, system.conforming)
+    return as_family(family, system.body).through(DrivenSystem) if isinstance(system, DrivenSystem) else family
 
 
 @remembered

@@ -8,6 +8,7 @@ from .chetaev import ChetaevSystem
 from .composed.bodies import Copies, Subsystem
 from .composed.system import ComposedSystem
 from .driven import DrivenSystem, driven
+from .embedded import EmbeddedSystem, embedded
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
@@ -27,6 +28,7 @@ __all__ = [
     "ContactSystem",
     "Copies",
     "DrivenSystem",
+    "EmbeddedSystem",
     "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -42,5 +44,6 @@ __all__ = [
     "ThermodynamicHerglotz",
     "TurningSystem",
     "driven",
+    "embedded",
     "momenta_of",
 ]

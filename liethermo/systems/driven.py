@@ -158,6 +158,10 @@ class DrivenSystem(System):
         object.__setattr__(found, "torque", torque)
         return found
 
+    @property
+    def surface(self):
+        return self.body.surface
+
     def raised(self, x, alpha):
         """What is moved to correct something is moved in the body: never the clock, nor the work done."""
         return jnp.concatenate([self.body.raised(x[:-2], alpha[:-2]), jnp.zeros(2)])

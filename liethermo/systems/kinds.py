@@ -17,7 +17,7 @@ from manifolds._module import Module
 
 from ..dissipation.base import Dissipation, Law
 from ..functions.energy import Energy
-from ..functions.spheres import Spheres
+from ..functions.surface import Surface
 from .baths import HeatBaths
 
 
@@ -160,8 +160,8 @@ class Kind(Module):
         return False
 
     @property
-    def spheres(self) -> Spheres | None:
-        """Which vectors of the state have constant lengths, too many for a function each; None where none are known."""
+    def surface(self) -> Surface | None:
+        """Where a step has to end, of constraints that are no functions of the system; None where there are none."""
         return None
 
     @property

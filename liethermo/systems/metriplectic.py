@@ -14,6 +14,7 @@ from ..errors import InputError
 from .base import System, square_field
 from .baths import HeatBaths
 from .chart import ChartSystem
+from .embedded import EmbeddedSystem
 
 
 class MetriplecticSystem(System):
@@ -67,7 +68,6 @@ class MetriplecticSystem(System):
                     f"the space is a manifolds.Space such as manifolds.Sphere(2), not {type(space).__name__}; "
                     "for a manifold of geomstats give manifolds.from_geomstats(...)"
                 )
-            _chart(space)  # raises where a space lacks what it is run by
             dim = space.size if dim is None else dim
         if dim is None and (poisson is None or (callable(poisson) and not isinstance(poisson, mf.PoissonStructure))):
             raise InputError(
@@ -88,12 +88,10 @@ class MetriplecticSystem(System):
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
-        """Around a state of a manifold, in the coordinates of its exponential map or of its projection."""
+        """In the space around a manifold; where it has no equations, in the coordinates of its exponential map."""
         if self.space is None:
             return self, x
-        around = mf.coordinates_around(_chart(self.space), self.points(x))
+        if self.space.surrounded:
+            return EmbeddedSystem(self), x
+        around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
         return ChartSystem(self, around, around.centre() if centred else None), jnp.zeros(self.space.dim)
-
-
-def _chart(space: mf.Space) -> mf.Chart:
-    return mf.RiemannianRetraction(space) if space.geodesics else mf.ProjectionRetraction(space)

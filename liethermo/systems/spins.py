@@ -123,7 +123,7 @@ class SpinSystem(System):
         return {LENGTHS: Squares(math.prod(self.lattice))}
 
     @property
-    def spheres(self) -> Spheres:
+    def surface(self) -> Spheres:
         assert self._spins is not None
         return Spheres(math.prod(self.lattice), LENGTHS, self._spins.planar)
 

@@ -25,6 +25,7 @@ def SO(n: int) -> MatrixGroup:
         log_map=rotation_log,
         adjoint_cayley_map=None,
         restore_map=orthonormalized,
+        equations=closed.orthogonal_equations,
     )
     if n == 2:
         return replace(
@@ -46,6 +47,7 @@ def SE(n: int) -> MatrixGroup:
         closed.rigid_inverse,
         adjoint_cayley_map=maps.cayley if n == 2 else None,
         restore_map=closed.rigid_restored,
+        equations=closed.rigid_equations,
     )
     if n == 2:
         return replace(group, log_map=closed.rigid_log)
@@ -68,7 +70,7 @@ def SU(n: int) -> MatrixGroup:
         restore_map=closed.unitary_restored,
     )
     if n == 2:
-        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
+        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log, equations=closed.su2_equations)
         return replace(
             group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
         )
@@ -80,8 +82,8 @@ def SL(n: int) -> MatrixGroup:
     """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.unimodular_restored)
     if n == 2:
-        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley)
-    return replace(group, cayley_map=None, adjoint_cayley_map=None)
+        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley, equations=closed.symplectic_equations)
+    return replace(group, cayley_map=None, adjoint_cayley_map=None, equations=closed.unimodular_equations)
 
 
 @register((2,))
@@ -94,6 +96,7 @@ def Sp(n: int) -> MatrixGroup:
         closed.symplectic_inverse,
         adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
         restore_map=closed.symplectic_restored,
+        equations=closed.symplectic_equations,
     )
 
 

@@ -193,6 +193,43 @@ def heisenberg_defect(g) -> jax.Array:
     return largest(jnp.where(_free(g), 0.0, g - jnp.eye(g.shape[-1])))
 
 
+# -- equations: they vanish on the group, and products from the right with its elements do not change them ----------
+
+
+def orthogonal_equations(g) -> jax.Array:
+    """The entries of ``g g^T - I`` above and on the diagonal."""
+    n = g.shape[-1]
+    return (g @ g.swapaxes(-1, -2) - jnp.eye(n))[..., *np.triu_indices(n)]
+
+
+def rigid_equations(g) -> jax.Array:
+    """Those of the linear part, and the last row less (0, …, 0, 1)."""
+    last = g[..., -1, :] - jnp.eye(g.shape[-1])[-1]
+    return jnp.concatenate([orthogonal_equations(g[..., :-1, :-1]), last], axis=-1)
+
+
+def symplectic_equations(g) -> jax.Array:
+    """The entries of ``g J g^T - J`` above the diagonal; of 2 x 2 matrices ``det g - 1``."""
+    n = g.shape[-1] // 2
+    top, bottom = g[..., :n], g[..., n:]
+    form = top @ bottom.swapaxes(-1, -2)
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    return (form - form.swapaxes(-1, -2) - J)[..., *np.triu_indices(2 * n, 1)]
+
+
+def unimodular_equations(g) -> jax.Array:
+    """``det g - 1``."""
+    return determinant(g)[..., None] - 1.0
+
+
+def su2_equations(g) -> jax.Array:
+    """Of ``[[a, b], [-conj b, conj a]]`` with ``|a|^2 + |b|^2 = 1``."""
+    a, b = g[..., 0, 0], g[..., 0, 1]
+    rest = jnp.stack([a - g[..., 1, 1].conj(), b + g[..., 1, 0].conj()], axis=-1)
+    square = a.real**2 + a.imag**2 + b.real**2 + b.imag**2
+    return jnp.concatenate([rest.real, rest.imag, square[..., None] - 1.0], axis=-1)
+
+
 # -- inverses -----------------------------------------------------------------------------------------------------
 
 

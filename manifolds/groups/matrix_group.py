@@ -88,6 +88,9 @@ class MatrixGroup:
         ``(algebra, x) -> g`` with ``Ad(g) = cay(ad x)``, or None where ``cay(ad x)`` is not an adjoint action.
     restore_map : callable
         ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it, where it has a formula.
+    equations : callable or None
+        ``g -> array``, shape (..., m): independent functions that vanish on the group, and are constant along every
+        ``g exp(t X)`` for X in the algebra, wherever g is; where it has such.
     """
 
     name: str
@@ -100,6 +103,7 @@ class MatrixGroup:
     inverse_cayley_map: Callable = maps.inverse_cayley
     adjoint_cayley_map: Callable | None = maps.adjoint_cayley
     restore_map: Callable = closed.unchanged
+    equations: Callable | None = None
 
     def __post_init__(self) -> None:
         if getattr(self.defect, "__module__", "") != closed.__name__:  # those are known to take batches

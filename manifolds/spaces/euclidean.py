@@ -44,6 +44,18 @@ class Euclidean(Space):
     def _project(self, x):
         return x
 
+    def _constraints(self, x):
+        return jnp.zeros((*x.shape[: x.ndim - len(self.shape)], 0))
+
+    def _normal(self, x, c):
+        return jnp.zeros_like(x)
+
+    def _along(self, x, w):
+        return w
+
+    def _rounded(self, x):
+        return self._constraints(x)
+
     def _random(self, key, size):
         return jax.random.normal(key, (*size, *self.shape))
 

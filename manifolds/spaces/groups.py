@@ -14,7 +14,7 @@ from .._arrays import as_numeric
 from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
-from ..groups.closed_forms import affine
+from ..groups.closed_forms import affine, unchanged
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
 from ..matrices.linear import determinant, polar, solve, spectral_radius
 from ..matrices.symmetric import orthonormal_columns
@@ -137,6 +137,24 @@ class GroupSpace(Space):
     def _restored(self, x):
         """One Newton step to the group, so that rounding does not add up."""
         return self.group.restore_map(x)
+
+    @property
+    def surrounded(self):
+        """Not where all that is known of the group is its algebra and a distance from it."""
+        return self._has_equations or self.group.restore_map is not unchanged or self.dim == self.size
+
+    @property
+    def _has_equations(self):
+        return self.group.equations is not None
+
+    def _constraints(self, x):
+        return super()._constraints(x) if self.group.equations is None else self.group.equations(x)
+
+    def _returned(self, x):
+        return self._restored(x)
+
+    def _inside(self, x):
+        return self.group.defect(x) <= MEMBERSHIP_TOLERANCE
 
     # -- the metric of this space, which its subclasses replace -----------------------------------------------------
 

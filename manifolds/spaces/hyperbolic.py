@@ -52,6 +52,12 @@ class Hyperbolic(Space):
         space = x[..., 1:]
         return jnp.concatenate([jnp.sqrt(1.0 + (space**2).sum(axis=-1, keepdims=True)), space], axis=-1)
 
+    def _constraints(self, x):
+        return 0.5 * (_minkowski(x, x) + 1.0)
+
+    def _inside(self, x):
+        return x[..., 0] > 0.0
+
     def _random(self, key, size):
         return self._project(jax.random.normal(key, (*size, *self.shape)))
 
@@ -73,7 +79,7 @@ class Hyperbolic(Space):
 
     def _sharp(self, x, alpha):
         raised = _lowered(alpha)
-        return raised + _minkowski(x, raised) * x
+        return _minkowski(x, raised) * x - _minkowski(x, x) * raised  # along every hyperboloid
 
     def _exp(self, x, v):
         z = _minkowski(v, v)

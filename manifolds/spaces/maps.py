@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import SpaceError
+from ..matrices.linear import solve_near_identity
 
 
 class Maps(ABC):
@@ -180,6 +181,59 @@ class Maps(ABC):
 
     def _reach(self, x, v):
         return self._norm(x, v) / self.injectivity_radius()
+
+    # -- in the arrays around ---------------------------------------------------------------------------------------
+    # Systems are run there where no retraction is asked for. These maps are asked for near the space too.
+
+    @property
+    def surrounded(self) -> bool:
+        """Whether systems are run in the arrays around the space where no retraction is asked for."""
+        return True
+
+    def _constraints(self, x):
+        """Independent functions that vanish on the space, shape (..., m): by default what :meth:`_returned` takes off.
+
+        Quadratic ones are kept by collocation, and cost an implicit step nothing.
+        """
+        return self.to_vector(x - self._returned(x))
+
+    def _returned(self, x):
+        """A point near x that is nearer to the space, as Newton's method comes nearer; x itself where it is one."""
+        return self._project(x)
+
+    def _inside(self, x):
+        """Whether a solution of the constraints is in the space, shape (...)."""
+        return jnp.ones(x.shape[: x.ndim - len(self.shape)], bool)
+
+    @property
+    def _has_equations(self) -> bool:
+        return type(self)._constraints is not Maps._constraints
+
+    def _rows(self, x):
+        """The derivatives of the constraints, shape (..., m, size)."""
+        found, pull = jax.vjp(lambda y: self._constraints(self.from_vector(y)), self.to_vector(x))
+        axes = jnp.eye(found.shape[-1])
+        return jax.vmap(lambda e: pull(jnp.broadcast_to(e, found.shape))[0], out_axes=-2)(axes)
+
+    def _normal(self, x, c):
+        """The least displacement at x that changes the constraints by c, shape (..., m)."""
+        if not self._has_equations:
+            return self.from_vector(c)
+        rows = self._rows(x)
+        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), c[..., None])
+        return self.from_vector((weights * rows).sum(axis=-2))
+
+    def _along(self, x, w):
+        """The array w less what would change the constraints at x."""
+        if not self._has_equations:
+            return self._project_tangent(x, w)
+        return w - self._normal(x, jax.jvp(self._constraints, (x,), (w + jnp.zeros_like(x),))[1])
+
+    def _rounded(self, x):
+        """The sizes at which the constraints are rounded at x, shape (..., m)."""
+        if not self._has_equations:
+            return jnp.abs(self.to_vector(x))
+        return (jnp.abs(self._rows(x)) * jnp.abs(self.to_vector(x))[..., None, :]).sum(axis=-1)
 
     # What retractions other than the Riemannian one are made of, where a space has it.
 

@@ -101,6 +101,38 @@ class Product(Space):
     def _project_tangent(self, x, w):
         return self._joined("_project_tangent", x, w)
 
+    @property
+    def surrounded(self):
+        return all(factor.surrounded for factor in self.factors)
+
+    @property
+    def _has_equations(self):
+        return True
+
+    def _constraints(self, x):
+        return self._rows_of("_constraints", x)
+
+    def _rounded(self, x):
+        return self._rows_of("_rounded", x)
+
+    def _rows_of(self, kernel: str, *arrays):
+        """What a kernel of every factor gives, shape (..., m), side by side."""
+        parts = self._each(kernel, *arrays)
+        batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in parts))
+        return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
+
+    def _normal(self, x, c):
+        parts = self.split(x)
+        sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._each("_constraints", x), x)]
+        triples = zip(self.factors, parts, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
+        return self.join(*(factor._normal(part, own) for factor, part, own in triples))
+
+    def _along(self, x, w):
+        return self._joined("_along", x, w)
+
+    def _inside(self, x):
+        return jnp.stack(self._each("_inside", x)).all(axis=0)
+
     def _frame(self, x):
         batch, columns = x.shape[:-1], []
         for i, (factor, part) in enumerate(zip(self.factors, self.split(x), strict=True)):
@@ -109,9 +141,7 @@ class Product(Space):
         return jnp.concatenate(columns, axis=-2)
 
     def _coordinates(self, x, v):
-        parts = self._each("_coordinates", x, v)
-        batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in parts))
-        return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
+        return self._rows_of("_coordinates", x, v)
 
     def _from_coordinates(self, x, c):
         ends = np.cumsum([factor.dim for factor in self.factors])[:-1]
@@ -248,6 +278,33 @@ class Power(Space):
 
     def _project_tangent(self, x, w):
         return self.base._project_tangent(x, w)
+
+    @property
+    def surrounded(self):
+        return self.base.surrounded
+
+    @property
+    def _has_equations(self):
+        return self.base._has_equations
+
+    def _constraints(self, x):
+        return self._joined(self.base._constraints(x))
+
+    def _rounded(self, x):
+        return self._joined(self.base._rounded(x))
+
+    @staticmethod
+    def _joined(c):
+        return c.reshape(*c.shape[:-2], -1)
+
+    def _normal(self, x, c):
+        return self.base._normal(x, c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count))
+
+    def _along(self, x, w):
+        return self.base._along(x, w)
+
+    def _inside(self, x):
+        return self.base._inside(x).all(axis=-1)
 
     def _frame(self, x):
         frames = self.base._frame(x).reshape(*x.shape[: -len(self.shape)], self.count, self.base.dim, -1)

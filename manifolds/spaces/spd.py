@@ -54,6 +54,12 @@ class SPD(Space):
         x = symmetrized(x)
         return jnp.where(jnp.isfinite(cholesky(x)).all(axis=(-2, -1), keepdims=True), x, jnp.nan)
 
+    def _returned(self, x):
+        return symmetrized(x)
+
+    def _inside(self, x):
+        return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
+
     def _random(self, key, size):
         components = 0.5 * jax.random.normal(key, (*size, self.dim))
         return symmetrized(expm(jnp.einsum("...a,aij->...ij", components, self._basis)))

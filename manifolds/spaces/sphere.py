@@ -52,6 +52,9 @@ class Sphere(Space):
     def _project(self, x):
         return x / jnp.sqrt(_dot(x, x))
 
+    def _constraints(self, x):
+        return 0.5 * (_dot(x, x) - 1.0)
+
     def _random(self, key, size):
         return self._project(jax.random.normal(key, (*size, *self.shape)))
 
@@ -76,7 +79,7 @@ class Sphere(Space):
         return v
 
     def _sharp(self, x, alpha):
-        return self._project_tangent(x, alpha)
+        return _dot(x, x) * alpha - _dot(x, alpha) * x  # along every sphere around the origin
 
     def _exp(self, x, v):
         z = _dot(v, v)

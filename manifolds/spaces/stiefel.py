@@ -67,6 +67,10 @@ class Stiefel(Space):
     def _project(self, x):
         return polar(x)
 
+    def _constraints(self, x):
+        rest = _transposed(x) @ x - jnp.eye(self.p)
+        return rest[..., *np.triu_indices(self.p)]
+
     def _random(self, key, size):
         return orthonormal_columns(jax.random.normal(key, (*size, *self.shape)))
 
@@ -98,7 +102,7 @@ class Stiefel(Space):
         return v - 0.5 * x @ (_transposed(x) @ v)
 
     def _sharp(self, x, alpha):
-        return alpha - x @ _transposed(alpha) @ x
+        return alpha @ (_transposed(x) @ x) - x @ (_transposed(alpha) @ x)  # a rotation of x, whatever x^T x is
 
     def _exp(self, x, v):
         return orthonormalized(expm(self._lift(x, v)) @ x)  # one Newton step back, so that rounding does not add up

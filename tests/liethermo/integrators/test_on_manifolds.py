@@ -302,7 +302,7 @@ def test_a_point_off_the_manifold(build):
 def test_a_step_beyond_the_injectivity_radius(build):
     fast = lt.MetriplecticSystem(SPIN, lambda s: 20.0 * s[2], space=SPHERE, validate=False)
     with pytest.raises(lt.NonFiniteError, match=r"as long as the domain.*injectivity radius 3\.14159") as failure:
-        final(fast, START, MIDPOINT, 10, T=10.0)
+        final(fast, START, lt.MetriplecticMidpoint(retraction="midpoint"), 10, T=10.0)
     assert len(failure.value.solution.x) == 1
 
 

@@ -1,0 +1,141 @@
+"""Where states have to stay that have equations of their own: a step ends on the surface that it began on."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..tracing.interpret import polynomial_degree
+
+EPS = float(np.finfo(np.float64).eps)
+
+REACHED = 1e-9
+"""Largest change of a constraint, relative to the size at which it is rounded, that one more step takes off."""
+
+NOTICED, TAKEN = 4.0 * EPS, 8.0 * EPS
+"""What a constraint has to be off, relative to that size, for a step to take it back, and the most that one takes."""
+
+
+class Surface(Protocol):
+    """The points that a step may end at. Displacements are arrays of shape (n,), and so are directions.
+
+    Attributes
+    ----------
+    name : str
+        Of the first integral that is held with it; empty where there is none.
+    collocated : bool
+        Whether the steps of collocation methods end on it by themselves.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def collocated(self) -> bool: ...
+
+    def along(self, x, v) -> jax.Array:
+        """v, the direction of a correction, along the surface."""
+        ...
+
+    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
+        """The displacement from x + low that ends near where d does, on the surface; and a length that is missed."""
+        ...
+
+    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+        """A state x + low at the end of a step, less what rounding has moved it; NaN outside of the domain."""
+        ...
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class LevelSet:
+    """The first components of a state are a point of a space.
+
+    Attributes
+    ----------
+    space : manifolds.Space
+    tangent : bool
+        Whether the motion is along the level sets of the constraints near the space too.
+    """
+
+    space: mf.Space
+    tangent: bool
+    name = ""
+
+    @property
+    def collocated(self) -> bool:
+        """Collocation keeps quadratic first integrals."""
+        return self.tangent and _degree(self.space) <= 2
+
+    def along(self, x, v) -> jax.Array:
+        """v itself: gradients that are raised in the space around are along it."""
+        return v
+
+    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
+        """By Newton's method, from what the constraints change by along d: as exact as d is small."""
+        end, changes = x + (low + d), []
+        for _ in range(2):
+            changes.append(self._change(x, low, d))
+            d = d - self._moved(end, changes[-1])
+        left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY), initial=0.0)
+        return d, jnp.where(left <= REACHED, 0.0, left) * jnp.linalg.norm(x)
+
+    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+        point = self._point(x)
+        values, slopes = jax.jvp(self.space._constraints, (point,), (self._point(low),))
+        size, off = self.space._rounded(point), values + slopes
+        off = jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -TAKEN * size, TAKEN * size), 0.0)
+        return jnp.where(self.inside(x), x, jnp.nan), low - self._moved(x, off)
+
+    def inside(self, x) -> jax.Array:
+        """Whether a state on the surface is in the space."""
+        return self.space._inside(self._point(x))
+
+    def returned(self, x) -> jax.Array:
+        """A state nearer to the surface, for functions that are defined on it alone."""
+        return x - self._moved(x, self.space._constraints(self._point(x)))
+
+    def _change(self, x, low, d) -> jax.Array:
+        """What the constraints change by along d, by a quadrature that is exact for quadratic ones."""
+        nodes, weights = _rule(1 if _degree(self.space) <= 2 else NODES)
+        way = self._point(d)
+        rates = [jax.jvp(self.space._constraints, (self._point(x + (low + c * d)),), (way,))[1] for c in nodes]
+        return sum(w * rate for w, rate in zip(weights[1:], rates[1:], strict=True)) + weights[0] * rates[0]
+
+    def _moved(self, x, c) -> jax.Array:
+        """The displacement, shape (n,), that changes the constraints by c."""
+        v = self.space.to_vector(self.space._normal(self._point(x), c))
+        return v if v.shape == x.shape else jnp.pad(v, (0, x.shape[0] - v.shape[0]))
+
+    def _point(self, x) -> jax.Array:
+        return self.space.from_vector(x[: self.space.size])
+
+
+TINY = float(np.finfo(np.float64).tiny)
+
+NODES = 5
+"""Of the quadrature for constraints of higher degree: what it misses is the eleventh power of the step."""
+
+
+def _rule(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss' quadrature on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(number)
+    return 0.5 * (nodes + 1.0), 0.5 * weights
+
+
+@functools.lru_cache
+def _degree(space: mf.Space) -> float:
+    """The degree of the constraints as polynomials; infinity where they are none."""
+    return polynomial_degree(_mixed, space, space.size)
+
+
+def _mixed(space: mf.Space, x):
+    values = space._constraints(space.from_vector(x))
+    return jnp.sum(values * jnp.cos(jnp.arange(1.0, values.shape[-1] + 1.0)))

@@ -1,0 +1,139 @@
+"""The levels of functions, and the surface, that a step has to end on; and how it is brought there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ..functions.energy import Energy
+from ..functions.frames import VANISHED, towards
+from ..functions.gradients import EPS, Gonzalez
+from ..functions.surface import Surface
+from ..systems import System
+
+CORRECTIONS = 4
+"""Newton corrections of a step at most: a relative error of a twentieth is one of rounding after them."""
+
+NOISY = 1e-8
+"""As :data:`..functions.gradients.NOISY`, for a step that is not iterated: noise in what a function changes by is no
+more than its rounding, and does not add up, since the values at which one step ends are those that the next begins
+with."""
+
+DIFFERENCE = 16.0 * EPS
+"""What a change of a function may be off, relative to the size at which its values are rounded: a few roundings of
+both."""
+
+VANISHED_LENGTH = math.sqrt(VANISHED)
+
+
+class Law(NamedTuple):
+    """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
+
+    function: Energy
+    sign: float
+
+
+LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
+
+
+class Ended(NamedTuple):
+    """A displacement, what it misses of the surface and the levels, the gradients at its end, lengths of directions."""
+
+    d: jax.Array
+    left: jax.Array
+    ends: list
+    missed: jax.Array
+    lengths: jax.Array
+
+
+def corrected(
+    system: System, laws: list[Law], x, low, d, changes, corrections: int = CORRECTIONS
+) -> tuple[jax.Array, jax.Array]:
+    """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
+    change, surface = Gonzalez(NOISY), system.surface
+    functions, blocks = [law.function for law in laws], system.blocks
+    before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
+
+    def landed(d) -> tuple[jax.Array, jax.Array]:
+        return (d, jnp.zeros(())) if surface is None else surface.reached(x, low, d)
+
+    def gradients(d) -> list:
+        return [f.gradient(x + (low + d)) for f in functions]
+
+    def misses(d, ends) -> jax.Array:
+        """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
+        along = [
+            change(f, x, d, low) if first is None else 0.5 * (first + last)
+            for f, first, last in zip(functions, before, ends, strict=True)
+        ]
+        return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
+
+    def directions(d, ends) -> list:
+        end = x + (low + d)
+        found = [system.raised(end, gradient) for gradient in ends]
+        return found if surface is None else [surface.along(end, v) for v in found]
+
+    def measured(d, left, ends, found) -> Ended:
+        """What is missed there, and the lengths of the directions.
+
+        These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
+        of their own, as entropies beside a momentum, those by which a function changes most in d.
+        """
+        missed = misses(d, ends)
+        if len(blocks) == 1:
+            lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
+        else:
+            moved = jnp.linalg.norm(d)
+            most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
+            lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
+        return Ended(d, left, ends, missed, lengths)
+
+    def nearer(s: Ended, found) -> Ended:
+        new, left = landed(s.d + towards(found, s.missed, passes=min(len(blocks), 2)))
+        return measured(new, left, gradients(new), found)
+
+    def again(s: Ended, _) -> tuple[Ended, None]:
+        return jax.lax.cond(done(s), lambda: s, lambda: nearer(s, directions(s.d, s.ends))), None
+
+    def done(s: Ended) -> jax.Array:
+        small = jnp.abs(s.missed) <= EPS * s.lengths * jnp.linalg.norm(s.d)
+        return (s.left == 0.0) & (small | (s.lengths <= VANISHED_LENGTH)).all()
+
+    def hidden() -> jax.Array:
+        """What rounding of the values may make of what is missed: nothing where there is a closed form."""
+        return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
+
+    d, left = landed(d)
+    ends = gradients(d)
+    found = directions(d, ends)
+    s = nearer(measured(d, left, ends, found), found)
+    s, _ = jax.lax.scan(again, s, length=corrections - 1)  # of a short step one is enough
+    rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.missed), hidden)
+    vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.missed) - rounding, 0.0)
+    return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
+
+
+def ended(system: System, surface: Surface, held: Sequence[Energy], x, low, d) -> jax.Array:
+    """The displacement of an implicit step, which has changed all functions as it has to, brought to the surface.
+
+    The functions ``held`` stay as they were, and so does an energy that is conserved; what else has a law changes by
+    what it has changed by. NaN where that is not found.
+    """
+    laws = [Law(C, 0.0) for C in held]
+    for function, law in ((system.energy, system.energy_law), (system.entropy, system.entropy_law)):
+        if law in LAWS and function is not None:
+            laws.append(Law(function, LAWS[law]))
+    if not laws:
+        return surface.reached(x, low, d)[0]
+    change = Gonzalez(NOISY)
+    changes = [jnp.zeros(()) if law.sign == 0.0 else jnp.dot(change(law.function, x, d, low), d) for law in laws]
+    d, missed = corrected(system, laws, x, low, d, jnp.stack(changes))
+    return jnp.where(missed <= MISSED * jnp.linalg.norm(x), d, jnp.nan)
+
+
+MISSED = 1e-12
+"""What a step may miss of the surface and the levels, relative to the state."""

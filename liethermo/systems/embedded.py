@@ -1,0 +1,199 @@
+"""A system on a manifold in the space of arrays around it: a system on R^n that stays on a surface.
+
+The field is the same formula, asked for near the manifold too, where the covectors that it is handed and the velocities
+that it gives are made tangent to the level sets of the constraints. So these are first integrals of it, and a method
+has no more to do than to end each step on the level that it began on [:doc:`/explanation/exact_laws`].
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds._arrays import is_traced
+
+from ..dissipation.base import Carried
+from ..functions.checks import recognised
+from ..functions.energy import Energy
+from ..functions.surface import LevelSet
+from ..tracing.interpret import at_points
+from .base import System
+
+TANGENT = 1e-12
+"""Largest component across the level sets, relative to the velocity, of a field that is along them by form."""
+
+AWAY = 0.05
+"""How far off the manifold that is asked for, relative to the components of a point."""
+
+
+class EmbeddedSystem(System):
+    """The system on states x, shape (n,), the arrays of the space in one row. Made by :func:`embedded`.
+
+    Attributes
+    ----------
+    manifold : System
+    conforming : bool
+        Whether the motion is along the level sets of the constraints as it is: then nothing is projected.
+    """
+
+    manifold: System
+    conforming: bool = eqx.field(static=True)
+
+    def __init__(self, manifold: System, conforming: bool = False):
+        self.manifold, self.conforming = manifold, conforming
+        self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
+        self.energy = recognised(manifold.energy, self.dim)
+        self.entropy = None if manifold.entropy is None else recognised(manifold.entropy, self.dim)
+        as_they_are = conforming or isinstance(manifold.poisson, mf.NoPoisson)
+        self.poisson = manifold.poisson if as_they_are else _Tangent(manifold)
+        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold, conforming)
+        self.momentum_maps = {name: self._recognised(J) for name, J in manifold.momentum_maps.items()}
+        self.preserved_as, self.decided = manifold.preserved_as, manifold.decided
+
+    def _recognised(self, energy: Energy) -> Energy:
+        return recognised(energy, self.dim)
+
+    @property
+    def kind(self) -> str:
+        return self.manifold.kind
+
+    @property
+    def domain(self) -> str:  # type: ignore[override]
+        return f"a point of {_space(self.manifold).name}"
+
+    @property
+    def surface(self) -> LevelSet:
+        return LevelSet(_space(self.manifold), self.conforming)
+
+    def outside(self, x) -> str:
+        space, x = _space(self.manifold), np.asarray(x)
+        if not np.isfinite(x).all() or at_points(_inside, self.surface, x[None])[0] > 0.0:
+            return ""
+        return f"the step leaves {space.name}: {space._why_off(np.asarray(self.points(x)), np.inf)}"
+
+    # -- states -------------------------------------------------------------------------------------------------------
+
+    def points(self, x):
+        return self.manifold.points(x)
+
+    def numbers(self, x, batch: bool = False):
+        return self.manifold.numbers(x, batch)
+
+    def on_states(self, energy: Energy) -> Energy:
+        return self.manifold.on_states(energy)
+
+    def samples(self, count, seed=0, scale=1.0):
+        return self.manifold.samples(count, seed, scale)
+
+    def without_baths(self) -> System:
+        return self.manifold.without_baths()
+
+    def _around(self, x) -> np.ndarray:
+        return self.manifold._around(x)
+
+    def presented(self, solution):
+        given = self.manifold.dissipation
+        kind = None if given is None else type(given).__name__
+        return self.manifold.presented(solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind))
+
+    # -- dynamics -----------------------------------------------------------------------------------------------------
+
+    def at_time(self, t) -> System:
+        return EmbeddedSystem(self.manifold.at_time(t), self.conforming) if self.is_driven else self
+
+    def raised(self, x, alpha):
+        """What of a gradient is along the level sets: the direction of corrections."""
+        return _along(self.manifold, x, alpha)
+
+    @property
+    def unrollable(self) -> bool:
+        return self.manifold.smooth
+
+    @property
+    def smooth(self) -> bool:
+        return self.manifold.smooth
+
+
+class _Tangent(mf.PoissonStructure):
+    """``P Pi P``, P the projector to the level sets."""
+
+    manifold: System
+
+    @property
+    def dim(self) -> int:
+        return self.manifold.dim
+
+    def tensor(self, x):
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
+
+    def sharp(self, x, alpha):
+        motion = self.manifold.poisson.sharp(x, _along(self.manifold, x, alpha))
+        return _along(self.manifold, x, motion)
+
+
+class _Force(Carried):
+    """A dissipation that is handed the metric of the space, tangent where it is not so by form."""
+
+    manifold: System
+    conforming: bool = eqx.field(static=True)
+
+    def force(self, system, x, dH, dS, dL):
+        """Of what is along the level sets of the gradients: near an equilibrium that has digits of its own."""
+        along = lambda v: None if v is None else _along(self.manifold, x, v)  # noqa: E731
+        force = self.part.force(self.manifold, x, along(dH), along(dS), tuple(map(along, dL)))
+        return force if self.conforming else along(force)
+
+    def factor(self, system, x, dH, dL):
+        along = lambda v: _along(self.manifold, x, v)  # noqa: E731
+        B = self.part.factor(self.manifold, x, along(dH), tuple(map(along, dL)))
+        return None if B is None else B._replace(times=lambda w: along(B.times(w)), solenoidal=False)
+
+    def divergence(self, system, x):
+        """That with the volume of the manifold."""
+        return self.part.divergence(self.manifold, system.surface.returned(x))
+
+    def own_residuals(self, system, x):
+        return self.part.own_residuals(self.manifold, x)
+
+
+def embedded(system: System) -> System:
+    """The system in the space around its manifold; itself on R^n, and where it can be run in charts alone."""
+    if system.space is None or not system.space.surrounded:
+        return system
+    if is_traced(system):
+        return EmbeddedSystem(system)
+    points = system.samples(3)
+    points = points * (1.0 + AWAY * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
+    across = np.nan_to_num(at_points(_across, system, points), nan=np.inf)
+    return EmbeddedSystem(system, bool(across.max() <= TANGENT))
+
+
+def _inside(surface: LevelSet, x):
+    """1 where the point of the surface next to a state is in the space, else 0."""
+    return jnp.where(surface.inside(surface.returned(x)), 1.0, 0.0)
+
+
+def _across(system: System, x):
+    """What of a field is across the level sets, and what covectors across them do, relative to the field."""
+    covectors = np.random.default_rng(1).standard_normal((3 + len(system.preserved), x.shape[0]))
+    off = [alpha - _along(system, x, alpha) for alpha in np.roll(covectors, 1, axis=0)]
+    fields = []
+    for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, off, strict=True)]):
+        fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
+    size = jnp.max(jnp.abs(fields[0]))
+    missed = jnp.maximum(jnp.abs(fields[1] - fields[0]), jnp.abs(fields[0] - _along(system, x, fields[0])))
+    return jnp.max(missed) / jnp.where(size > 0.0, size, 1.0)
+
+
+def _along(system: System, x, w):
+    """An array less what would change the constraints of the space."""
+    space = _space(system)
+    return space.to_vector(space._along(space.from_vector(x), space.from_vector(w)))
+
+
+def _space(system: System) -> mf.Space:
+    assert system.space is not None
+    return system.space

@@ -1,0 +1,209 @@
+"""Systems on manifolds without charts: the order, the laws and the constraints in the space around, and refusals."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.runs.preparation import as_run
+from tests.manifolds.spaces.test_own_spaces import Ellipsoid
+
+RK4, RK8, GAUSS, MIDPOINT = (
+    lt.MetriplecticRungeKutta(4),
+    lt.MetriplecticRungeKutta(8),
+    lt.MetriplecticGauss(2),
+    lt.MetriplecticMidpoint(),
+)
+
+STEPS = {2: (20, 40), 4: (10, 20), 8: (4, 6)}
+
+ON_THE_SPACE = 4e-15
+"""Residual of a state, relative to it; at most 7e-16 seen after 10^4 steps."""
+
+SPACES = {
+    "sphere": lambda: mf.Sphere(2),
+    "SPD": lambda: mf.SPD(2),
+    "Stiefel": lambda: mf.Stiefel(3, 2),
+    "hyperboloid": lambda: mf.Hyperbolic(2),
+    "rotations": lambda: mf.SpecialOrthogonal(3),
+    "unitary": lambda: mf.SpecialUnitary(2),
+    "motions": lambda: mf.SpecialEuclidean(2),
+    "volume": lambda: mf.GroupSpace(mf.SL(2), np.diag([1.0, 2.0, 2.0])),
+    "product": lambda: mf.Sphere(2) * mf.Euclidean(2),
+    "power": lambda: mf.Sphere(2) ** 2,
+    "ellipsoid": lambda: Ellipsoid((1.0, 1.5, 2.0)),
+}
+"""By name. The last has no equations, only a projection."""
+
+
+def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
+    """An energy and an entropy without symmetries, neither quadratic; the metric is that of the space."""
+    random = np.random.default_rng(5)
+    (a, b), Q = random.standard_normal((2, space.size)), random.standard_normal((space.size, space.size))
+    Q = -(Q @ Q.T) / space.size
+
+    def energy(x):
+        v = space.to_vector(x)
+        return v @ a + 0.1 * jnp.sin(v @ b)
+
+    def entropy(x):
+        v = space.to_vector(x)
+        return 0.5 * v @ Q @ v + 0.2 * jnp.cos(v @ a)
+
+    return lt.MetriplecticSystem(None, energy, entropy, lt.ProjectedMetric(normalized=True), space=space)
+
+
+def start(space: mf.Space) -> np.ndarray:
+    return np.asarray(space.to_vector(space.random(3)))
+
+
+def reference(system: lt.MetriplecticSystem, x0, T: float) -> np.ndarray:
+    """SciPy's solution of the field on the manifold, in the arrays around it."""
+    field = jax.jit(lambda x: system.vector_field(x))
+    found = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, T), x0, method="DOP853", rtol=1e-12, atol=1e-13)
+    return found.y[:, -1]
+
+
+def check(name: str, method) -> None:
+    space = SPACES[name]()
+    system, x0, T = relaxing(space), start(space), 1.0
+    exact, errors, steps = reference(system, x0, T), [], STEPS[method.order]
+    for n in steps:
+        run = lt.integrate(system, x0, (0.0, T), T / n, method)
+        assert run.audit().passed, run.audit()
+        assert run.audit().energy_drift <= 1e-14
+        assert run.stats.least_entropy_increment > 0.0
+        assert float(space.residual(system.points(run.x)).max()) <= ON_THE_SPACE
+        errors.append(np.abs(run.x[-1] - exact).max())
+    slope = np.log(errors[0] / errors[1]) / np.log(steps[1] / steps[0])
+    assert errors[-1] < 1e-12 or abs(slope - method.order) < 0.12 * method.order, (errors, slope)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("sphere", RK4), ("SPD", GAUSS), ("ellipsoid", MIDPOINT)],
+    ids=lambda value: value if isinstance(value, str) else str(value),
+)
+def test_order_laws_and_constraints(name, method):
+    check(name, method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [RK4, RK8, GAUSS, MIDPOINT], ids=str)
+@pytest.mark.parametrize("name", SPACES)
+def test_order_laws_and_constraints_everywhere(name, method):
+    check(name, method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sphere", "SPD", "Stiefel", "hyperboloid", "rotations"])
+def test_with_charts_and_without(name):
+    """The same flow: both are within their errors of the other."""
+    space = SPACES[name]()
+    system, x0 = relaxing(space), start(space)
+    runs = [lt.integrate(system, x0, (0.0, 1.0), 0.05, m) for m in (GAUSS, lt.MetriplecticGauss(2, retraction="exp"))]
+    assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
+
+
+def test_what_is_run_is_a_system_on_arrays():
+    """No chart: a spin moves along every sphere, so nothing is projected; with a retraction it is in charts."""
+    spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
+    system, method = as_run(spin, GAUSS)
+    assert type(system).__name__ == "EmbeddedSystem"
+    assert system.conforming
+    assert method == GAUSS
+    in_charts = as_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
+    assert in_charts[0] is spin
+    assert isinstance(in_charts[1], lt.InCharts)
+
+    def tensor(x):
+        a, b, c = x
+        c = c + jnp.sum(x**2) - 1.0  # off the sphere it is no longer tangent
+        return jnp.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
+
+    other = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
+    assert not as_run(other, GAUSS)[0].conforming
+    x0 = np.array([0.6, 0.64, 0.48])
+    ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, other)]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-6
+    assert abs(np.linalg.norm(ends[1]) - 1.0) < ON_THE_SPACE
+
+
+def test_a_step_out_of_the_domain_ends_the_run():
+    """A covariance that would lose its rank in one long step: a status with the time, not a NaN."""
+    falling = lt.MetriplecticSystem(
+        None, lambda P: 3.0 * jnp.trace(P), dissipation=lt.Friction(np.ones(4)), space=mf.SPD(2), validate=False
+    )
+    run = lt.integrate(falling, np.eye(2), (0.0, 2.0), 0.25, RK4, on_failure="return")
+    assert run.status.code == "non_finite"
+    assert "leaves SPD(2): not positive definite" in run.status.message
+    assert "t = 0.25" in run.status.message
+    assert np.isfinite(run.x).all()
+    assert len(run.t) == 2
+
+
+def test_a_point_near_the_space_stays_as_near():
+    """What passes as a point is not moved: it stays on the level that it begins on."""
+    system = relaxing(mf.Sphere(2))
+    x0 = np.array([0.6, 0.64, 0.48]) * (1.0 + 1e-10)
+    run = lt.integrate(system, x0, (0.0, 1.0), 0.1, RK4)
+    assert np.abs(np.linalg.norm(run.x, axis=1) - (1.0 + 1e-10)).max() < 1e-13
+    with pytest.raises(mf.OffManifoldError):
+        lt.integrate(system, 1.1 * x0, (0.0, 1.0), 0.1, RK4)
+
+
+@pytest.mark.slow
+def test_events_dense_output_and_adaptive_steps():
+    space = mf.Stiefel(3, 2)
+    system, x0 = relaxing(space), start(space)
+    run = lt.integrate(system, x0, (0.0, 3.0), lt.Adaptive(1e-8), RK8, dense=True, until=lambda X: X[0, 0] - 0.1)
+    between = run(np.linspace(0.0, run.t[-1], 20))
+    assert float(space.residual(system.points(between)).max()) <= ON_THE_SPACE
+    assert np.abs(between[-1] - reference(system, x0, run.t[-1])).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_an_ensemble_is_its_runs_and_a_flow_has_derivatives():
+    space = mf.Sphere(2)
+    system = relaxing(space)
+    x0s = np.asarray(space.random(1, (3,)))
+    many = lt.ensemble(system, x0s, (0.0, 1.0), 0.1, RK4)
+    for i, x0 in enumerate(x0s):
+        assert np.array_equal(many.x[i], lt.integrate(system, x0, (0.0, 1.0), 0.1, RK4).x[-1])
+    v = np.asarray(space.random_tangent(2, x0s[0]))
+    for method in (RK4, GAUSS):
+
+        def end(t, method=method):
+            return lt.flow(system, space.exp(x0s[0], t * v), (0.0, 1.0), 0.1, method)
+
+        derivative = jax.jvp(end, (0.0,), (1.0,))[1]
+        quotient = (end(1e-5) - end(-1e-5)) / 2e-5
+        assert np.abs(derivative - quotient).max() < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sphere", "Stiefel"])
+def test_noise_stays_on_the_space(name):
+    space = SPACES[name]()
+    system = relaxing(space)
+    run = lt.integrate(system, start(space), (0.0, 2.0), 0.01, noise=lt.Fluctuations(1e-2, seed=1))
+    assert float(space.residual(system.points(run.x)).max()) <= ON_THE_SPACE
+    assert run.audit().energy_drift <= 1e-14
+
+
+@pytest.mark.slow
+def test_an_energy_that_depends_on_time():
+    space = mf.Sphere(2)
+    system = lt.MetriplecticSystem(
+        mf.LiePoisson(mf.so(3)), lambda s, t: s[0] * jnp.sin(t) + s[2] ** 2, space=space, validate=False
+    )
+    x0 = np.array([0.6, 0.64, 0.48])
+    runs = [lt.integrate(system, x0, (0.0, 2.0), 0.05, m) for m in (RK4, lt.MetriplecticGauss(2, retraction="exp"))]
+    assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
+    assert runs[0].audit().passed
+    assert np.abs(np.linalg.norm(runs[0].x, axis=1) - 1.0).max() < ON_THE_SPACE
