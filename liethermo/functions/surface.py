@@ -121,7 +121,7 @@ class LevelSet:
 TINY = float(np.finfo(np.float64).tiny)
 
 NODES = 5
-"""Of the quadrature for constraints of higher degree: what it misses is the eleventh power of the step."""
+"""Nodes of the quadrature for constraints of higher degree: it misses the eleventh power of the step."""
 
 
 def _rule(number: int) -> tuple[np.ndarray, np.ndarray]:

@@ -59,8 +59,8 @@ class MetriplecticGauss(GaussMethod):
     not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
     s is 1 or 2.
 
-    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the state,
-    a new one at each step: same order, same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the
+    state, a new one at each step: same order, same laws. See :class:`InCharts`.
 
     Parameters
     ----------

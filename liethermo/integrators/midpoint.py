@@ -25,8 +25,8 @@ class MetriplecticMidpoint(OneStepMethod):
     equation of the size of the state per step; a general energy costs two values and three gradients an iteration with
     ``"gonzalez"``, two and five with ``"mean_value"``, and about 3n gradients with ``"coordinate_increment"``.
 
-    On a manifold it runs in the space around. With ``retraction`` it is ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)``
-    with the discrete gradient (4.9)-(4.10), in the chart around z [BFM §4.4]: see :class:`InCharts`.
+    On a manifold it runs in the space around. With ``retraction`` it is
+    ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the chart around z [BFM §4.4]: see :class:`InCharts`.
 
     Parameters
     ----------

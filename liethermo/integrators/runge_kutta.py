@@ -38,8 +38,8 @@ class MetriplecticRungeKutta(ExplicitMethod):
     value of what each function changes by. There is nothing to iterate, but stiff systems ask for short steps. A step
     that is too long for its corrections fails with a status.
 
-    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the state,
-    a new one at each step: same order, same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the
+    state, a new one at each step: same order, same laws. See :class:`InCharts`.
 
     Parameters
     ----------

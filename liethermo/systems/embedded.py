@@ -141,7 +141,7 @@ class _Force(Carried):
     conforming: bool = eqx.field(static=True)
 
     def force(self, system, x, dH, dS, dL):
-        """Of what is along the level sets of the gradients: near an equilibrium that has digits of its own."""
+        """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
         along = lambda v: None if v is None else _along(self.manifold, x, v)  # noqa: E731
         force = self.part.force(self.manifold, x, along(dH), along(dS), tuple(map(along, dL)))
         return force if self.conforming else along(force)

@@ -223,7 +223,7 @@ def unimodular_equations(g) -> jax.Array:
 
 
 def su2_equations(g) -> jax.Array:
-    """Of ``[[a, b], [-conj b, conj a]]`` with ``|a|^2 + |b|^2 = 1``."""
+    """Those of ``[[a, b], [-conj b, conj a]]`` with ``|a|^2 + |b|^2 = 1``."""
     a, b = g[..., 0, 0], g[..., 0, 1]
     rest = jnp.stack([a - g[..., 1, 1].conj(), b + g[..., 1, 0].conj()], axis=-1)
     square = a.real**2 + a.imag**2 + b.real**2 + b.imag**2
