@@ -80,14 +80,18 @@ class LevelSet:
 
     def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
         """By Newton's method, from what the constraints change by along d: as exact as d is small."""
+        if _count(self.space) == 0:
+            return d, jnp.zeros(())
         end, changes = x + (low + d), []
         for _ in range(2):
             changes.append(self._change(x, low, d))
             d = d - self._moved(end, changes[-1])
-        left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY), initial=0.0)
+        left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY))
         return d, jnp.where(left <= REACHED, 0.0, left) * jnp.linalg.norm(x)
 
     def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+        if _count(self.space) == 0:
+            return jnp.where(self.inside(x), x, jnp.nan), low
         point = self._point(x)
         values, slopes = jax.jvp(self.space._constraints, (point,), (self._point(low),))
         size, off = self.space._rounded(point), values + slopes
@@ -100,7 +104,7 @@ class LevelSet:
 
     def returned(self, x) -> jax.Array:
         """A state nearer to the surface, for functions that are defined on it alone."""
-        return x - self._moved(x, self.space._constraints(self._point(x)))
+        return x if _count(self.space) == 0 else x - self._moved(x, self.space._constraints(self._point(x)))
 
     def _change(self, x, low, d) -> jax.Array:
         """What the constraints change by along d, by a quadrature that is exact for quadratic ones."""
@@ -131,8 +135,16 @@ def _rule(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.lru_cache
+def _count(space: mf.Space) -> int:
+    """How many constraints there are: none in an open set."""
+    return jax.eval_shape(space._constraints, jax.ShapeDtypeStruct(space.shape, space.dtype)).shape[-1]
+
+
+@functools.lru_cache
 def _degree(space: mf.Space) -> float:
     """The degree of the constraints as polynomials; infinity where they are none."""
+    if _count(space) == 0:
+        return 0
     return polynomial_degree(_mixed, space, space.size)
 
 

@@ -110,8 +110,9 @@ def corrected(
     d, left = landed(d)
     ends = gradients(d)
     found = directions(d, ends)
-    s = nearer(measured(d, left, ends, found), found)
-    s, _ = jax.lax.scan(again, s, length=corrections - 1)  # of a short step one is enough
+    s = measured(d, left, ends, found)
+    if corrections > 0:
+        s, _ = jax.lax.scan(again, nearer(s, found), length=corrections - 1)  # of a short step one is enough
     rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.missed), hidden)
     vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.missed) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))

@@ -26,14 +26,16 @@ class MetriplecticMidpoint(OneStepMethod):
     ``"gonzalez"``, two and five with ``"mean_value"``, and about 3n gradients with ``"coordinate_increment"``.
 
     On a manifold it runs in the space around. With ``retraction`` it is
-    ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the chart around z [BFM §4.4]: see :class:`InCharts`.
+    ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the chart around z [BFM
+    §4.4]: see :class:`InCharts`.
 
     Parameters
     ----------
     gradient : {"gonzalez", "mean_value", "coordinate_increment", "symmetric_coordinate_increment"} or DiscreteGradient
     retraction : str or manifolds.Retraction, optional
         On a manifold, in whose charts to run: ``"midpoint"`` is the paper's ``exp~_h`` (4.8), others as
-        :func:`manifolds.retraction` names them. Where z is at the start of the step, the chart's own midpoint is taken, so the order is 2 too.
+        :func:`manifolds.retraction` names them. Where z is at the start of the step, the chart's own midpoint is taken,
+        so the order is 2 too.
     """
 
     gradient: DiscreteGradient

@@ -2,8 +2,10 @@
 
 from .base import Space, registered_spaces
 from .euclidean import Euclidean
+from .grassmann import Grassmann
 from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
 from .hyperbolic import Hyperbolic
+from .level_set import LevelSet
 from .product import Power, Product
 from .spd import SPD
 from .sphere import Sphere
@@ -12,8 +14,10 @@ from .stiefel import Stiefel
 __all__ = [
     "SPD",
     "Euclidean",
+    "Grassmann",
     "GroupSpace",
     "Hyperbolic",
+    "LevelSet",
     "Power",
     "Product",
     "Space",

@@ -72,7 +72,7 @@ class Maps(ABC):
 
         By Gram and Schmidt's process, the longest rest first.
         """
-        push = jax.linearize(self._project, x)[1]
+        push = (lambda w: self._along(x, w)) if self._has_equations else jax.linearize(self._project, x)[1]
         axes = self.from_vector(jnp.eye(self.size))
         rest = jax.vmap(lambda axis: self.to_vector(push(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(axes)
         basis: list[jax.Array] = []
@@ -220,14 +220,16 @@ class Maps(ABC):
         if not self._has_equations:
             return self.from_vector(c)
         rows = self._rows(x)
-        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), c[..., None])
-        return self.from_vector((weights * rows).sum(axis=-2))
+        gram = rows @ rows.swapaxes(-1, -2)
+        inverse = solve_near_identity(gram, jnp.broadcast_to(jnp.eye(gram.shape[-1]), gram.shape))
+        return self.from_vector(((inverse @ c[..., None]) * rows).sum(axis=-2))
 
     def _along(self, x, w):
         """The array w less what would change the constraints at x."""
         if not self._has_equations:
             return self._project_tangent(x, w)
-        return w - self._normal(x, jax.jvp(self._constraints, (x,), (w + jnp.zeros_like(x),))[1])
+        x, w = jnp.broadcast_arrays(x, w)
+        return w - self._normal(x, jax.jvp(self._constraints, (x,), (w,))[1])
 
     def _rounded(self, x):
         """The sizes at which the constraints are rounded at x, shape (..., m)."""

@@ -319,7 +319,7 @@ def test_double_brackets_on_a_lattice_lower_the_energy_to_the_last_bit_of_the_le
 
 def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
     system = small()
-    monkeypatch.setattr(lt.SpinSystem, "spheres", None)
+    monkeypatch.setattr(lt.SpinSystem, "surface", None)
     solution = lt.integrate(
         system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(6), engine="compiled"
     )

@@ -1,0 +1,166 @@
+"""Grassmann manifolds: the subspaces of R^n of one dimension, as projectors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from .._sizes import checked_size
+from ..errors import ParameterError
+from ..matrices.exponential import expm
+from ..matrices.linear import complement, largest, skew
+from ..matrices.symmetric import eigh, orthonormal_columns, symmetrized
+from .base import CUT_MARGIN, Space, register
+
+_GAP = 1e-8
+"""Least distance of the eigenvalues that are taken from those that are not, relative to the largest."""
+
+_SETTLED = 60
+"""Newton's steps for the sign of a matrix: enough for that gap."""
+
+
+@register((3, 1), (4, 2))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class Grassmann(Space):
+    """The p-dimensional subspaces of R^n, each as its orthogonal projector x, shape (n, n), ``inner = tr(u v)``.
+
+    A tangent vector v at x is ``[W, x]`` for the skew ``W = [v, x]``, and the geodesic ``expm(W) x expm(-W)``. Its
+    length is sqrt(2) times the root of the sum of the squared principal angles [Bendokat, Zimmermann & Absil 2024]. The
+    logarithm is unique where no angle is a right one.
+    """
+
+    n: int
+    p: int
+    metric = "canonical"
+
+    def __post_init__(self):
+        checked_size(self.n, 2, "Grassmann(n, p)")
+        checked_size(self.p, 1, "Grassmann(n, p)", "p")
+        if self.p >= self.n:
+            raise ParameterError(f"Grassmann(n, p): p must be less than n, not {self.p} >= {self.n}")
+
+    @property
+    def name(self):
+        return f"Gr({self.n}, {self.p})"
+
+    @property
+    def dim(self):
+        return self.p * (self.n - self.p)
+
+    @property
+    def shape(self):
+        return (self.n, self.n)
+
+    def injectivity_radius(self, x=None):
+        return math.pi / math.sqrt(2.0)
+
+    def subspace(self, basis) -> jax.Array:
+        """The point with the span of the columns of ``basis``, shape (..., n, p)."""
+        q = orthonormal_columns(jnp.asarray(basis, dtype=jnp.float64))
+        return q @ q.swapaxes(-1, -2)
+
+    def _residual(self, x):
+        square = largest(x @ x - x)
+        rank = jnp.abs(jnp.trace(x, axis1=-2, axis2=-1) - self.p)
+        return jnp.maximum(jnp.maximum(square, largest(x - x.swapaxes(-1, -2))), rank)
+
+    def _returned(self, x):
+        x = symmetrized(x)
+        return symmetrized(x @ x @ (3.0 * jnp.eye(self.n) - 2.0 * x))  # eigenvalues go to 0 and 1
+
+    def _inside(self, x):
+        return jnp.abs(jnp.trace(x, axis1=-2, axis2=-1) - self.p) < 0.5
+
+    def _project(self, x):
+        """The projector to the eigenvectors with the largest eigenvalues."""
+        x = symmetrized(x)
+        values = jnp.sort(eigh(jax.lax.stop_gradient(x))[0], axis=-1)
+        upper, under = values[..., self.n - self.p], values[..., self.n - self.p - 1]
+        middle, size = 0.5 * (upper + under), jnp.maximum(values[..., -1] - under, upper - values[..., 0])
+        sign = (x - middle[..., None, None] * jnp.eye(self.n)) / size[..., None, None]
+        sign = jax.lax.fori_loop(0, _SETTLED, lambda _, y: 1.5 * y - 0.5 * y @ y @ y, sign)
+        return jnp.where(
+            (upper - under > _GAP * size)[..., None, None], symmetrized(0.5 * (jnp.eye(self.n) + sign)), jnp.nan
+        )
+
+    def _random(self, key, size):
+        q = orthonormal_columns(jax.random.normal(key, (*size, self.n, self.p)))
+        return q @ q.swapaxes(-1, -2)
+
+    def _project_tangent(self, x, w):
+        w = symmetrized(w)
+        along = x @ w @ (jnp.eye(self.n) - x)
+        return along + along.swapaxes(-1, -2)
+
+    def _frame(self, x):
+        """Turns of a basis of the subspace into one of its complement."""
+        basis = self._basis(x)
+        inner, outer = basis[..., : self.p], basis[..., self.p :]
+        turns = jnp.einsum("...ia,...jb->...abij", inner, outer)
+        turns = (turns + turns.swapaxes(-1, -2)) / math.sqrt(2.0)
+        return turns.reshape(*x.shape[:-2], self.dim, self.n, self.n)
+
+    def _basis(self, x):
+        """An orthonormal basis of R^n that begins with one of the subspace: of its longest projected axes."""
+        rest, columns = x, []
+        for _ in range(self.p):
+            squares = (rest**2).sum(axis=-2)
+            best = jnp.argmax(squares, axis=-1)[..., None] == jnp.arange(self.n)
+            e = jnp.where(best[..., None, :], rest, 0.0).sum(axis=-1)
+            e = e / jnp.sqrt((e**2).sum(axis=-1, keepdims=True))
+            rest = rest - e[..., :, None] * (e[..., None, :] @ rest)
+            columns.append(e)
+        q = jnp.stack(columns, axis=-1)
+        return jnp.concatenate([q, complement(q)], axis=-1)
+
+    @property
+    def isotropic_size(self):
+        return math.comb(self.n, 2)
+
+    def _isotropic(self, x, w):
+        """By the rotations of every plane."""
+        return _bracket(skew(w, self.n), x) / math.sqrt(2.0)
+
+    def _inner(self, x, u, v):
+        return self._pair(u, v)
+
+    def _flat(self, x, v):
+        return v
+
+    def _sharp(self, x, alpha):
+        return _bracket(_bracket(symmetrized(alpha), x), x)
+
+    def _exp(self, x, v):
+        turn = expm(_bracket(v, x))
+        return symmetrized(turn @ x @ turn.swapaxes(-1, -2))
+
+    def _log(self, x, y):
+        """From ``sin^2`` of the principal angles and the directions of the turn, which x and y give."""
+        gap = y - x
+        along = self._project_tangent(x, gap)  # its singular values are sin(t) cos(t)
+        values, vectors = eigh(symmetrized(x @ (jnp.eye(self.n) - y) @ x))  # sin(t)^2 in the subspace, 0 outside
+        sine = jnp.clip(values, 0.0, 1.0)
+        angle = jnp.arctan2(
+            jnp.sqrt(jnp.where(sine > 0.0, sine, 1.0)), jnp.sqrt(1.0 - jnp.where(sine > 0.0, sine, 0.0))
+        )
+        both = jnp.sqrt(jnp.where(sine > 0.0, sine, 1.0) * (1.0 - jnp.where(sine > 0.0, sine, 0.0)))
+        ratio = jnp.where(sine > 1e-18, angle / both, 1.0)
+        scaled = (vectors * ratio[..., None, :]) @ vectors.swapaxes(-1, -2) @ x @ along
+        v = self._project_tangent(x, scaled + scaled.swapaxes(-1, -2))
+        defined = (1.0 - sine).min(axis=-1) > (math.pi / 2 * CUT_MARGIN) ** 2
+        return jnp.where(defined[..., None, None], v, jnp.nan)
+
+    def _transport(self, x, v, u):
+        turn = expm(_bracket(v, x))
+        return symmetrized(turn @ u @ turn.swapaxes(-1, -2))
+
+    def _why_no_log(self, x, y):
+        return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
+
+
+def _bracket(a, b):
+    return a @ b - b @ a

@@ -1,0 +1,242 @@
+"""A manifold from its equations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._sizes import checked_size
+from ..errors import DomainError, ParameterError, SpaceError
+from ..matrices.linear import solve_near_identity
+from .base import MEMBERSHIP_TOLERANCE, Space, register
+
+DEPENDENT = 1e-9
+"""Least singular value of the gradients of the constraints, made unit vectors, that counts as independent."""
+
+TRIED = 16
+"""Random arrays, of which at least one has to lead to a point."""
+
+VANISHING = 1e-5
+"""Length of a gradient on the manifold, relative to that at random arrays, that counts as none."""
+
+_NEWTON_STEPS = 24
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True, init=False, repr=False)
+class LevelSet(Space):
+    """The arrays x with ``constraints(x) = 0``: ``LevelSet(lambda x: x @ x - 1, 3)`` is a sphere.
+
+    Points are projected, and random ones found, by Newton's method along the gradients. A point at which these depend
+    on each other is none. There are geodesics by integration, :meth:`geodesic`, and none in closed form.
+
+    Parameters
+    ----------
+    constraints : function, or a sequence of functions
+        From an array of the given shape to a number, or to an array of them: smooth, and independent of each other.
+    shape : int, or tuple of int
+        Of a point.
+    metric : array, shape (n, n), or function from x to one; optional
+        Positive definite: inner products of arrays in one row, n their number of entries, restricted to the manifold.
+        By default the sum of products.
+    name : str
+
+    Raises
+    ------
+    SpaceError
+        If the constraints are no such functions, depend on each other, or no random array leads to a point.
+    ParameterError
+        If the shape or the metric cannot be used.
+    """
+
+    constraints: tuple[Callable, ...]
+    sizes: tuple[int, ...]
+    form: Callable | None
+    name: str = "level set"
+
+    def __init__(self, constraints, shape, metric=None, name: str = "level set"):
+        functions = tuple(constraints) if isinstance(constraints, list | tuple) else (constraints,)
+        sizes = tuple(shape) if isinstance(shape, list | tuple) else (shape,)
+        sizes = tuple(checked_size(n, 1, "LevelSet(constraints, shape)", "a size") for n in sizes)
+        for field, value in (("constraints", functions), ("sizes", sizes), ("name", name)):
+            object.__setattr__(self, field, value)
+        object.__setattr__(self, "form", metric if metric is None or callable(metric) else _Constant.of(metric, self))
+        self._check()
+
+    def _check(self) -> None:
+        try:
+            count = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            raise SpaceError(f"{self.name}: its constraints take no array of shape {self.shape}: {error}") from None
+        if not 0 < count < self.size:
+            raise SpaceError(f"{self.name}: {count} constraints on {self.size} numbers leave no manifold")
+        x = jax.random.normal(jax.random.key(0), (TRIED, *self.shape))
+        dependence = self._compiled("_dependence", x)
+        if not bool((dependence > DEPENDENT).any()):
+            worst = float(np.nanmax(np.asarray(dependence), initial=0.0))
+            raise SpaceError(
+                f"{self.name}: its constraints depend on each other: of their gradients, made unit vectors, the least "
+                f"singular value is at most {worst:.1e} at {TRIED} random arrays; leave one out"
+            )
+        points = self._compiled("_project", x)
+        found = np.asarray(jnp.isfinite(points).all(axis=self._axes))
+        if not found.any():
+            raise SpaceError(
+                f"{self.name}: Newton's method finds no point of it from {TRIED} random arrays: its constraints may "
+                "contradict each other, or depend on each other at its points"
+            )
+        sizes = [np.linalg.norm(np.asarray(self._compiled("_rows", y)), axis=-1) for y in (x, points)]
+        shrunk = (sizes[1][found] / np.median(sizes[0], axis=0)).max(axis=0)
+        if (shrunk < VANISHING).any():
+            i = int(np.argmin(shrunk))
+            raise SpaceError(
+                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[found][0]}: "
+                "give a function that changes its sign there"
+            )
+        if self.form is not None and self._compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
+            raise ParameterError(f"{self.name}: the metric is a matrix of shape {(self.size, self.size)} at each point")
+
+    @property
+    def metric(self):  # type: ignore[override]
+        return "induced" if self.form is None else "given"
+
+    @property
+    def dim(self):
+        return self.size - jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
+
+    @property
+    def shape(self):
+        return self.sizes
+
+    def geodesic(self, x, v, steps: int = 200) -> jax.Array:
+        """The point that the geodesic from x with velocity v reaches at time 1, shape ``shape``, by integration.
+
+        Classical Runge-Kutta steps for ``x' = sharp(p)``, ``p' = -d(p . sharp(p))/dx / 2``: the error falls like the
+        fourth power of their number.
+
+        Parameters
+        ----------
+        x, v : array, shape ``shape``
+            A point, and a tangent vector there.
+        steps : int
+        """
+        x, v = self._checked_vectors(x, v=v)
+        end = self._compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
+        if not bool(jnp.isfinite(end).all()):
+            raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps: take more")
+        return end
+
+    # -- maps ---------------------------------------------------------------------------------------------------------
+
+    def _constraints(self, x):
+        batch = x.shape[: x.ndim - len(self.shape)]
+
+        def of_one(y):
+            return jnp.concatenate([jnp.ravel(jnp.asarray(c(y))) for c in self.constraints])
+
+        return jax.vmap(of_one)(x.reshape(-1, *self.shape)).reshape(*batch, -1) if batch else of_one(x)
+
+    def _project(self, x):
+        x = jax.lax.fori_loop(0, _NEWTON_STEPS, lambda _, y: y - self._normal(y, self._constraints(y)), x)
+        return jnp.where(self._scale(self._residual(x) <= MEMBERSHIP_TOLERANCE, jnp.ones_like(x)) > 0, x, jnp.nan)
+
+    def _residual(self, x):
+        away = jnp.abs(self._normal(x, self._constraints(x))).max(axis=self._axes)
+        return away / jnp.maximum(jnp.abs(x).max(axis=self._axes), 1.0)
+
+    def _random(self, key, size):
+        tries = self._project(jax.random.normal(key, (TRIED, *size, *self.shape)))
+        found = jnp.isfinite(tries).all(axis=self._axes, keepdims=True)
+        chosen = jnp.argmax(found, axis=0, keepdims=True)
+        return jnp.take_along_axis(tries, chosen, axis=0)[0]
+
+    def _project_tangent(self, x, w):
+        return self._along(x, w)
+
+    def _metric_at(self, x):
+        assert self.form is not None
+        batch, form = x.shape[: x.ndim - len(self.shape)], self.form
+        found = jax.vmap(lambda y: jnp.asarray(form(y)))(x.reshape(-1, *self.shape))
+        return found.reshape(*batch, *found.shape[1:])
+
+    def _inner(self, x, u, v):
+        return self._pair(self._flat(x, u), v)
+
+    def _flat(self, x, v):
+        if self.form is None:
+            return v + jnp.zeros_like(x)
+        return self.from_vector((self._metric_at(x) @ self.to_vector(v)[..., None])[..., 0])
+
+    def _sharp(self, x, alpha):
+        if self.form is None:
+            return self._along(x, alpha)
+        g, alpha = self._metric_at(x), self.to_vector(alpha + jnp.zeros_like(x))[..., None]
+        columns = self._rows(x).swapaxes(-1, -2)
+        raised = solve_near_identity(g, jnp.concatenate([columns, alpha], axis=-1))
+        normal, v = raised[..., :-1], raised[..., -1:]
+        weights = solve_near_identity(columns.swapaxes(-1, -2) @ normal, columns.swapaxes(-1, -2) @ v)
+        return self.from_vector((v - normal @ weights)[..., 0])
+
+    @property
+    def _induced(self):
+        return self.form is None
+
+    def _dependence(self, x):
+        rows = self._rows(x)
+        rows = rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
+        return jnp.sqrt(jnp.linalg.eigvalsh(rows @ rows.swapaxes(-1, -2))[..., 0])
+
+    def _geodesic(self, x, v, steps):
+        def rate(state):
+            x, p = state
+            velocity = self._sharp(x, p)
+            return velocity, -0.5 * jax.grad(lambda y: self._pair(p, self._sharp(y, p)))(x)
+
+        def step(_, state):
+            moved = lambda share, k: jax.tree_util.tree_map(lambda a, b: a + share / steps * b, state, k)  # noqa: E731
+            a = rate(state)
+            b = rate(moved(0.5, a))
+            c = rate(moved(0.5, b))
+            d = rate(moved(1.0, c))
+            return jax.tree_util.tree_map(
+                lambda y, a, b, c, d: y + (a + 2.0 * b + 2.0 * c + d) / (6.0 * steps), state, a, b, c, d
+            )
+
+        return self._project(jax.lax.fori_loop(0, steps, step, (x, self._flat(x, v)))[0])
+
+    def _why_off(self, x, residual):
+        if np.isfinite(x).all() and not float(self._compiled("_dependence", jnp.asarray(x))) > DEPENDENT:
+            return "the gradients of its constraints depend on each other there"
+        return super()._why_off(x, residual)
+
+
+@dataclass(frozen=True)
+class _Constant:
+    """A metric that is the same everywhere."""
+
+    rows: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, metric, space: LevelSet) -> _Constant:
+        matrix = np.asarray(metric, dtype=np.float64)
+        n = math.prod(space.sizes)
+        if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+            raise ParameterError(f"{space.name}: the metric is a symmetric matrix of shape {(n, n)}")
+        if not (least := np.linalg.eigvalsh(matrix)[0]) > 0.0:
+            raise ParameterError(f"{space.name}: the metric has the eigenvalue {least:.3g}: it is positive definite")
+        return cls(tuple(map(tuple, matrix.tolist())))
+
+    def __call__(self, x):
+        return jnp.asarray(self.rows)
+
+
+def _torus(x):
+    return (jnp.sqrt(x[0] ** 2 + x[1] ** 2) - 2.0) ** 2 + x[2] ** 2 - 1.0
+
+
+register((_torus, 3))(LevelSet)
