@@ -7,6 +7,7 @@ NAMES = (
     "functions",
     "variational",
     "spin",
+    "manifolds",
     "fluids",
     "ensemble",
     "others",

@@ -107,8 +107,8 @@ class LevelSet:
         return x if _count(self.space) == 0 else x - self._moved(x, self.space._constraints(self._point(x)))
 
     def _change(self, x, low, d) -> jax.Array:
-        """What the constraints change by along d, by a quadrature that is exact for quadratic ones."""
-        nodes, weights = _rule(1 if _degree(self.space) <= 2 else NODES)
+        """What the constraints change by along d, by a quadrature that is exact for polynomials of degree ten."""
+        nodes, weights = _rule(int(min(np.ceil(0.5 * max(_degree(self.space), 2)), NODES)))
         way = self._point(d)
         rates = [jax.jvp(self.space._constraints, (self._point(x + (low + c * d)),), (way,))[1] for c in nodes]
         return sum(w * rate for w, rate in zip(weights[1:], rates[1:], strict=True)) + weights[0] * rates[0]
