@@ -10,6 +10,7 @@ from .cylinder import cylinder
 from .gas_piston import gas_piston
 from .heat_grid import heat_grid
 from .mass_spring_gas import mass_spring_gas
+from .open_gases import IdealMixture, porous_piston, reaction_vessel
 from .oscillator import damped_oscillator
 from .quantised_sphere import QuantisedSphere
 from .rigid_body import free_rigid_body, rigid_body
@@ -21,6 +22,7 @@ from .tumbling_body import tumbling_body
 from .zeitlin import zeitlin
 
 __all__ = [
+    "IdealMixture",
     "QuantisedSphere",
     "body_with_wheels",
     "cylinder",
@@ -32,6 +34,8 @@ __all__ = [
     "heat_grid",
     "mass_spring_gas",
     "moving_thermo_particles",
+    "porous_piston",
+    "reaction_vessel",
     "rigid_body",
     "ring_damper",
     "single_spin",

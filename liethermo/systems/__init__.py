@@ -6,6 +6,7 @@ from .baths import HeatBaths
 from .chart import ChartSystem
 from .chetaev import ChetaevSystem
 from .composed.bodies import Copies, Subsystem
+from .composed.matter import Membrane, Reaction
 from .composed.system import ComposedSystem
 from .driven import DrivenSystem, driven
 from .embedded import EmbeddedSystem, embedded
@@ -36,7 +37,9 @@ __all__ = [
     "Herglotz",
     "Legendre",
     "LiePoissonSystem",
+    "Membrane",
     "MetriplecticSystem",
+    "Reaction",
     "SimpleClosedSystem",
     "SpinSystem",
     "Subsystem",

@@ -147,9 +147,9 @@ class VariationalIntegrator(OneStepMethod):
 
     def _share(self, system: ComposedSystem) -> np.ndarray:
         """How far on its way each component of a composed system is looked at."""
-        (map,), (q, p, S, _) = self.phi, system.poisson.places
-        share = np.empty(system.dim)
-        share[q], share[p], share[S] = map.alpha, 1.0 - map.alpha, map.beta
+        (map,), (q, p, _, _) = self.phi, system.poisson.places
+        share = np.full(system.dim, map.beta)
+        share[q], share[p] = map.alpha, 1.0 - map.alpha
         return share
 
     def change(self, system: System, x, low, h, k, d) -> jax.Array:

@@ -28,30 +28,41 @@ class Subsystem(Module):
     energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy; or None
         With ``lt.Kinetic`` and ``lt.Potential`` as terms where that is its form; None where it is all in the coupling.
     dim : int
-        2n + 1 components; 1 for a body at rest, whose state is S alone.
+        2n + 1 components; 1 for a body at rest, whose state is S alone, and more where it holds matter.
     friction : optional
         A coefficient R of linear friction, ``p' = -R v`` and ``S' = v . R v / T`` (mass / time): a number, an array of
         shape (n,) for a diagonal matrix or (n, n), positive semidefinite, or a function from the state of the body to
         one. Or "contact": the friction ``p' = -p T`` of an evolution field [SML 7]. None by default.
     name : str, optional
         For messages.
+    species : int
+        Kinds of particles in a body at rest: its state is (S, N_1, N_2, …), so dim = 1 + species. A wall that moves is
+        a body of its own, joined by the coupling.
     """
 
     energy: Energy
     friction: jax.Array | Callable | str | None
     dim: int = eqx.field(static=True)
     name: str | None = eqx.field(static=True)
+    species: int = eqx.field(static=True)
 
-    def __init__(self, energy, dim: int, friction=None, name: str | None = None):
-        _check_dim(dim)
+    def __init__(self, energy, dim: int, friction=None, name: str | None = None, species: int = 0):
+        self.species = species
+        if species == 0:
+            _check_dim(dim)
+        elif isinstance(species, bool) or not isinstance(species, int) or species < 0 or dim != 1 + species:
+            raise InputError(
+                f"{name or 'a subsystem'} holds {species!r} kinds of particles, so its state is (S, N) of dim 1 + "
+                f"species, not {dim!r}; a wall that moves is a body of its own"
+            )
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
         self.energy = recognised(check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
-        self.friction = _checked_friction(friction, dim, name or "a subsystem")
+        self.friction = _checked_friction(friction, dim - species, name or "a subsystem")
 
     @property
     def degrees_of_freedom(self) -> int:
-        return self.dim // 2
+        return (self.dim - self.species) // 2
 
     @property
     def count(self) -> int:
@@ -106,6 +117,11 @@ class Copies(Module):
     @property
     def degrees_of_freedom(self) -> int:
         return self.dim // 2
+
+    @property
+    def species(self) -> int:
+        """Kinds of particles: copies hold none."""
+        return 0
 
     def energy_from(self, start: int) -> Energy:
         """The energy as a function of a whole state in which the first of the bodies begins at a component."""

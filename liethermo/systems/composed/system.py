@@ -18,16 +18,18 @@ from manifolds.structures.contact import Places
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
+from ...dissipation.matter import MatterExchange, Process, conserved_numbers
 from ...errors import InputError
 from ...functions.arguments import needed_arguments
 from ...functions.checks import check_scalar
 from ...functions.edges import Edges, edges, parts
-from ...functions.energy import Energy, Function, TimeDependent
+from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import as_pattern, pattern, union
 from ...functions.mechanics import is_free_of, is_mechanical
 from ..base import System
 from ..evolution import entropy_component
 from .bodies import Copies, Subsystem, named
+from .matter import Membrane, Reaction
 
 
 class ComposedSystem(System):
@@ -35,7 +37,8 @@ class ComposedSystem(System):
 
     ``q_a' = H_{p_a}``, ``p_a' = -H_{q_a}`` and friction, ``S_a' = sum_b k_ab (T_b - T_a) / T_a`` and the heat of
     friction, with ``H = sum_a H_a(q_a, p_a, S_a) + V(q, S)`` and temperatures ``T_a = H_{S_a}``. The state is
-    (q_1, p_1, S_1, q_2, …). H is constant; the entropy is the sum of the S_a and does not fall.
+    (q_1, p_1, S_1, q_2, …). H is constant; the entropy is the sum of the S_a and does not fall. Bodies may hold matter
+    too, ``mu = H_N``, that passes membranes and reacts; the numbers that no process changes are constants of motion.
 
     Discretisations evaluate the Fourier factors ``K_ab = k_ab (1/T_a - 1/T_b)`` and the heat of friction with discrete
     temperatures and velocities, the components of the discrete gradient. So conduction alone gives
@@ -50,8 +53,9 @@ class ComposedSystem(System):
     ----------
     subsystems : sequence of Subsystem or Copies, or dict of them by name
     coupling : function of q, of (q, S) or of (q, S, t), or an Energy of the whole state; or a sequence of such
-        V, with q the positions of all subsystems in one array and S their entropies, shape (N,). An Energy may have
-        coordinates of its own (``lt.Function(e).on(...)``), such as the squared distance of two bodies.
+        V, with q the positions of all subsystems in one array and S their entropies, shape (N,). Where bodies hold
+        matter a function of three arguments is one of (q, S, N), all their particle numbers in one array. An Energy may
+        have coordinates of its own (``lt.Function(e).on(...)``), such as the squared distance of two bodies.
     conductance : array, shape (N, N), or SciPy sparse matrix; or sequence of (i, j, k); or a number for two bodies
         Symmetric and >= 0 (power / temperature). In an edge, or for two bodies, it may be a function of the two
         temperatures (T_i, T_j), or of (T_i, T_j, x) with the whole state x, symmetric under exchange of the bodies; a
@@ -63,6 +67,8 @@ class ComposedSystem(System):
         Fourier factors by the discrete temperatures, so that the entropy grows in each step for every energy, or by the
         temperatures at the midpoint, as SML §6.2 prints them: then it is known to grow for quadratic energies alone,
         and no law of it is stated.
+    membranes : sequence of Membrane
+    reactions : sequence of Reaction
     connected : bool
         Refuse a conductance whose graph falls into parts that exchange no heat.
     momentum_maps : dict of functions, or a sequence of them
@@ -99,16 +105,26 @@ class ComposedSystem(System):
         momentum_maps=(),
         validate: bool = True,
         conduction: Literal["discrete", "midpoint"] = "discrete",
+        membranes: Sequence[Membrane] = (),
+        reactions: Sequence[Reaction] = (),
     ):
         if conduction not in ("discrete", "midpoint"):
             raise InputError(f"conduction is 'discrete' or 'midpoint', not {conduction!r}")
         self.labels, self.subsystems = named(subsystems)
-        structure = mf.ExtendedPhaseSpace(
-            tuple(n for body in self.subsystems for n in (body.degrees_of_freedom,) * body.count)
+        dofs, kinds = (
+            tuple(n for body in self.subsystems for n in (getattr(body, name),) * body.count)
+            for name in ("degrees_of_freedom", "species")
         )
+        structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
         energy = check_scalar(self._energy(structure, coupling), structure.dim, "the energy", timed=True)
         entropy = entropy_component(structure.dim, structure.places.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected, conduction)
+        given: list[Membrane | Reaction] = [*membranes, *reactions]
+        processes = [one.process(self.names, structure.matter) for one in given]
+        if processes:
+            exchange = MatterExchange(processes)
+            dissipation = exchange if dissipation is None else dissipation + exchange
+        momentum_maps = {**_conserved_numbers(structure, processes), **_named_maps(momentum_maps)}
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
@@ -140,6 +156,14 @@ class ComposedSystem(System):
         """The ``T_a = H_{S_a}``, shape (..., N); at a time, where the energy depends on one."""
         return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._places.S]
 
+    def numbers_of_particles(self, x) -> jax.Array:
+        """Those of all bodies, shape (..., K)."""
+        return self.state(x, batch=True)[..., self.poisson.matter.N]
+
+    def chemical_potentials(self, x, t=None) -> jax.Array:
+        """The ``mu = H_N`` of all particle numbers, shape (..., K); at a time, where the energy depends on one."""
+        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self.poisson.matter.N]
+
     def fourier_factors(self, x, t=None) -> jax.Array:
         """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
 
@@ -169,6 +193,8 @@ class ComposedSystem(System):
         return f"{' and '.join(found)}: it has to be positive"
 
     def sparsity(self) -> scipy.sparse.csr_array | None:
+        if self.poisson.species:
+            return None
         parts = [_motion(self.poisson), *([] if self.dissipation is None else [self.dissipation.couplings(self)])]
         through, hessian = union(parts), self.energy.couplings(self.dim)
         if through is None or hessian is None:
@@ -272,20 +298,39 @@ def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     if not callable(V):
         raise InputError(f"a coupling is a function of q, or of (q, S), or an Energy, not {type(V).__name__}")
     q, _, S, _ = structure.places
-    needed, joined = needed_arguments(V), _Apart(V, len(q))
+    needed, N = needed_arguments(V), structure.matter.N
     if needed == 1:
         return Function(V).on(q)
-    return (TimeDependent(joined) if needed == 3 else Function(joined)).on(np.concatenate([q, S]))
+    parts = (q, S, N) if structure.species and needed is not None and needed > 2 else (q, S)
+    joined = _Apart(V, tuple(np.cumsum([len(part) for part in parts[:-1]]).tolist()))
+    return (TimeDependent(joined) if needed == len(parts) + 1 else Function(joined)).on(np.concatenate(parts))
 
 
 class _Apart(Module):
-    """V(q, S), or V(q, S, t), as a function of one array, and of t."""
+    """V(q, S), or V(q, S, N), and of t, as a function of one array, and of t."""
 
     V: Callable
-    positions: int = eqx.field(static=True)
+    ends: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, y, *t):
-        return self.V(y[: self.positions], y[self.positions :], *t)
+        return self.V(*jnp.split(y, self.ends), *t)
+
+
+def _named_maps(given) -> dict:
+    if isinstance(given, Mapping):
+        return dict(given)
+    return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
+
+
+def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
+    """The sums of particle numbers that no process changes."""
+    N = structure.matter.N
+    found: dict[str, Energy] = {}
+    for i, weights in enumerate(conserved_numbers(processes, len(N)) if len(N) else ()):
+        b = np.zeros(structure.dim)
+        b[N] = weights
+        found[f"particles {i + 1}"] = Quadratic(jnp.zeros(structure.dim), b)
+    return found
 
 
 def _by_law(conductance, bodies: int) -> tuple[Any, tuple[Callable, ...]]:

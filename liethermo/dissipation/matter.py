@@ -1,0 +1,108 @@
+"""Matter that passes membranes, and that reacts: friction between chemical potentials [after GBY; SML §7]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._module import Module
+
+from .base import Dissipation
+from .factor import Factor
+
+
+class Process(Module):
+    """One way in which particle numbers change together, ``N' = nu J``.
+
+    Attributes
+    ----------
+    stoichiometry : tuple of float
+        nu, of all particle numbers of the system.
+    heated : tuple of float
+        The shares of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
+    carried : tuple of float
+        Which bodies entropy is carried to (1) and from (-1).
+    entropy : array, shape ()
+        What is carried with a particle (entropy).
+    coefficient : array, shape (), or function of the whole state
+        L >= 0.
+    """
+
+    stoichiometry: tuple[float, ...] = eqx.field(static=True)
+    heated: tuple[float, ...] = eqx.field(static=True)
+    carried: tuple[float, ...] = eqx.field(static=True)
+    entropy: jax.Array
+    coefficient: jax.Array | Callable
+
+
+class MatterExchange(Dissipation):
+    """Processes e with fluxes ``J_e = L_e z_e . dS`` along vectors z_e that hold the energy.
+
+    ``z = nu d/dN + sum_b (w_b A + c_b s T_m) / T_b d/dS_b`` with the affinity ``A = -nu . mu``, ``mu = H_N`` and
+    ``T_b = H_{S_b}``; w has sum 1 and c has sum 0, so ``z . dH = nu . mu + A = 0``, for discrete gradients too. The
+    entropy grows by ``sum_e L_e (z_e . dS)^2``; in one body ``J = L A / T``, and through a membrane between equal
+    temperatures ``J = L (mu_2 - mu_1) / T``. In metriplectic form K is ``sum_e L_e z_e z_e^T``.
+
+    Parameters
+    ----------
+    processes : sequence of Process
+    """
+
+    processes: tuple[Process, ...]
+
+    def __init__(self, processes: Sequence[Process]):
+        self.processes = tuple(processes)
+
+    def force(self, system, x, dH, dS, dL):
+        numbers, directions = self._directions(system, dH)
+        N, S = system.poisson.matter.N, system.poisson.places.S
+        flux = self._coefficients(x) * (numbers @ dS[N] + directions @ dS[S])
+        return jnp.zeros_like(x).at[N].add(flux @ numbers).at[S].add(flux @ directions)
+
+    def factor(self, system, x, dH, dL):
+        numbers, directions = self._directions(system, dH)
+        N, S, root = system.poisson.matter.N, system.poisson.places.S, jnp.sqrt(self._coefficients(x))
+        return Factor(
+            len(self.processes),
+            lambda w: jnp.zeros_like(x).at[N].add((root * w) @ numbers).at[S].add((root * w) @ directions),
+        )
+
+    def _coefficients(self, x) -> jax.Array:
+        """L of each process; NaN where it is negative: the step is then refused."""
+        found = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
+        L = jnp.stack([jnp.asarray(value) for value in found])
+        return jnp.where(L >= 0.0, L, jnp.nan)
+
+    def _directions(self, system, dH) -> tuple[np.ndarray, jax.Array]:
+        """The components of each z along the particle numbers, and along the entropies."""
+        numbers, heated, carried = (
+            np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
+        )
+        mu, T = dH[system.poisson.matter.N], dH[system.poisson.places.S]
+        T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
+        affinity = -(numbers @ mu)
+        mean = touched @ T / np.maximum(touched.sum(axis=1), 1.0)
+        heat = jnp.stack([e.entropy for e in self.processes]) * mean
+        return numbers, (heated * affinity[:, None] + carried * heat[:, None]) / T
+
+
+def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:
+    """Combinations of particle numbers that no process changes, shape (combinations, count): reduced by elimination."""
+    rows = np.array([e.stoichiometry for e in processes]).reshape(-1, count)
+    _, singular, basis = np.linalg.svd(rows, full_matrices=True)
+    kernel = basis[int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum()) :]
+    place = 0
+    for row in range(len(kernel)):
+        while place < count and np.abs(kernel[row:, place]).max() < 1e-9:
+            place += 1
+        best = row + int(np.abs(kernel[row:, place]).argmax())
+        kernel[[row, best]] = kernel[[best, row]]
+        kernel[row] /= kernel[row, place]
+        others = np.arange(len(kernel)) != row
+        kernel[others] -= np.outer(kernel[others, place], kernel[row])
+        place += 1
+    return np.where(np.abs(kernel) < 1e-12, 0.0, kernel)

@@ -1,0 +1,124 @@
+"""Membranes and reactions between the bodies of a composed system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._module import Module
+from manifolds.structures.contact import Matter
+
+from ...dissipation.matter import Process
+from ...errors import InputError
+from ...functions.conditions import require
+
+
+class Membrane(Module):
+    """What lets particles of one kind pass between two bodies: ``N_1' = L (mu_2 / T_2 - mu_1 / T_1 + …) = -N_2'``.
+
+    Between equal temperatures ``J = L (mu_2 - mu_1) / T``; what the particles lose heats either body by half. Between
+    bodies of different temperature the flux is driven by ``e (1/T_1 - 1/T_2) - (mu_1/T_1 - mu_2/T_2)``, with the energy
+    ``e = (mu_1 + mu_2)/2 + s (T_1 + T_2)/2`` that a particle carries.
+
+    Parameters
+    ----------
+    first, second : int or str
+        The bodies, by number or by name.
+    permeability : float, >= 0, or function of the whole state to one
+        L (particles^2 / (entropy time)).
+    species : int, or a pair of them
+        Which of the particle numbers of a body, the same in both or one in each.
+    carries : float
+        s, the entropy that a particle carries.
+    """
+
+    first: int | str = eqx.field(static=True)
+    second: int | str = eqx.field(static=True)
+    permeability: jax.Array | Callable
+    species: tuple[int, int] = eqx.field(static=True)
+    carries: jax.Array
+
+    def __init__(self, first, second, permeability, species: int | tuple[int, int] = 0, carries: float = 0.0):
+        self.first, self.second = first, second
+        self.permeability = _coefficient(permeability, "the permeability of a membrane")
+        of_first, of_second = (species, species) if isinstance(species, int) else species
+        self.species = (of_first, of_second)
+        self.carries = jnp.asarray(carries, dtype=jnp.float64)
+
+    def process(self, names: Sequence[str], matter: Matter) -> Process:
+        """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
+        a, b = (_body(given, names) for given in (self.first, self.second))
+        if a == b:
+            raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
+        stoichiometry, sides = np.zeros(len(matter.N)), np.zeros((2, len(names)))
+        for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
+            stoichiometry[_number(body, kind, names, matter)] = sign
+            sides[:, body] = 0.5, sign
+        numbers, heated, carried = (tuple(row.tolist()) for row in (stoichiometry, *sides))
+        return Process(numbers, heated, carried, self.carries, self.permeability)
+
+
+class Reaction(Module):
+    """A reaction among the particles of a body, ``N' = nu L A / T`` with the affinity ``A = -nu . mu``.
+
+    It rests where ``nu . mu = 0``, the law of mass action of ideal gases. The rates of mass action themselves are those
+    of ``L = (k_f prod n_educts - k_b prod n_products) T / A``, which is positive.
+
+    Parameters
+    ----------
+    body : int or str
+    stoichiometry : sequence of float
+        nu, negative for what is used up: (-1, -1, 1) for A + B -> C.
+    rate : float, >= 0, or function of the whole state to one
+        L (particles^2 / (entropy time)).
+    """
+
+    body: int | str = eqx.field(static=True)
+    stoichiometry: tuple[float, ...] = eqx.field(static=True)
+    rate: jax.Array | Callable
+
+    def __init__(self, body, stoichiometry: Sequence[float], rate):
+        self.body, self.rate = body, _coefficient(rate, "the rate of a reaction")
+        self.stoichiometry = tuple(float(nu) for nu in stoichiometry)
+
+    def process(self, names: Sequence[str], matter: Matter) -> Process:
+        """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
+        body = _body(self.body, names)
+        own = np.flatnonzero(matter.owner == body)
+        if len(own) != len(self.stoichiometry):
+            raise InputError(
+                f"a reaction in {names[body]} has {len(own)} stoichiometric numbers, not {len(self.stoichiometry)}"
+            )
+        stoichiometry, heated = np.zeros(len(matter.N)), np.zeros(len(names))
+        stoichiometry[own], heated[body] = self.stoichiometry, 1.0
+        none = (0.0,) * len(names)
+        return Process(tuple(stoichiometry.tolist()), tuple(heated.tolist()), none, jnp.zeros(()), self.rate)
+
+
+def _coefficient(given, what: str) -> jax.Array | Callable:
+    if callable(given):
+        return given
+    value = jnp.asarray(given, dtype=jnp.float64)
+    if value.shape != ():
+        raise InputError(f"{what} is one number, or a function of the state, not an array of shape {value.shape}")
+    require(value, lambda L: L >= 0.0, what + " must be >= 0, not {value}: entropy would fall")
+    return value
+
+
+def _body(given, names: Sequence[str]) -> int:
+    if isinstance(given, str) and given in names:
+        return list(names).index(given)
+    if isinstance(given, int) and not isinstance(given, bool) and 0 <= given < len(names):
+        return given
+    raise InputError(f"there is no body {given!r}: the bodies are {', '.join(names)}, counted from 0")
+
+
+def _number(body: int, kind: int, names: Sequence[str], matter: Matter) -> int:
+    own = np.flatnonzero(matter.owner == body)
+    if not 0 <= kind < len(own):
+        raise InputError(f"{names[body]} has {len(own)} kinds of particles, so no number {kind}")
+    return int(own[kind])
