@@ -75,7 +75,7 @@ sphinx_gallery_conf = {
     "examples_dirs": ["../examples"],
     "gallery_dirs": ["gallery"],
     "subsection_order": [
-        *map("../examples/{}".format, "bodies algebras spins fluids heat studies methods".split()),
+        *map("../examples/{}".format, "bodies algebras spins fluids heat quantum studies methods".split()),
         "*",
     ],
     "filename_pattern": r"/plot_",

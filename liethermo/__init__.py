@@ -23,6 +23,7 @@ from .dissipation.landau_lifshitz import LandauLifshitz
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
+from .dissipation.quantum import SteepestEntropyAscent, ThermalJumps
 from .errors import (
     AxiomError,
     CasimirError,
@@ -37,6 +38,7 @@ from .errors import (
     SpecError,
 )
 from .functions import magnetism
+from .functions.density import VonNeumann
 from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
@@ -91,6 +93,7 @@ from .systems import (
     LiePoissonSystem,
     Membrane,
     MetriplecticSystem,
+    QuantumSystem,
     Reaction,
     SimpleClosedSystem,
     SpinSystem,
@@ -169,6 +172,7 @@ __all__ = [
     "PowerLawFriction",
     "ProjectedMetric",
     "Quadratic",
+    "QuantumSystem",
     "Reaction",
     "Reference",
     "Relaxed",
@@ -178,14 +182,17 @@ __all__ = [
     "SpinSystem",
     "Stats",
     "Status",
+    "SteepestEntropyAscent",
     "Study",
     "StudyStatus",
     "Subsystem",
     "System",
+    "ThermalJumps",
     "ThermodynamicHerglotz",
     "TimeDependent",
     "VariationalGauss",
     "VariationalIntegrator",
+    "VonNeumann",
     "WithAttitude",
     "Zipped",
     "bodies",

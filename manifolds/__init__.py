@@ -35,6 +35,8 @@ from .errors import (
 )
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
 from .groups.matrix_group import MatrixGroup, registered_groups
+from .matrices.divided import ScalarFunction
+from .matrices.spectral import spectral, spectral_trace
 from .retractions.charts import (
     CayleyRetraction,
     EuclideanRetraction,
@@ -74,6 +76,7 @@ from .structures.contact import (
     LagrangianContact,
     SplitContact,
 )
+from .structures.density import DensityMatrices
 from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
 from .structures.spins import Spins
 
@@ -95,6 +98,7 @@ __all__ = [
     "ContactStructure",
     "Coordinates",
     "Cosymplectic",
+    "DensityMatrices",
     "DirectSum",
     "DomainError",
     "Euclidean",
@@ -134,6 +138,7 @@ __all__ = [
     "RepresentationError",
     "Retraction",
     "RiemannianRetraction",
+    "ScalarFunction",
     "ShapeError",
     "SizeError",
     "Sp",
@@ -169,6 +174,8 @@ __all__ = [
     "sl",
     "so",
     "sp",
+    "spectral",
+    "spectral_trace",
     "su",
     "testing",
     "trilinear_form",

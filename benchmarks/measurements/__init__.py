@@ -9,6 +9,7 @@ NAMES = (
     "spin",
     "manifolds",
     "fluids",
+    "quantum",
     "ensemble",
     "others",
     "tumbling",

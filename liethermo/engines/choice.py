@@ -160,7 +160,7 @@ class Chosen:
                     f"the sparse engine cannot run a {system.kind} that does not know its sparsity: a "
                     "ComposedSystem of lt.Copies joined by lt.Each does"
                 )
-        long = self.steps >= COMPILED_STEPS
+        long = self.steps >= COMPILED_STEPS or system.spectral
         if self.asked == "compiled" or (auto and is_small(system, COMPILED_DIM if long else SMALL_DIM)):
             compiled = CompiledEngine(system, method)
             try:

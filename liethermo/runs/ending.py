@@ -198,6 +198,8 @@ def _culprit(engine: Chosen, state, h: float) -> str:
     """Which function is not finite just ahead of the last good state."""
     system = engine.system
     ahead = _ahead(state, h)
+    if reason := system.outside(ahead):
+        return reason
     if reason := engine.method.explain(system, state.x, state.k, h):
         return reason
     suspects = {"energy": system.energy.value, "gradient of the energy": system.energy.gradient}
@@ -207,4 +209,4 @@ def _culprit(engine: Chosen, state, h: float) -> str:
         if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
             near = np.array2string(np.asarray(system.seen(ahead)), precision=4, threshold=8)
             return f"the {name} first, near x = {near}"
-    return system.outside(ahead) or f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
+    return f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"

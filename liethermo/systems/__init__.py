@@ -16,6 +16,7 @@ from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .metriplectic import MetriplecticSystem
+from .quantum import QuantumSystem
 from .simple_closed import SimpleClosedSystem
 from .spins import SpinSystem
 
@@ -39,6 +40,7 @@ __all__ = [
     "LiePoissonSystem",
     "Membrane",
     "MetriplecticSystem",
+    "QuantumSystem",
     "Reaction",
     "SimpleClosedSystem",
     "SpinSystem",

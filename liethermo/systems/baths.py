@@ -29,7 +29,8 @@ class HeatBaths(Module):
     Parameters
     ----------
     capacity, temperature : float > 0, or array, shape (number,)
-        C (energy / temperature) and T, in any consistent units.
+        C (energy / temperature) and T, in any consistent units. A bath of infinite capacity keeps its temperature,
+        ``U = T y``.
     number : int
     energy : function from y, a scalar, to a scalar, optional
         The same for all baths, in place of the two numbers. It has to increase.
@@ -53,7 +54,7 @@ class HeatBaths(Module):
         self.number = number
         if energy is None:
             given = {"capacity": capacity, "temperature": temperature}
-            self.energy = Warmth(*(_positive(value, what, number) for what, value in given.items()))
+            self.energy = Warmth(*(_positive(value, what, number, what == "capacity") for what, value in given.items()))
         else:
             self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
@@ -66,15 +67,19 @@ class HeatBaths(Module):
     def scale(self) -> np.ndarray | float:
         """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
         energy = self.energy
-        return np.asarray(energy.capacity) if isinstance(energy, Warmth) and not is_traced(energy) else 1.0
+        if not isinstance(energy, Warmth) or is_traced(energy):
+            return 1.0
+        capacity = np.asarray(energy.capacity)
+        return np.where(np.isfinite(capacity), capacity, 1.0)
 
 
-def _positive(value, what: str, number: int) -> jax.Array:
+def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     array = real_array(value)
     if array.shape not in ((), (number,)):
         raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
-    if not is_traced(array) and not bool(((array > 0.0) & jnp.isfinite(array)).all()):
-        raise InputError(f"the {what} of a bath must be positive and finite, not {array.tolist()}")
+    if not is_traced(array) and not bool(((array > 0.0) & (infinite | jnp.isfinite(array))).all()):
+        allowed = "positive" if infinite else "positive and finite"
+        raise InputError(f"the {what} of a bath must be {allowed}, not {array.tolist()}")
     return jnp.broadcast_to(array, (number,))
 
 

@@ -112,6 +112,10 @@ class DrivenSystem(System):
     def unrollable(self) -> bool:
         return self.body.unrollable
 
+    @property
+    def spectral(self) -> bool:
+        return self.body.spectral
+
     def field(self, x, dH, dS, dL=()):
         motion = self._now(x).left_alone().field(*_part_of_body(x, dH, dS, dL))
         motion = jnp.concatenate([motion, _clock(dH, self.unit)])

@@ -264,6 +264,11 @@ class Kind(Module):
         return self.space is None or (self.space.smooth and self.space.dtype.kind != "c")
 
     @property
+    def spectral(self) -> bool:
+        """Whether it is made of functions of matrices, which XLA compiles more slowly than the compiled engine."""
+        return False
+
+    @property
     def smooth(self) -> bool:
         """Whether the vector field can be differentiated twice and more."""
         return self.space is None or self.space.smooth

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import math
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+
+from manifolds.matrices.exponential import expm
+
+from .keys import key
+
+FEW = 64
+"""Numbers that are no table yet: what they are made from may be shorter."""
 
 CALLS = ("jit", "pjit", "closed_call", "core_call")
 """Primitives that call a jaxpr, which takes their place here."""
@@ -28,6 +37,10 @@ class Lifting:
         """The jaxpr, its remaining constants, and the numbers: scalars in one array, then arrays."""
         body = _Body(self)
         body.bind(closed.jaxpr, closed.consts, closed.jaxpr.invars)
+        used = {a for eqn in body.equations for a in eqn.invars if type(a) is Var} | {
+            a for a in body.outputs if type(a) is Var
+        }
+        body.numbers = [(v, x) for v, x in body.numbers if v in used]
         scalars = [(v, x) for v, x in body.numbers if isinstance(x, float)]
         arrays = [(v, x) for v, x in body.numbers if not isinstance(x, float)]
         invars = [v for v, _ in (*scalars, *arrays)] + list(closed.jaxpr.invars)
@@ -79,14 +92,15 @@ class _Body:
         for eqn in jaxpr.eqns:
             inputs = [read(a) for a in eqn.invars]
             if eqn.primitive.name in CALLS and isinstance(eqn.params.get("jaxpr"), ClosedJaxpr):
-                inner = eqn.params["jaxpr"]
+                inner = _substitute(eqn) or eqn.params["jaxpr"]
                 found = self._run(inner.jaxpr, inner.consts, dict(zip(inner.jaxpr.invars, inputs, strict=True)))
                 env.update(zip(eqn.outvars, found, strict=True))
                 continue
             fixed = self._value_of(eqn, inputs)
             if fixed is not None:
                 for var, value in zip(eqn.outvars, fixed, strict=True):
-                    env[var] = self._keep(Var(var.aval), value)
+                    inexact = _is_inexact(var.aval)
+                    env[var] = self._number(value, var.aval) if inexact else self._keep(Var(var.aval), value)
                 continue
             inputs, params = self._lifted(eqn, inputs)
             outputs = [type(v)(v.aval) for v in eqn.outvars]
@@ -160,10 +174,14 @@ class _Body:
     # -- what follows from numbers alone ----------------------------------------------------------------------------
 
     def _value_of(self, eqn: JaxprEqn, inputs: list) -> list | None:
-        """The values of truths or integers that follow from numbers alone: they belong to the operations."""
-        if eqn.effects or all(_is_inexact(v.aval) for v in eqn.outvars):
+        """The values of truths or integers that follow from numbers alone: they belong to the operations.
+
+        Or those of large arrays of numbers: a table is kept as it is, not what it is made from.
+        """
+        table = all(map(_is_table, eqn.outvars)) and any(math.prod(a.aval.shape) > FEW for a in inputs)
+        if eqn.effects or (all(_is_inexact(v.aval) for v in eqn.outvars) and not table):
             return None
-        if not any(_is_inexact(a.aval) for a in inputs):
+        if not any(_is_inexact(a.aval) for a in inputs) and not table:
             return None
         if not all(isinstance(a, Literal) or a in self._fixed for a in inputs):
             return None
@@ -186,6 +204,25 @@ class _Body:
         return _evaluated(eqn, values)
 
 
+def _substitute(eqn: JaxprEqn) -> ClosedJaxpr | None:
+    """What takes the place of a function of JAX that unrolls badly, above all its derivatives: the exponential."""
+    if eqn.params.get("name") != "expm" or len(eqn.invars) != 1:
+        return None
+    aval: Any = eqn.invars[0].aval
+    known, own = _exponentials(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    return own if known is not None and key(eqn.params["jaxpr"]) == known else None
+
+
+@functools.lru_cache(maxsize=64)
+def _exponentials(shape) -> tuple[Hashable, ClosedJaxpr | None]:
+    """A key of what JAX's does to an array, where that can be traced, and the operations of ours."""
+    outer = jax.make_jaxpr(jax.scipy.linalg.expm)(shape)
+    found = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
+    if len(found) != 1:
+        return None, None
+    return key(found[0].params["jaxpr"]), jax.make_jaxpr(expm)(shape)
+
+
 def _evaluated(eqn: JaxprEqn, values: Sequence) -> list:
     inputs = [Var(a.aval) for a in eqn.invars]
     jaxpr = Jaxpr([], inputs, eqn.outvars, [eqn.replace(invars=list(inputs))], debug_info=DebugInfo("", "", None, None))
@@ -200,6 +237,11 @@ def _unnamed(jaxpr: Jaxpr) -> DebugInfo:
 def _is_inexact(aval) -> bool:
     dtype = getattr(aval, "dtype", None)
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
+
+
+def _is_table(var: Var) -> bool:
+    aval: Any = var.aval
+    return getattr(aval, "dtype", None) == np.float64 and aval.size > FEW
 
 
 def _is_number(atom) -> bool:

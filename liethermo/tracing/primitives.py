@@ -258,11 +258,15 @@ def _split(x, params):
 # run on the numbers of the entries.
 
 
+SHORT_GATHER = 256
+"""Entries of a result that are found one by one; for more it is worth to compile what JAX does."""
+
+
 def _gather(b, eqn, x, indices):
     fill_value = eqn.params["fill_value"]
     if fill_value is None:
         fill_value = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
-    if not indexing.known(indices):
+    if not indexing.known(indices) or math.prod(eqn.outvars[0].aval.shape) <= SHORT_GATHER:
         return indexing.gathered(b, eqn, x, indices, fill_value)
     numbers = jnp.arange(x.size).reshape(x.shape)
     where = integers(indices).astype(_dtype(eqn, 1))

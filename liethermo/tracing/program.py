@@ -244,6 +244,27 @@ class Scan(Block):
         return carried + [a for column in made for a in column]
 
 
+@dataclass(frozen=True, eq=False)
+class Routine(Block):
+    """A program that is written once and called wherever it is needed.
+
+    Attributes
+    ----------
+    program : Program
+        Of one array of numbers, with another as its result.
+    """
+
+    program: Program
+    name: str = field(default="routine", repr=False)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("f",) * len(self.program.outputs[0])
+
+    def __call__(self, *args) -> list:
+        return self.program.run(args)[0]
+
+
 # -- what follows from instructions -----------------------------------------------------------------------------------
 
 

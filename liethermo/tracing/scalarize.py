@@ -9,18 +9,22 @@ is none.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
+
+from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
 from .builder import Builder, LimitExceededError, Scalar, array, constant, elementwise
 from .complex_numbers import ComplexBuilder, arranged, flat, kinds
 from .primitives import PARAMETERS, RULES
-from .program import Program, Scan, While, live
+from .program import Program, Routine, Scan, While, live
 
 LIMIT = 200_000
 """Instructions that a program may have: far more than compile in reasonable time."""
@@ -182,6 +186,38 @@ def _call(b, eqn, *arguments):
     if isinstance(inner, ClosedJaxpr):
         return _unroll(b, inner.jaxpr, inner.consts, arguments)
     return _unroll(b, inner, (), arguments)
+
+
+def _chain(b, eqn, *arguments):
+    """A function of matrices, whose derivatives have been taken: unrolled here, or a routine where that is long."""
+    (out,), rank = (var.aval for var in eqn.outvars), arguments[0].ndim - 2
+    if not rank or eqn.params["function"].shares:
+        return _one_chain(b, arguments, out, eqn.params)
+    front, result = out.shape[:rank], np.empty(out.shape, object)
+    for place in np.ndindex(*front):  # one after another, by the same routine
+        own = [x[tuple(i if n > 1 else 0 for i, n in zip(place, x.shape, strict=False))] for x in arguments]
+        result[place] = _one_chain(b, own, out.update(shape=out.shape[rank:]), eqn.params)
+    return result
+
+
+def _one_chain(b, arguments, out, params) -> np.ndarray:
+    shifts = len(arguments) - len(params["slots"])
+    avals = tuple(
+        jax.ShapeDtypeStruct(x.shape, np.float64 if i == shifts else out.dtype) for i, x in enumerate(arguments)
+    )
+    closed, routine = _routine(avals, **params)
+    if len(routine.program.instructions) <= LONG:
+        return _unroll(b, closed.jaxpr, closed.consts, arguments)[0]
+    return arranged(iter(b.real.block(routine, *flat(arguments))), [out])[0]
+
+
+@functools.lru_cache(maxsize=256)
+def _routine(avals: tuple, function, slots: tuple[int, ...]) -> tuple[ClosedJaxpr, Routine]:
+    evaluation = functools.partial(chains.evaluated, function=function, slots=slots, unrolled=True)
+    closed = jax.make_jaxpr(evaluation)(*avals)
+    own, names = Builder(LIMIT), [f"x0_{i}" for i in range(len(kinds(avals)))]
+    found = flat(_unroll(own, closed.jaxpr, closed.consts, arranged(iter(names), avals)))
+    return closed, Routine(_program(own, [names], [found], [(len(found),)]))
 
 
 def _linear_solve(b, eqn, *arguments):
@@ -379,6 +415,7 @@ CALLS = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call che
 CONTROL = {
     **dict.fromkeys(CALLS.split(), _call),
     "custom_linear_solve": _linear_solve,
+    chains.chain_p.name: _chain,
     "cond": _cond,
     "scan": _scan,
     "while": _while,

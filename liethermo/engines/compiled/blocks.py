@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from llvmlite import ir
 
 from ...tracing.builder import Block
 from ...tracing.calls import Call, Deferred
-from ...tracing.program import Scan, While
+from ...tracing.program import Routine, Scan, While
 from .lapack import kernel
 
 PLACE = ir.IntType(32)
@@ -29,6 +30,8 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> Results:
         return _scan(writer, block, args)
     if isinstance(block, Deferred):
         return Results(writer.deferred(args, len(block.kinds)))
+    if isinstance(block, Routine):
+        return _routine(writer, block, args)
     assert isinstance(block, Call)
     return _call(writer, block, args)
 
@@ -157,6 +160,28 @@ class Table:
         self.build.store(value, self.build.gep(self.start, [i]))
 
 
+class Given:
+    """Numbers in memory that are the same for all lanes, such as parameters: nothing is copied."""
+
+    def __init__(self, writer: Any, start: ir.Value, length: int):
+        self.writer, self.start, self.length = writer, start, length
+
+    def read(self, i: ir.Value) -> ir.Value:
+        return self.writer.splat(self.writer.builder.load(self.writer.builder.gep(self.start, [i])))
+
+    def of_each_lane(self, places: ir.Value) -> ir.Value:
+        """What each lane has at a place of its own, or at the nearest."""
+        writer, build, places = self.writer, self.writer.builder, inside(self.writer, places, self.length)
+        if writer.lanes == 1:
+            return self.read(places)
+        found = ir.Constant(writer.number, ir.Undefined)
+        for lane in range(writer.lanes):
+            at = ir.Constant(PLACE, lane)
+            value = build.load(build.gep(self.start, [build.extract_element(places, at)]))
+            found = build.insert_element(found, value, at)
+        return found
+
+
 class Results:
     """The results of a block: values, then tables of one length. What is in those is read where it is used."""
 
@@ -177,6 +202,34 @@ def table(writer: Any, values: Sequence[ir.Value]) -> Table:
     """Values as a table; they are numbers where one of them is."""
     kind = writer.number if any(value.type == writer.number for value in values) else values[0].type
     return Table(writer, kind, [writer.cast(v, "f") if kind == writer.number else v for v in values])
+
+
+def _routine(writer: Any, routine: Routine, args: Sequence[ir.Value]) -> Results:
+    """By a function of its own, which all that need it call."""
+    build, count = writer.builder, len(routine.kinds)
+    given = Table(writer, writer.number, [writer.cast(a, "f") for a in args])
+    found = Table(writer, writer.number, length=count)
+    name = "routine_" + hashlib.sha256(repr(routine).encode()).hexdigest()[:16]
+    function = build.module.globals.get(name) or _written(writer, routine, name)
+    build.call(function, [given.start, found.start])
+    return Results([], [found], count)
+
+
+def _written(writer: Any, routine: Routine, name: str) -> ir.Function:
+    kinds = [writer.number.as_pointer()] * 2
+    function = ir.Function(writer.builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
+    build, (given, found) = inside.builder, function.args
+
+    def read(i: int, j: int) -> ir.Value:
+        return build.load(build.gep(given, [inside.whole_number(j)]))
+
+    for i, value in enumerate(inside.write(routine.program, read)[0]):
+        build.store(value, build.gep(found, [inside.whole_number(i)]))
+    build.ret_void()
+    return function
 
 
 def _call(writer: Any, call: Call, args: Sequence[ir.Value]) -> Results:

@@ -186,7 +186,12 @@ class _Steps(Writer):
             array = piece.arguments[i]
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
-        for array, values in zip(piece.results, self.write(piece.program, read), strict=True):
+        def memory(i: int, j: int, count: int) -> ir.Value | None:
+            if piece.arguments[i] != "p" or any(own is not None for own in self.own[j : j + count]):
+                return None
+            return build.gep(self.argument["p"], [self.whole_number(j)])
+
+        for array, values in zip(piece.results, self.write(piece.program, read, memory), strict=True):
             for slot, value in zip(self.slots[array], values, strict=True):
                 build.store(value if where is None else build.select(where, value, build.load(slot)), slot)
 
@@ -196,13 +201,7 @@ class _Steps(Writer):
             return build.load(self.place(self.layout.rows["p"] + own), align=8)
         found = build.load(build.gep(self.argument["p"], [self.whole_number(i)]))
         found.set_metadata("invariant.load", build.module.add_metadata([]))
-        return found if self.lanes == 1 else self.splat(found)
-
-    def splat(self, number: ir.Value) -> ir.Value:
-        build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
-        one = build.insert_element(ir.Constant(self.number, ir.Undefined), number, zero)
-        order = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
-        return build.shuffle_vector(one, ir.Constant(self.number, ir.Undefined), order)
+        return self.splat(found)
 
     def place(self, row: int) -> ir.Value:
         start = self.builder.gep(self.builder.load(self.block), [self.whole_number(row * self.lanes)])

@@ -38,7 +38,11 @@ def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> M
             return build.load(place(first + j))
         return build.load(place(block.rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.whole_number(j)]))
 
-    for i, value in enumerate(itertools.chain.from_iterable(writer.write(program, read))):
+    def memory(i: int, j: int, count: int) -> ir.Value | None:
+        shared = i == 0 and not varies[j : j + count].any()
+        return build.gep(p, [writer.whole_number(j)]) if shared else None
+
+    for i, value in enumerate(itertools.chain.from_iterable(writer.write(program, read, memory))):
         build.store(value, place(first + i))
     build.ret_void()
     return MachineCode(module)

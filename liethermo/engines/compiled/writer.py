@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import ChainMap, Counter
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from llvmlite import ir
@@ -13,7 +14,7 @@ from ...tracing.branches import Branch, branched
 from ...tracing.builder import Block, Instruction, Scalar
 from ...tracing.program import Program
 from ...tracing.scalarize import UnsupportedPrimitive
-from .blocks import Results, Table, picked, table, write_block
+from .blocks import Given, Results, Table, picked, table, write_block
 from .exponential import exponential
 from .lapack import SPECIAL, declared
 
@@ -29,6 +30,10 @@ COMPARED = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
 ARITHMETIC |= {"div": ("fdiv", ""), "rem": ("frem", "")}
 LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
+
+
+Read: TypeAlias = Callable[[int, int], ir.Value]
+Memory: TypeAlias = Callable[[int, int, int], ir.Value | None]
 
 
 class Writer:
@@ -53,19 +58,25 @@ class Writer:
         self.kinds = {"f": self.number, "b": self.test, "i": self.whole}
         self.active: ir.Value | None = None
 
-    def write(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
+    def at(self, builder: ir.IRBuilder) -> Writer:
+        """A writer for as many lanes, where another builder stands."""
+        return Writer(builder, self.lanes)
+
+    def write(self, program: Program, read: Read, memory: Memory | None = None) -> list[list[ir.Value]]:
         """The values of the outputs, array by array.
 
         Parameters
         ----------
         read : function from the places of an array among the inputs, and of an entry in it, to its value
             Asked for what the program uses.
+        memory : function from such places and a count of entries to their place in memory, optional
+            None where they do not lie one after another, or are not the same for all lanes. Tables are read there.
         """
-        return [[self._as_number(value) for value in entries] for entries in self.values(program, read)]
+        return [[self._as_number(value) for value in entries] for entries in self.values(program, read, memory)]
 
-    def values(self, program: Program, read: Callable[[int, int], ir.Value]) -> list[list[ir.Value]]:
+    def values(self, program: Program, read: Read, memory: Memory | None = None) -> list[list[ir.Value]]:
         """The same, integers and truth values as they are."""
-        written = _Written(self, program, read)
+        written = _Written(self, program, read, memory)
         written.all(branched(program))
         return [[written.value(a) for a in entries] for entries in program.outputs]
 
@@ -183,6 +194,15 @@ class Writer:
         found = build.bitcast(build.call(self._declared(f"llvm.smax.v{count}i64", whole, bits), bits), number)
         return build.extract_element(found, first) if self.lanes == 1 else found
 
+    def splat(self, number: ir.Value) -> ir.Value:
+        """A number in every lane."""
+        if self.lanes == 1:
+            return number
+        build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
+        one = build.insert_element(ir.Constant(self.number, ir.Undefined), number, zero)
+        order = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+        return build.shuffle_vector(one, ir.Constant(self.number, ir.Undefined), order)
+
     def any(self, tests: ir.Value) -> ir.Value:
         """Whether a truth value holds in any lane, as one bit."""
         if self.lanes == 1:
@@ -267,8 +287,8 @@ class Writer:
 class _Written:
     """The variables of a program so far, as it is written: those of one side of a branch are known there alone."""
 
-    def __init__(self, writer: Writer, program: Program, read: Callable[[int, int], ir.Value]):
-        self.writer, self.read = writer, read
+    def __init__(self, writer: Writer, program: Program, read: Read, memory: Memory | None):
+        self.writer, self.read, self.memory = writer, read, memory
         self.places = {name: (i, j) for i, names in enumerate(program.inputs) for j, name in enumerate(names)}
         self.uses = Counter(a for _, _, args in program.instructions for a in args)
         self.uses.update(a for entries in program.outputs for a in entries)
@@ -276,7 +296,7 @@ class _Written:
         self.products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
         self.sizes: set[Scalar] = set()  # numbers without a sign
         self.blocks: dict[Scalar, Results] = {}
-        self.tables: dict[Scalar, Table] = {}
+        self.tables: dict[Scalar, Table | Given] = {}
 
     def value(self, a: Scalar) -> ir.Value:
         if not isinstance(a, str):
@@ -302,9 +322,8 @@ class _Written:
             return
         if op in ("table", "column"):
             whole = op == "table"
-            self.tables[target] = (
-                table(writer, [self.value(a) for a in args]) if whole else self.blocks[args[0]].column(int(args[1]))
-            )
+            made = self.given(args) or table(writer, [self.value(a) for a in args]) if whole else None
+            self.tables[target] = made or self.blocks[args[0]].column(int(args[1]))
             return
         if op == "lookup":
             self.values[target] = self.tables[args[1]].of_each_lane(self.value(args[0]))
@@ -326,6 +345,15 @@ class _Written:
             self.products[target] = given
         if op == "abs" or unsigned:
             self.sizes.add(target)
+
+    def given(self, names: Sequence[Scalar]) -> Given | None:
+        """A table of inputs that lie in memory one after another."""
+        places = [self.places.get(a, (-1, -1)) if isinstance(a, str) else (-1, -1) for a in names]
+        (i, first), *_ = places
+        if self.memory is None or i < 0 or places != [(i, first + n) for n in range(len(names))]:
+            return None
+        start = self.memory(i, first, len(names))
+        return None if start is None else Given(self.writer, start, len(names))
 
     def branch(self, branch: Branch) -> None:
         """Each side where any lane takes it, then what each lane chooses."""

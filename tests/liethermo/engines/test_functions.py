@@ -140,3 +140,22 @@ def test_what_cannot_be_compiled_is_named():
     system = body(lambda m: jnp.abs(lax.asinh(m[0] + 1j)))
     with pytest.raises(lt.LiethermoError, match=r"primitive 'asinh' on complex numbers \(test_functions.py:\d+"):
         lt.integrate(system, X0, (0.0, 0.1), 0.1, engine="compiled")
+
+
+FUNCTIONS_OF_MATRICES = {
+    "where eigenvalues meet": lambda m: mf.spectral_trace(jnp.log, jnp.diag(2.0 + 0.0 * m) + 0.1 * jnp.outer(m, m)),
+    "4 x 4, complex": lambda m: (
+        mf.spectral(jnp.sqrt, 2.0 * jnp.eye(4) + 0.3j * mf.so(4).hat(jnp.tile(m, 2)))[0, 0].real
+    ),
+}
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("method", METHODS, ids=["implicit", "explicit"])
+@pytest.mark.parametrize("name", FUNCTIONS_OF_MATRICES)
+def test_functions_of_matrices(name, method):
+    """The second has eigenvectors from LAPACK, of eigenvalues that come in equal pairs for some m."""
+    system = body(FUNCTIONS_OF_MATRICES[name])
+    ours, other = (lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array"))
+    assert np.abs(ours.x - other.x).max() <= 2e-14
+    assert ours.audit().energy_drift <= 4e-15

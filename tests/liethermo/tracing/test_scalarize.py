@@ -26,6 +26,7 @@ from liethermo.tracing.builder import Instruction, meaning
 from liethermo.tracing.primitives import RULES
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import CONTROL, UnsupportedPrimitive, scalarize
+from manifolds.matrices.exponential import expm
 from manifolds.matrices.linear import solve
 from tests.cases import DISSIPATIONS, EPS, build, state_of
 from tests.machine_code import compiled
@@ -159,6 +160,9 @@ SPECTRAL = {
     "svd, complex": (lambda a: jnp.linalg.svd(a + 1j * a.T)[1], square),
     "cholesky, complex": (lambda a: parts(jnp.linalg.cholesky(a + hermitian + 9.0 * jnp.eye(2))), spd[:2, :2]),
     "expm": (jax.scipy.linalg.expm, square),
+    "expm, own, derivative": (both(expm), square),
+    "spectral": (lambda a: mf.spectral(jnp.log, a), spd),
+    "spectral, derivative": (both(lambda a: mf.spectral(jnp.sqrt, a)), spd),
     "dot_general, as a loop": (both(lambda a: jnp.kron(a, a) @ jnp.sin(jnp.kron(a, a))), square),
     "dot_general, complex": (lambda a: parts(jnp.kron(a, a + 1j) @ jnp.exp(1j * jnp.kron(a, a))), square),
     "sort": (both(lambda a: [jnp.sort(a), jnp.sort(a)[::-1], jnp.median(a)]), w),
@@ -432,6 +436,7 @@ CASES = {
 }
 
 NOT_TRACED_HERE = {
+    "inverse": "the equations of a step are solved with it, where Newton's method is traced",
     "expand_dims": "lax writes it as broadcast_in_dim",
     "copy_p": "the name of copy in some versions of JAX",
     "pjit": "the name of jit in earlier versions",

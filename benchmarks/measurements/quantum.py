@@ -1,0 +1,95 @@
+"""Density matrices in a bath of constant temperature, beside QuTiP."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import numpy as np
+import scipy.linalg
+
+import liethermo as lt
+
+from .. import laws, peers
+from ..report import Report, Table, UnavailableError, ratio
+from ..timing import race
+
+TEMPERATURE, RATE, END = 0.8, 0.1, 100.0
+
+
+def operators(levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Levels whose distances differ, and a coupling of neighbours."""
+    return np.diag(np.cumsum(np.arange(levels) * 0.3 + 0.4)), np.diag(np.sqrt(np.arange(1.0, levels)), 1)
+
+
+def system(levels: int) -> lt.QuantumSystem:
+    H, V = operators(levels)
+    bath = lt.HeatBaths(capacity=np.inf, temperature=TEMPERATURE)
+    return lt.QuantumSystem(H, lt.ThermalJumps([(V, RATE)]), baths=bath)
+
+
+def collapse(levels: int) -> list[np.ndarray]:
+    """The jumps of Lindblad's equation, their rates inside."""
+    H, V = operators(levels)
+    found = []
+    for i in range(levels - 1):
+        one, omega = np.zeros((levels, levels)), H[i + 1, i + 1] - H[i, i]
+        one[i, i + 1] = V[i, i + 1]
+        for L, energy in ((one, omega), (one.T, -omega)):
+            found.append(np.sqrt(RATE * np.exp(energy / (2 * TEMPERATURE))) * L)
+    return found
+
+
+def exact(levels: int, rho: np.ndarray) -> np.ndarray:
+    H, one = operators(levels)[0], np.eye(levels)
+    generator = -1j * (np.kron(H, one) - np.kron(one, H.T))
+    for L in collapse(levels):
+        n = L.T @ L
+        generator += np.kron(L, L.conj()) - 0.5 * (np.kron(n, one) + np.kron(one, n.T))
+    return (scipy.linalg.expm(generator * END) @ rho.ravel()).reshape(levels, levels)
+
+
+def mesolve(levels: int, rho: np.ndarray, tolerance: float):
+    """A call of ``qutip.mesolve`` to the end, and the density matrix there."""
+    qutip = peers.module("qutip")
+    H, jumps = qutip.Qobj(operators(levels)[0]), [qutip.Qobj(L) for L in collapse(levels)]
+    options = {"rtol": tolerance, "atol": 0.01 * tolerance, "nsteps": 1_000_000, "store_final_state": True}
+    return lambda: qutip.mesolve(H, qutip.Qobj(rho), [0.0, END], c_ops=jumps, options=options).final_state.full()
+
+
+def run(quick: bool) -> Report:
+    rows, rounds = [], 1 if quick else 5
+    for levels, step in ((2, 0.5), (3, 0.4), (4, 0.25), *(() if quick else ((8, 0.2), (16, 0.1)))):
+        q, rng = system(levels), np.random.default_rng(levels)
+        root = rng.normal(size=(levels, levels)) + 1j * rng.normal(size=(levels, levels))
+        rho = root @ root.conj().T / np.trace(root @ root.conj().T).real
+        x, wanted, method = q.state(rho), exact(levels, rho), lt.MetriplecticGauss(3)
+        start = time.process_time()
+        lt.integrate(q, x, (0.0, step), step, method)
+        first, steps = time.process_time() - start, round(END / step)
+
+        def ours(q=q, x=x, step=step, steps=steps):
+            return lt.integrate(q, x, (0.0, END), step, lt.MetriplecticGauss(3), save_every=steps)
+
+        error = np.abs(np.asarray(q.density(ours().x[-1])) - wanted).max()
+        works = {"ours": ours}
+        with contextlib.suppress(UnavailableError):
+            works["QuTiP"] = mesolve(levels, rho, max(error, 1e-12))
+        outcomes = race(works, rounds=rounds)
+        own = outcomes["ours"]
+        cells = [levels, first, own.processor / steps, own.processor, error]
+        if "QuTiP" in outcomes:
+            other = outcomes["QuTiP"]
+            cells += [ratio(other.processor, own.processor), np.abs(other.result - wanted).max()]
+        else:
+            cells += [None, None]
+        rows.append([*cells, *laws.of_solution(own.result).cells()])
+    columns = {"Levels": "text", "First answer": "seconds", "Time a step": "seconds", "To the end": "seconds"}
+    columns |= {"Error": "error", "QuTiP, relative": "ratio", "Its error": "error"}
+    table = Table(
+        f"Three Gauss stages to T = {END:g}, beside `qutip.mesolve` at about the same error.",
+        columns | laws.COLUMNS,
+        rows,
+    )
+    text = "Levels in a bath of constant temperature, where the motion is Lindblad's equation. Processor times."
+    return Report("Density matrices", text, [table], [])

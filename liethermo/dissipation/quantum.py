@@ -1,0 +1,329 @@
+"""Open quantum systems: jumps that exchange heat with baths, and steepest entropy ascent."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds.matrices.spectral import log_mean
+
+from ..errors import InputError
+from ..functions.density import OfMatrix
+from ..functions.energy import Energy, Function
+from ..functions.frames import frame
+from .base import Dissipation
+from .checks import checked_rate
+
+EIGEN = 1e-9
+"""Residual of ``[H, V] = -omega V``, and difference of frequencies, relative to the sizes of H and V, that is zero."""
+
+
+class Operator:
+    """A matrix that cannot change and is compared by value, to be a static field of a module."""
+
+    def __init__(self, matrix):
+        self._array = np.array(matrix, dtype=complex)
+        self._array.flags.writeable = False
+        self._hash = hash((self._array.shape, self._array.tobytes()))
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return self._array if dtype is None else self._array.astype(dtype)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, Operator) and np.array_equal(self._array, other._array)
+
+    def __repr__(self) -> str:
+        return f"Operator{self._array.shape}"
+
+
+class Jump(NamedTuple):
+    """A part of a coupling that takes the energy omega out of the system, ``[H, V] = -omega V``.
+
+    Attributes
+    ----------
+    operator : Operator
+        V; together with its adjoint, which puts that energy in.
+    source : int
+        The number of the coupling.
+    weight : float
+        One half where V is its own adjoint: the two are then one.
+    """
+
+    operator: Operator
+    source: int
+    weight: float
+
+
+class ThermalJumps(Dissipation):
+    """Jumps of an open quantum system that exchange heat with a bath [Carlen & Maas 2017; Mittnenzweig & Mielke 2017].
+
+    A coupling V is split into parts with ``[H, V] = -omega V``. With ``B(A, a) = [V, A] - (a / T) [V, dE]`` and L the
+    logarithmic mean of ``e^(-omega / 2T) rho`` from the left and ``e^(omega / 2T) rho`` from the right, the friction is
+    ``K = sum (rate / 2) B* L B`` over the parts and their adjoints. ``K dE = 0`` and ``K >= 0`` by form, for discrete
+    gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is constant the motion
+    is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and V^H at
+    ``rate * exp(-omega / 2T)``. The Hamiltonian may change in time where its eigenvectors stay.
+
+    In a system without baths the jumps exchange no heat, which is the limit of infinite temperature: the identity is at
+    rest (the noise is unital), and the entropy cannot fall. The energy is kept where every V commutes with H, as in
+    dephasing.
+
+    Parameters
+    ----------
+    couplings : list of (V, rate)
+        V is a matrix, shape (N, N); a Hermitian one acts once, another together with its adjoint. The rate is a
+        number >= 0 (1 / time), or a function of omega and T, such as ``g / (2 sinh(omega / 2T))`` for a bath of bosons,
+        which has to be even in omega.
+    bath : int
+        The number of the bath, from 0.
+
+    Raises
+    ------
+    InputError
+        If a coupling or a rate cannot be used.
+    """
+
+    operators: tuple[Operator, ...] = eqx.field(static=True)
+    rates: tuple[Any, ...]
+    bath: int = eqx.field(static=True)
+    jumps: tuple[Jump, ...] = eqx.field(static=True)
+    isolated: bool = eqx.field(static=True)
+    keeps_energy: bool = eqx.field(static=True)
+
+    def __init__(self, couplings: Sequence[tuple[Any, Any]], bath: int = 0):
+        given = list(couplings)
+        if not given or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in given):
+            raise InputError("ThermalJumps takes a list of pairs (V, rate), such as [(V, 0.1)]")
+        if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
+            raise InputError(f"bath is the number of a bath, from 0, not {bath!r}")
+        self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(given))
+        self.rates = tuple(rate if callable(rate) else checked_rate(rate) for _, rate in given)
+        self.bath, self.jumps, self.isolated, self.keeps_energy = bath, (), False, True
+
+    @property
+    def energy_law(self):
+        return "conserved" if self.keeps_energy else None
+
+    def prepared(self, system):
+        structure, baths = needed_density(system, "ThermalJumps"), system.baths
+        for i, V in enumerate(self.operators):
+            if np.shape(V) != (structure.size,) * 2:
+                raise InputError(
+                    f"the coupling V[{i}] has shape {np.shape(V)}, and the Hamiltonian ({structure.size},"
+                    f" {structure.size})"
+                )
+        if baths is not None and self.bath >= baths.number:
+            raise InputError(f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number}, from 0")
+        hamiltonians = system.hamiltonians()
+        if baths is None:
+            jumps = tuple(Jump(V, i, 0.5 if _hermitian(V) else 1.0) for i, V in enumerate(self.operators))
+            kept = all(_small(_commutator(H, V), H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
+        else:
+            jumps = tuple(
+                itertools.chain.from_iterable(_split(V, i, hamiltonians) for i, V in enumerate(self.operators))
+            )
+            kept = True
+        return self._replaced(jumps=jumps, isolated=baths is None, keeps_energy=kept)
+
+    def _replaced(self, **fields) -> ThermalJumps:
+        found = object.__new__(ThermalJumps)
+        for name in ("operators", "rates", "bath", "jumps", "isolated", "keeps_energy"):
+            object.__setattr__(found, name, fields.get(name, getattr(self, name)))
+        return found
+
+    def with_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
+        """The same rates with other matrices, such as those of a larger system, and another bath."""
+        return self._replaced(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
+
+    def force(self, system, x, dH, dS, dL):
+        structure, n = system.structure, system.body_dim
+        logs = mf.spectral(jnp.log, structure.matrix(x[:n]))
+        H, A = structure.matrix(dH[:n]), structure.matrix(dS[:n])
+        fixed = np.stack([np.asarray(jump.operator) for jump in self.jumps])
+        V, adjoint = jnp.asarray(fixed), jnp.asarray(fixed.conj().swapaxes(-1, -2))
+        squares, conjugate = np.sum(np.abs(fixed) ** 2, axis=(-2, -1)), jnp.asarray(fixed.conj())
+        turned = _commutator(V, H)
+        omega = jnp.sum(turned * conjugate, axis=(-2, -1)).real / squares
+        if self.isolated:
+            T, shift = jnp.asarray(jnp.inf), jnp.zeros(len(self.jumps))
+            B = _commutator(V, A)
+        else:
+            T = dH[n + self.bath]
+            ratio, shift = dS[n + self.bath] / T, omega / (2.0 * T)
+            B = _commutator(V, A) - ratio * turned
+        image = log_mean(logs, shift, B) * self._strengths(omega, T)[:, None, None]
+        force = structure.vector(jnp.sum(_commutator(adjoint, image), axis=0))  # the adjoints add the adjoint
+        if self.isolated:
+            return force
+        lost = jnp.sum(turned.conj() * image).real
+        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-lost / T)])
+
+    def _strengths(self, omega, T) -> jax.Array:
+        rates = [self.rates[jump.source] for jump in self.jumps]
+        return jnp.stack(
+            [
+                jump.weight * jnp.asarray(rate(omega[i], T) if callable(rate) else rate)
+                for i, (jump, rate) in enumerate(zip(self.jumps, rates, strict=True))
+            ]
+        )
+
+
+class SteepestEntropyAscent(Dissipation):
+    """Steepest entropy ascent of an isolated quantum system [Beretta 1984].
+
+    ``K = rate P^T L P`` with the metric ``L A = (rho A + A rho) / 2`` and P the projector, orthogonal for L, off the
+    energy, the trace and what else is preserved. An eigenvalue of rho that is zero stays zero: so a state keeps its
+    rank, and a pure state moves by the Hamiltonian alone. For such states take ``lt.VonNeumann(floor=...)``, and
+    ``lt.MetriplecticMidpoint``: it keeps the rank to rounding, the other methods to their order.
+
+    Parameters
+    ----------
+    rate : float, >= 0
+        1 / time.
+    preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
+        Observables ``tr(rho A)`` that are kept, or other functions.
+    """
+
+    rate: jax.Array
+    functions: tuple[Any, ...]
+
+    def __init__(self, rate=1.0, preserve=()):
+        self.rate = checked_rate(rate)
+        self.functions = tuple(
+            f if callable(f) else Operator(checked_hermitian(f, f"preserve[{i}]")) for i, f in enumerate(preserve)
+        )
+
+    @property
+    def preserve(self) -> tuple[Energy, ...]:
+        return tuple(f for f in self.functions if isinstance(f, Energy))
+
+    def prepared(self, system):
+        needed_density(system, "SteepestEntropyAscent")
+        return self
+
+    def on_density(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
+        """What it preserves as functions of states, whose structure is given."""
+        made = []
+        for i, f in enumerate(self.functions):
+            if isinstance(f, Operator):
+                if np.shape(f) != (structure.size,) * 2:
+                    raise InputError(
+                        f"preserve[{i}] has shape {np.shape(f)}, and the Hamiltonian that of {structure.size}"
+                    )
+                f = Function(_Observable(structure.vector(np.asarray(f))))
+            elif not isinstance(f, Energy):
+                f = Function(OfMatrix(f, structure))
+            made.append(f)
+        found = SteepestEntropyAscent(self.rate)
+        object.__setattr__(found, "functions", tuple(made))
+        return found
+
+    def force(self, system, x, dH, dS, dL):
+        structure, n = system.structure, system.body_dim
+        rho = structure.matrix(x[:n])
+
+        def raised(alpha):  # the Hermitian part of rho A has both terms
+            return structure.vector(rho @ structure.matrix(alpha))
+
+        one = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
+        held = frame((one, dH[:n], *(L[:n] for L in dL)), form=raised)
+        force = held.off_images(raised(held.off(dS[:n])))
+        return jnp.pad(self.rate * force, (0, system.dim - n))
+
+
+class _Observable(eqx.Module):
+    """``tr(rho A)``, of a state whose first coordinates are those of rho."""
+
+    coordinates: jax.Array
+
+    def __call__(self, x):
+        return jnp.dot(self.coordinates, x[: self.coordinates.shape[0]])
+
+
+def needed_density(system, name: str) -> mf.DensityMatrices:
+    """The structure of a system of density matrices."""
+    structure = getattr(system, "structure", None)
+    if not isinstance(structure, mf.DensityMatrices):
+        raise InputError(f"{name} acts on density matrices: use it in an lt.QuantumSystem")
+    return structure
+
+
+def checked_matrix(matrix, what: str) -> np.ndarray:
+    """A square complex matrix; that of a ``Qobj`` too, which is read by its ``full()``."""
+    full: Callable | None = getattr(matrix, "full", None)
+    found = np.asarray(full() if callable(full) else matrix)
+    if found.dtype.kind not in "fiuc" or found.ndim != 2 or found.shape[0] != found.shape[1]:
+        raise InputError(f"{what} is a square matrix of numbers, not an array of {found.dtype}, shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise InputError(f"{what} is not finite")
+    return found.astype(complex)
+
+
+def checked_hermitian(matrix, what: str) -> np.ndarray:
+    """A Hermitian matrix."""
+    found = checked_matrix(matrix, what)
+    residual, size = float(np.abs(found - found.conj().T).max()), float(np.abs(found).max())
+    if residual > 1e-12 * size:
+        raise InputError(
+            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}; its Hermitian part is "
+            "(A + A.conj().T) / 2"
+        )
+    return (found + found.conj().T) / 2
+
+
+def _commutator(a, b):
+    return a @ b - b @ a
+
+
+def _hermitian(V) -> bool:
+    V = np.asarray(V)
+    return bool(np.abs(V - V.conj().T).max() <= 1e-12 * np.abs(V).max())
+
+
+def _small(residual, H, V) -> bool:
+    return bool(np.abs(residual).max() <= EIGEN * np.abs(H).max() * np.abs(V).max())
+
+
+def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray]) -> list[Jump]:
+    """The eigenoperators of ``[H, .]`` that a coupling is the sum of; those of a Hermitian one up to adjoints."""
+    V, H = np.asarray(operator), hamiltonians[0]
+    energies, vectors = np.linalg.eigh(H)
+    inside = vectors.conj().T @ V @ vectors
+    gaps = energies[None, :] - energies[:, None]
+    present = np.abs(inside) > 1e-14 * np.abs(V).max()
+    spread = EIGEN * max(float(np.abs(energies).max()), 1e-300)
+    frequencies: list[float] = []
+    for gap in np.sort(gaps[present]):
+        if not frequencies or gap > frequencies[-1] + spread:
+            frequencies.append(float(gap))
+    own_adjoint, parts = _hermitian(V), []
+    for omega in frequencies:
+        if own_adjoint and omega < -spread:
+            continue
+        still = own_adjoint and abs(omega) <= spread
+        whole = len(frequencies) == 1
+        part = (
+            V
+            if whole
+            else vectors @ np.where(present & (np.abs(gaps - omega) <= spread), inside, 0.0) @ vectors.conj().T
+        )
+        for other in hamiltonians[1:]:
+            turned = _commutator(other, part)
+            along = np.vdot(part, turned) / np.vdot(part, part)
+            if not _small(turned - along * part, other, part):
+                raise InputError(
+                    f"the coupling V[{source}] has no parts with [H, V] = -omega V at all times: the eigenvectors of "
+                    "the Hamiltonian turn. Jumps are for Hamiltonians whose eigenvalues alone depend on time"
+                )
+        parts.append(Jump(Operator(part), source, 0.5 if still else 1.0))
+    return parts

@@ -1,0 +1,120 @@
+"""Functions of Hermitian matrices by their eigenvalues, and traces of them, with derivatives of every order.
+
+Derivatives are by divided differences (:mod:`.chains`), so that they are finite and exact where eigenvalues meet.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .chains import chain
+from .divided import ScalarFunction, scalar_function
+from .symmetric import eigh
+
+SMALL = 3
+"""Rows up to which eigenvectors are found by rotations where operations are unrolled; beyond, LAPACK is called."""
+
+
+def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
+    """``f(A) = U f(p) U^H`` of a Hermitian matrix ``A = U p U^H``, with all its derivatives.
+
+    Forward and reverse mode have derivatives of any order, finite and exact also where eigenvalues meet [Daleckii &
+    Krein 1965]. A function that is defined anew has another identity, and is compiled again.
+
+    Parameters
+    ----------
+    f : function of an array, entry by entry
+        ``jnp.exp``, ``jnp.log``, ``jnp.log1p``, ``jnp.sqrt`` and ``jnp.reciprocal`` have divided differences in closed
+        form. Those of another function are quotients, or means of its derivatives where those are more accurate.
+    a : array, shape (..., n, n)
+        Real symmetric or complex Hermitian matrices.
+
+    Returns
+    -------
+    array, shape (..., n, n)
+        NaN where f is not defined at an eigenvalue.
+    """
+    return chain(Spectral(scalar_function(f)), [jnp.asarray(a)], (0,), np.zeros(1))
+
+
+def spectral_trace(f: Callable | ScalarFunction, a) -> jax.Array:
+    """``tr f(A)``, shape (...), whose gradient is ``f'(A)``.
+
+    Parameters
+    ----------
+    f, a
+        As for :func:`spectral`.
+    """
+    return _trace(scalar_function(f), jnp.asarray(a))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _trace(f: ScalarFunction, a):
+    return jnp.trace(spectral(f, a), axis1=-2, axis2=-1).real
+
+
+@_trace.defjvp
+def _trace_derivative(f, primals, tangents):
+    (a,), (da,) = primals, tangents
+    slope = spectral(f.differentiated, a)
+    return _trace(f, a), jnp.sum(slope.swapaxes(-1, -2) * da, axis=(-2, -1)).real
+
+
+def log_mean(logs, shift, x) -> jax.Array:
+    """``L X``, with the logarithmic mean of ``e^-s A`` from the left and ``e^s A`` from the right, ``A = exp(logs)``.
+
+    In eigenvectors of A ``(L X)_kl = X_kl (u - v) / (ln u - ln v)`` with ``u = e^-s p_k`` and ``v = e^s p_l``. It is
+    the divided difference of exp at the logarithms, and so has all its derivatives [Carlen & Maas 2017].
+
+    Parameters
+    ----------
+    logs : array, shape (..., n, n)
+        Hermitian.
+    shift : float, or array, shape (...)
+        s.
+    x : array, shape (..., n, n)
+    """
+    shift = jnp.asarray(shift)
+    return chain(Spectral(scalar_function(jnp.exp)), [logs], (0, 0), jnp.stack([-shift, shift], axis=-1), [x])
+
+
+@dataclass(frozen=True)
+class Spectral:
+    """A function of the eigenvalues of Hermitian matrices: see :class:`.chains.Chained`."""
+
+    function: ScalarFunction
+    shares: ClassVar[bool] = True
+
+    def chain(self, matrices, slots, shifts, directions, unrolled: bool) -> jax.Array:
+        found = [_eigenvectors(a, unrolled) for a in matrices]
+        vectors, k = [found[slot][1] for slot in slots], len(directions)
+        points = [
+            (found[slot][0] + shifts[..., j, None])[(..., *(slice(None) if i == j else None for i in range(k + 1)))]
+            for j, slot in enumerate(slots)
+        ]
+        weights, adjoint = self.function.divided(*points), [u.conj().swapaxes(-1, -2) for u in vectors]
+        inner = [adjoint[j] @ E @ vectors[j + 1] for j, E in enumerate(directions)]
+        if k == 0:
+            return (vectors[0] * weights[..., None, :]) @ adjoint[0]
+        if k > 1:  # sum over all places but the first and the last
+            letters = "abcdefghijklm"[: k + 1]
+            pairs = ",".join("..." + letters[j : j + 2] for j in range(k))
+            middle = jnp.einsum(f"...{letters},{pairs}->...{letters[0]}{letters[-1]}", weights, *inner)
+        else:
+            middle = weights * inner[0]
+        return vectors[0] @ middle @ adjoint[-1]
+
+
+def _eigenvectors(a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
+    a = (a + a.conj().swapaxes(-1, -2)) / 2
+    if unrolled and a.shape[-1] > SMALL:
+        vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
+        return values, vectors
+    return eigh(a)

@@ -1,0 +1,279 @@
+"""Density matrices beside Lindblad's equation, closed forms and programs of their own; both laws; what is refused."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+
+import liethermo as lt
+import manifolds as mf
+
+LOWER = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=complex)
+X, Y, Z = (np.array(m, dtype=complex) for m in ([[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]))
+QUBIT = np.diag([0.0, 1.3]).astype(complex)
+RHO = np.array([[0.3, 0.2 - 0.1j], [0.2 + 0.1j, 0.7]])
+T, RATE = 0.7, 0.2
+
+
+def infinite(temperature=T):
+    return lt.HeatBaths(capacity=np.inf, temperature=temperature)
+
+
+@functools.cache
+def qubit():
+    return lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=infinite())
+
+
+def random_density(n, seed=0):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
+    return root @ root.conj().T / np.trace(root @ root.conj().T).real
+
+
+def lindblad(rho, H, jumps):
+    """Jumps are pairs of an operator and its rate."""
+    found = -1j * (H @ rho - rho @ H)
+    for V, rate in jumps:
+        n = V.conj().T @ V
+        found = found + rate * (V @ rho @ V.conj().T - 0.5 * (n @ rho + rho @ n))
+    return found
+
+
+def motion(q, rho):
+    return np.asarray(q.structure.matrix(q.vector_field(q.state(rho))[: q.body_dim]))
+
+
+def test_the_structure_is_that_of_the_dual_of_unitary_matrices():
+    structure, g = mf.DensityMatrices(3), mf.u(3)
+    rho, H = random_density(3), random_density(3, 1)
+    x, alpha = structure.vector(rho), structure.vector(H)
+    assert np.abs(structure.matrix(structure.sharp(x, alpha)) + 1j * (H @ rho - rho @ H)).max() <= 1e-15
+    assert float(structure.jacobi_residual(x)) <= 1e-14
+    C = -1j * (H @ rho - rho @ H)
+    element = g.vee(1j * H)
+    dual, moved = ([np.trace((1j * m).conj().T @ e).real for e in g.basis] for m in (rho, C))
+    assert np.abs(g.ad_star(element, np.array(dual)) - np.array(moved)).max() <= 1e-14
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_at_a_constant_temperature_it_is_lindblads_equation(n):
+    H = np.diag(np.cumsum(np.arange(n) * 0.7 + 0.3)).astype(complex)
+    V = np.diag(np.sqrt(np.arange(1.0, n)), 1).astype(complex)  # of several frequencies
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, RATE)]), baths=infinite())
+    rho, jumps = random_density(n), []
+    for i in range(n - 1):
+        part, omega = np.zeros((n, n), complex), (H[i + 1, i + 1] - H[i, i]).real
+        part[i, i + 1] = V[i, i + 1]
+        jumps += [(part, RATE * np.exp(omega / (2 * T))), (part.T, RATE * np.exp(-omega / (2 * T)))]
+    assert np.abs(motion(q, rho) - lindblad(rho, H, jumps)).max() <= 1e-14
+    assert q.check().passed
+
+
+def test_a_hermitian_coupling_acts_once_and_a_rate_may_depend_on_frequency_and_temperature():
+    H, rho = QUBIT, RHO
+    bosons = lambda omega, T: 0.1 / (2 * jnp.sinh(omega / (2 * T)))  # noqa: E731
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(X, bosons)]), baths=infinite())
+    n = 1 / np.expm1(1.3 / T)
+    assert np.abs(motion(q, rho) - lindblad(rho, H, [(LOWER, 0.1 * (n + 1)), (LOWER.T, 0.1 * n)])).max() <= 1e-15
+    both = lt.QuantumSystem(H, lt.ThermalJumps([(Z, 0.3)]), baths=infinite())
+    assert np.abs(motion(both, rho) - lindblad(rho, H, [(Z, 0.3)])).max() <= 1e-15
+
+
+def test_a_qubit_beside_its_closed_form():
+    """T1, T2 and the frequency."""
+    q, t = qubit(), 20.0
+    solution = lt.integrate(q, q.state(RHO), (0.0, t), 0.05, lt.MetriplecticGauss(4))
+    rho = np.asarray(q.density(solution.x[-1]))
+    fast = RATE * 2 * np.cosh(1.3 / (2 * T))
+    rest = np.tanh(1.3 / (2 * T))
+    population = rest + (RHO[0, 0] - RHO[1, 1]).real * np.exp(-fast * t) - rest * np.exp(-fast * t)
+    assert abs((rho[0, 0] - rho[1, 1]).real - population) <= 1e-11
+    assert abs(rho[0, 1] - RHO[0, 1] * np.exp(1.3j * t - fast * t / 2)) <= 1e-11
+    audit = solution.audit()
+    assert audit.passed
+    assert audit.energy_drift <= 1e-13
+
+
+METHODS = {
+    "midpoint": (lt.MetriplecticMidpoint(), 2, (0.4, 0.2, 0.1)),
+    "Gauss 2": (lt.MetriplecticGauss(2), 4, (0.8, 0.4, 0.2)),
+    "Gauss 3": (lt.MetriplecticGauss(3), 6, (1.2, 0.6, 0.3)),
+    "explicit 4": (lt.MetriplecticRungeKutta(4), 4, (0.4, 0.2, 0.1)),
+    "explicit 6": (lt.MetriplecticRungeKutta(6), 6, (0.8, 0.4, 0.2)),
+}
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("name", METHODS)
+def test_orders(name):
+    """With a bath of finite heat capacity, so that nothing is linear."""
+    method, order, steps = METHODS[name]
+    q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=lt.HeatBaths(capacity=0.8, temperature=T))
+    x0 = q.state(RHO)
+    exact = lt.integrate(q, x0, (0.0, 2.4), 2.4, lt.Reference()).x[-1]
+    errors = [np.abs(lt.integrate(q, x0, (0.0, 2.4), h, method).x[-1] - exact).max() for h in steps]
+    slopes = np.diff(np.log(errors)) / np.diff(np.log(steps))
+    assert np.abs(slopes - order).max() <= 0.35
+
+
+def test_a_finite_bath():
+    """Energy of the whole, an entropy that never falls, and the state of Gibbs at the temperature that both reach."""
+    H = np.diag([0.0, 1.0, 2.7]).astype(complex)
+    V = np.diag([1.0, 1.0], 1).astype(complex)
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.4)]), baths=lt.HeatBaths(capacity=5.0, temperature=1.0))
+    solution = lt.integrate(q, q.state(random_density(3)), (0.0, 60.0), 0.2, lt.MetriplecticGauss(2))
+    audit = solution.audit()
+    assert audit.passed
+    assert audit.energy_drift <= 1e-13
+    assert np.diff(solution.entropy).min() >= -1e-15
+    temperature = float(q.temperatures(solution.x[-1])[0])
+    gibbs = scipy.linalg.expm(-H / temperature)
+    assert np.abs(q.density(solution.x[-1]) - gibbs / np.trace(gibbs)).max() <= 1e-9
+    assert np.abs(np.trace(q.density(solution.x), axis1=-2, axis2=-1) - 1.0).max() <= 1e-14
+
+
+def steepest(rho, H, rate, others=()):
+    """Steepest ascent by a program of its own: a Gram determinant in place of a projector."""
+    p, u = np.linalg.eigh(rho)
+    S = -(u * np.log(p)) @ u.conj().T
+    span = [np.eye(len(H)), H, *others]
+
+    def product(A, B):
+        return 0.5 * np.trace(rho @ (A @ B + B @ A)).real
+
+    gram = np.array([[product(A, B) for B in span] for A in span])
+    multipliers = np.linalg.solve(gram, [product(A, S) for A in span])
+    D = S - sum(m * A for m, A in zip(multipliers, span, strict=True))
+    return -1j * (H @ rho - rho @ H) + rate * 0.5 * (rho @ D + D @ rho)
+
+
+def test_steepest_ascent_beside_a_program_of_its_own():
+    H, rho, N = np.diag([0.0, 1.0, 2.5]).astype(complex), random_density(3), np.diag([1.0, 0.0, 1.0]).astype(complex)
+    q = lt.QuantumSystem(H, lt.SteepestEntropyAscent(0.4, preserve=[N]))
+    assert np.abs(motion(q, rho) - steepest(rho, H, 0.4, [N])).max() <= 1e-14
+
+    def field(t, y):
+        r = (y[:9] + 1j * y[9:]).reshape(3, 3)
+        d = steepest(r, H, 0.4, [N]).ravel()
+        return np.concatenate([d.real, d.imag])
+
+    y0 = np.concatenate([rho.ravel().real, rho.ravel().imag])
+    y = scipy.integrate.solve_ivp(field, (0, 4.0), y0, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    solution = lt.integrate(q, q.state(rho), (0.0, 4.0), 0.1, lt.MetriplecticGauss(3))
+    assert np.abs(q.density(solution.x[-1]) - (y[:9] + 1j * y[9:]).reshape(3, 3)).max() <= 1e-9
+    assert np.ptp(q.expectation(solution.x, N)) <= 1e-13
+    assert solution.audit().passed
+
+
+def test_steepest_ascent_keeps_the_rank():
+    """By the midpoint scheme, which adds nothing to the motion, to rounding; by others to their order."""
+    H = np.diag([0.0, 1.0, 2.5, 3.1]).astype(complex)
+    q = lt.QuantumSystem(H, lt.SteepestEntropyAscent(0.4), entropy=lt.VonNeumann(floor=1e-12))
+    rho = np.zeros((4, 4), complex)
+    rho[:3, :3] = random_density(3)
+    solution = lt.integrate(q, q.state(rho), (0.0, 2.0), 0.05, lt.MetriplecticMidpoint())
+    least = np.linalg.eigvalsh(q.density(solution.x))[:, 0]
+    assert np.abs(least).max() <= 1e-15
+    assert solution.audit().energy_drift <= 1e-13
+    assert np.diff(solution.entropy).min() > 0.0
+
+
+def test_noise_without_a_bath():
+    dephasing = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(Z, 0.3)]))
+    assert dephasing.energy_law == "conserved"
+    assert np.abs(motion(dephasing, RHO) - lindblad(RHO, QUBIT, [(Z, 0.3)])).max() <= 1e-15
+    turning = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(X, 0.3)]))
+    assert turning.energy_law is None
+    assert turning.entropy_law == "nondecreasing"
+    assert np.abs(motion(turning, RHO) - lindblad(RHO, QUBIT, [(X, 0.3)])).max() <= 1e-15
+
+
+def test_products_and_partial_traces():
+    one = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, 0.3)]), baths=infinite(1.0), names=["A"])
+    other = lt.QuantumSystem(2 * QUBIT, lt.ThermalJumps([(LOWER, 0.2)]), baths=infinite(0.5), names=["B"])
+    both = one * other
+    a, b = random_density(2, 3), random_density(2, 4)
+    x = both.state(np.kron(a, b))
+    assert np.abs(both.reduced(x, "A") - a).max() <= 1e-15
+    assert np.abs(both.reduced(x, 1) - b).max() <= 1e-15
+    rate = both.structure.matrix(both.vector_field(x)[:16])
+    apart = np.kron(motion(one, a), b) + np.kron(a, motion(other, b))
+    assert np.abs(rate - apart).max() <= 1e-15
+    linked = both.coupled(0.2 * (np.kron(LOWER, LOWER.T) + np.kron(LOWER.T, LOWER)))
+    assert linked.check().passed
+    assert linked.baths.number == 2
+
+
+def test_a_hamiltonian_that_depends_on_time():
+    """The work is in the ledger; jumps follow the frequency of the moment."""
+    H = lambda t: (1.0 + 0.2 * t) * jnp.asarray(QUBIT)  # noqa: E731
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(LOWER, RATE)]), baths=infinite())
+    rate = q.structure.matrix(q.vector_field(q.state(RHO), t=1.0)[:4])
+    omega = 1.2 * 1.3
+    jumps = [(LOWER, RATE * np.exp(omega / (2 * T))), (LOWER.T, RATE * np.exp(-omega / (2 * T)))]
+    assert np.abs(rate - lindblad(RHO, 1.2 * QUBIT, jumps)).max() <= 1e-15
+    solution = lt.integrate(q, q.state(RHO), (0.0, 3.0), 0.1)
+    assert solution.audit().passed
+    assert np.diff(solution.entropy).min() >= -1e-15
+    with pytest.raises(lt.InputError, match="eigenvectors of the Hamiltonian turn"):
+        lt.QuantumSystem(lambda t: jnp.cos(t) * Z + jnp.sin(t) * X, lt.ThermalJumps([(LOWER, 0.1)]), baths=infinite())
+
+
+def test_a_step_that_leaves_the_cone_is_refused():
+    q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, 50.0)]), baths=infinite(0.1))
+    x, span, method = q.state(np.diag([0.02, 0.98]).astype(complex)), (0.0, 0.01), lt.MetriplecticRungeKutta(4)
+    solution = lt.integrate(q, x, (0.0, 1.0), 0.5, method, on_failure="return")
+    assert not solution.status.ok
+    assert "outside the cone of positive matrices" in solution.status.message
+    shortened = lt.integrate(q, x, span, lt.Adaptive(1e-8, first=0.01), method)
+    assert shortened.status.ok
+    assert np.linalg.eigvalsh(q.density(shortened.x)).min() > 0.0
+
+
+def test_a_pure_state_is_refused_with_what_to_do():
+    q = qubit()
+    with pytest.raises(lt.InputError, match="gradient of the entropy is infinite: mix it"):
+        lt.integrate(q, q.state([0.0, 1.0]), (0.0, 1.0), 0.1)
+    assert np.linalg.eigvalsh(q.density(q.state([0.0, 1.0], mixed=1e-6)))[0] == pytest.approx(5e-7)
+
+
+def test_ensembles_over_rates_and_states():
+    q = qubit()
+    x0s = q.state(np.stack([random_density(2, seed) for seed in range(5)]))
+    found = lt.ensemble(q, x0s, (0.0, 2.0), 0.1, lt.MetriplecticGauss(2))
+    alone = lt.integrate(q, x0s[3], (0.0, 2.0), 0.1, lt.MetriplecticGauss(2)).x[-1]
+    assert np.array_equal(found.x[3], alone)
+
+
+BAD = {
+    "Hermitian": lambda q: lt.QuantumSystem(LOWER),
+    "square": lambda q: lt.QuantumSystem(np.ones((2, 3))),
+    r"V\[0\] has shape \(3, 3\)": lambda q: lt.QuantumSystem(
+        QUBIT, lt.ThermalJumps([(np.eye(3), 1.0)]), baths=infinite()
+    ),
+    "rate must be >= 0": lambda q: lt.ThermalJumps([(LOWER, -1.0)]),
+    "pairs": lambda q: lt.ThermalJumps([LOWER]),
+    "bath 1, but there are 1": lambda q: lt.QuantumSystem(
+        QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
+    ),
+    "leave out baths": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
+    "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
+    "matrix is not Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),
+    "least eigenvalue is": lambda q: q.state(np.diag([1.2, -0.2])),
+    "trace 0.7": lambda q: q.state(0.7 * RHO),
+    r"has shape \(2, 2\), not \(3, 3\)": lambda q: q.state(np.eye(3) / 3),
+    "not finite": lambda q: q.state(np.nan * RHO),
+    "lt.QuantumSystem": lambda q: lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(np.ones(3)), lt.Quadratic(np.ones(3)), lt.SteepestEntropyAscent()
+    ),
+    "whose product is not": lambda q: lt.QuantumSystem(QUBIT, parts=[3]),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_what_is_refused(message):
+    with pytest.raises(lt.InputError, match=message):
+        BAD[message](qubit())

@@ -1,0 +1,115 @@
+"""Functions of Hermitian matrices beside mpmath, their derivatives where eigenvalues meet, and the exponential's."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import manifolds as mf
+from manifolds.matrices.divided import Plain, scalar_function
+from manifolds.matrices.exponential import expm
+from manifolds.matrices.spectral import log_mean
+from manifolds.matrices.symmetric import eigh
+
+NAMES = ["exp", "log", "log1p", "sqrt", "reciprocal"]
+
+
+def hermitian(n, seed=0, is_complex=True):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, n)) + (1j * rng.normal(size=(n, n)) if is_complex else 0.0)
+    return (a + a.conj().T) / 2
+
+
+@pytest.mark.parametrize("points", [(2.0, 2.0), (2.0, 2.0 + 1e-9), (2.0, 2.05, 2.0), (2.0, 7.0, 2.0), (1e-9, 3.0, 0.5)])
+@pytest.mark.parametrize("name", NAMES)
+def test_divided_differences(name, points):
+    """Beside mpmath with 60 digits; points that coincide are moved apart there by 1e-20."""
+    exact = {"log1p": lambda x: mpmath.log(1 + x), "reciprocal": lambda x: 1 / x}.get(name) or getattr(mpmath, name)
+    with mpmath.workdps(90):
+        found = [mpmath.mpf(x) + k * mpmath.mpf(10) ** -20 for k, x in enumerate(points)]
+        table = [exact(x) for x in found]
+        for k in range(1, len(found)):
+            table = [(b - a) / (found[i + k] - found[i]) for i, (a, b) in enumerate(itertools.pairwise(table))]
+        wanted = float(table[0])
+    got = float(scalar_function(getattr(jnp, name)).divided(*map(jnp.asarray, points)))
+    assert got == pytest.approx(wanted, rel=3e-14)  # at most 5e-15
+
+
+def test_divided_differences_of_a_function_of_ones_own():
+    f = Plain(jnp.tanh)
+    for x, y in ((0.3, 0.3), (0.3, 0.3 + 1e-8), (0.0, 1e-9), (0.3, 2.5)):
+        wanted = float(mpmath.tanh(x) - mpmath.tanh(y)) / (x - y) if abs(x - y) > 1 else 1 - np.tanh((x + y) / 2) ** 2
+        assert float(f.divided(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(wanted, rel=1e-14)
+
+
+@pytest.mark.parametrize("is_complex", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_derivatives_of_every_order_where_eigenvalues_meet(is_complex):
+    """Both modes agree, and each order is the difference quotient of the one before."""
+    A = np.diag([2.0, 2.0])
+    B, C, G = (hermitian(2, seed, is_complex) for seed in range(3))
+
+    def along(x):
+        return jnp.sum(jnp.asarray(G) * mf.spectral(jnp.log, A + x[0] * B + x[1] * C).conj()).real
+
+    gradient, hessian = jax.jit(jax.grad(along)), jax.jit(jax.hessian(along))
+    third = jax.jit(jax.jacfwd(jax.hessian(along)))
+    x, h = jnp.zeros(2), 1e-4
+    reverse = jax.jacrev(jax.grad(along))(x)
+    assert np.abs(reverse - hessian(x)).max() <= 1e-14
+    for before, found in ((along, gradient(x)), (gradient, hessian(x)), (hessian, third(x))):
+        quotient = np.stack([(before(x + h * e) - before(x - h * e)) / (2 * h) for e in np.eye(2)], axis=-1)
+        assert np.abs(quotient - found).max() <= 1e-6 * np.abs(found).max()
+    # The control: the derivative of an eigenvector is not finite here.
+    by_vectors = jax.grad(lambda t: jnp.linalg.eigh(A + t * B)[1].real.sum())(0.0)
+    assert not np.isfinite(by_vectors)
+
+
+def test_gradients_of_traces():
+    A, B = np.diag([2.0, 2.0, 5.0]), hermitian(3)
+    for f, slope in ((jnp.log, np.diag([0.5, 0.5, 0.2])), (jnp.exp, np.diag(np.exp([2.0, 2.0, 5.0])))):
+        found = jax.grad(lambda t, f=f: mf.spectral_trace(f, A + t * B))(0.0)
+        assert found == pytest.approx(np.trace(slope @ B).real, rel=1e-14)
+
+
+def test_the_logarithmic_mean():
+    p, s, X = np.array([0.7, 0.3, 1e-12]), 0.4, hermitian(3)
+    left, right = np.exp(-s) * p[:, None], np.exp(s) * p[None, :]
+    wanted = X * (left - right) / np.log(left / right)
+    logs = jnp.diag(jnp.log(p)).astype(complex)
+    assert np.abs(log_mean(logs, s, X) - wanted).max() <= 1e-15
+    quotient = (log_mean(logs, s + 1e-5, X) - log_mean(logs, s - 1e-5, X)) / 2e-5
+    assert np.abs(jax.jacfwd(lambda s: log_mean(logs, s, X))(s) - quotient).max() <= 1e-9
+
+
+def test_batches_and_maps():
+    many = jnp.stack([hermitian(3, seed) for seed in range(4)])
+    together = mf.spectral(jnp.exp, many)
+    assert np.abs(together - jax.vmap(functools.partial(mf.spectral, jnp.exp))(many)).max() == 0.0
+    found = jax.vmap(lambda B: jax.jvp(functools.partial(mf.spectral, jnp.exp), (many[0],), (B,))[1])(many)
+    assert np.abs(found[2] - jax.jvp(functools.partial(mf.spectral, jnp.exp), (many[0],), (many[2],))[1]).max() <= 1e-14
+
+
+@pytest.mark.parametrize("n", [2, 3, 8])
+def test_eigenvectors_of_hermitian_matrices(n):
+    a = hermitian(n)
+    values, vectors = eigh(a)
+    assert np.abs(np.sort(values) - np.linalg.eigvalsh(a)).max() <= 1e-14
+    assert np.abs((vectors * values) @ vectors.conj().T - a).max() <= 1e-14
+
+
+def test_derivatives_of_the_exponential():
+    rng = np.random.default_rng(0)
+    X, D, E = rng.normal(size=(3, 2, 2))
+
+    def along(t):
+        return jnp.sum(E * expm(X + t[0] * D + t[1] * E))
+
+    t, h = jnp.zeros(2), 1e-5
+    hessian = jax.hessian(along)(t)
+    assert np.abs(jax.jacrev(jax.grad(along))(t) - hessian).max() <= 1e-13
+    quotient = np.stack([(jax.grad(along)(t + h * e) - jax.grad(along)(t - h * e)) / (2 * h) for e in np.eye(2)])
+    assert np.abs(quotient - hessian).max() <= 1e-7 * np.abs(hessian).max()
