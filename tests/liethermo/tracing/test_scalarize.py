@@ -437,6 +437,7 @@ CASES = {
 
 NOT_TRACED_HERE = {
     "inverse": "the equations of a step are solved with it, where Newton's method is traced",
+    "deferred": "a step leaves with it to the engine what Newton's method is to find",
     "expand_dims": "lax writes it as broadcast_in_dim",
     "copy_p": "the name of copy in some versions of JAX",
     "pjit": "the name of jit in earlier versions",
