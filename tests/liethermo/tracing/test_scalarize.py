@@ -436,7 +436,6 @@ CASES = {
 }
 
 NOT_TRACED_HERE = {
-    "deferred": "a step that Newton's method solves is put off by it, where a program of steps is traced",
     "inverse": "the equations of a step are solved with it, where Newton's method is traced",
     "deferred": "a step leaves with it to the engine what Newton's method is to find",
     "expand_dims": "lax writes it as broadcast_in_dim",
