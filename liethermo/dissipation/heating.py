@@ -81,6 +81,20 @@ class Heating(Carried):
         velocity = None if along is None else lambda w: body.at_sites(root, along(w))
         return B._replace(times=times, velocity=velocity, solenoidal=False)
 
+    def divergence(self, system, x):
+        """``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' the derivative of T by y: no matrix is formed."""
+        body, n = system.without_baths(), system.body_dim
+        dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
+        B = self.part.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
+        assert B is not None
+        if self.by_site and not B.solenoidal:  # each site has a temperature of its own
+            return super().divergence(system, x)
+        warmer = jax.jvp(system.energy.gradient, (x,), (jnp.zeros_like(x).at[n:].set(1.0),))[1]
+        T, slope = jnp.abs(self._of(dH[n:])), self._of(warmer[n:])
+        share = jnp.where(T > 0.0, 0.5 * slope / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        found = B.transposed(body.at_sites(share, dH[:n]))
+        return found if B.solenoidal else found + jnp.sqrt(T) * self.part.divergence(body, x[:n])
+
     def own_residuals(self, system, x):
         return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
 

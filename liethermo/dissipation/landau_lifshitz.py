@@ -108,4 +108,4 @@ class LandauLifshitz(Dissipation):
             pull = planes(w.reshape(spins.count, 3))
             return spins.joined(scaled(root, cross_planes(pull, s)), jnp.zeros(0))
 
-        return Factor(3 * spins.count, times)
+        return Factor(3 * spins.count, times, solenoidal=True)  # as w x s is, of any w that does not depend on s

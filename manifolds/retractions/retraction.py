@@ -186,7 +186,10 @@ class Chart(Retraction):
 
     def _carry(self, z, v, u):
         """See :meth:`carry`."""
-        raise SpaceError(f"{self} gives no _carry, so it has its base point at the start of a step, not in the middle")
+        raise SpaceError(
+            f"{self} gives no _carry, so its base point cannot lie in the middle of a step: take retraction='exp', "
+            "which has it at the start"
+        )
 
     def _reach(self, z, v):
         return self.space._reach(z, v)

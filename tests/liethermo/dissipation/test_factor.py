@@ -108,3 +108,39 @@ def test_roots_of_singular_matrices():
     assert np.allclose(same, np.diag([0.5, 1.0, 1.5]), atol=1e-14)
     assert np.isfinite(semidefinite_root(jnp.zeros((2, 2)))).all()
     assert np.isfinite(semidefinite_factor(jnp.zeros((2, 2)))).all()
+
+
+def in_baths(dissipation, baths):
+    moments = np.array([1.0, 2.0, 5.0])
+    return lt.LiePoissonSystem(
+        mf.so(3), lambda m: 0.5 * jnp.sum(m**2 / moments) + 0.1 * m[0] ** 4, dissipation=dissipation, baths=baths
+    )
+
+
+HEATED = {
+    "one bath": lambda: in_baths(lt.DoubleBracket(0.3), lt.HeatBaths(capacity=2.0, temperature=1.3)),
+    "friction that varies": lambda: in_baths(
+        lt.Friction(lambda m: (1.0 + m[1] ** 2) * jnp.diag(jnp.array([1.0, 2.0, 0.5]))), lt.HeatBaths(capacity=2.0)
+    ),
+    "below zero": lambda: in_baths(lt.DoubleBracket(0.3), lt.HeatBaths(energy=lambda y: 0.5 * y**2 + 0.1 * y**4)),
+    "a bath for each spin": lambda: lt.models.spin_lattice(
+        (2, 2), baths=lt.HeatBaths(capacity=[1.0, 2.0], number=2), bath=[[0, 1], [1, 0]]
+    ),
+    "spins": lambda: lt.models.spin_lattice((2, 2), baths=False),
+}
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("make", HEATED.values(), ids=HEATED)
+def test_divergences_of_what_heats(make):
+    """In closed form, against differentiation of every column by every component."""
+    system, rng = make(), np.random.default_rng(2)
+    x = jnp.asarray(rng.standard_normal(system.dim))
+    if system.baths is not None:
+        x = x.at[system.body_dim :].set(-0.4)  # where the energy of a bath may fall
+    product, _, missed = measured(system, x, system.energy.gradient(x), rng.standard_normal(system.dim), ())
+    if system.baths is not None:
+        assert product < 1e-13
+    assert np.abs(missed).max() < 1e-12
+    if system.baths is not None:
+        assert np.abs(divergence(system.dissipation, system, x)).max() > 1e-3
