@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import geomstats.geometry.euclidean as gs_euclidean
+import geomstats.geometry.grassmannian as gs_grassmannian
 import geomstats.geometry.hyperboloid as gs_hyperboloid
 import geomstats.geometry.hypersphere as gs_hypersphere
 import geomstats.geometry.nfold_manifold as gs_nfold
@@ -32,6 +33,7 @@ TOLERANCES = {
     "exact": (1e-14, "results of order one; at most 4e-15 seen, roundings of a distance near pi"),
     "hyperbolic": (4e-14, "times cosh(distance from the apex)^2, as for all coordinates there; at most 8e-15 seen"),
     "spd": (4e-14, "entries up to 20, and products of five such matrices; at most 1e-14 seen"),
+    "grassmann": (1e-13, "angles up to 81 degrees, whose tangents amplify; at most 3e-14 seen"),
     "oracle": (5e-14, "against geomstats, a few times its own roundings; at most 1e-14 seen"),
     "oracle_log": (1e-11, "against geomstats where its logarithm iterates, to 1e-13"),
     "ladder": (1e-6, "against two pole ladders of geomstats, extrapolated; at most 3e-7 seen"),
@@ -64,13 +66,17 @@ def close(a, b, name="exact", scale=1.0) -> bool:
     return largest(np.asarray(a) - np.asarray(b)) <= TOLERANCES[name][0] * scale
 
 
+OF_ONE_KIND = {"spd": "SPD", "grassmann": "Gr("}
+"""Tolerances of some spaces, by what their names contain."""
+
+
 def rounding(space, *points) -> tuple[str, float]:
     """Which tolerance holds in a space, and its scale for these points."""
     if "H^" in space.name:
         return "hyperbolic", max(largest(np.asarray(x)[..., 0]) for x in points) ** 2
     if space.name == "SL(2)":  # the condition number of such a matrix
         return "exact", max(largest(x) for x in points) ** 2
-    return ("spd", 1.0) if "SPD" in space.name else ("exact", 1.0)
+    return next((name, 1.0) for name in ("spd", "grassmann", "exact") if OF_ONE_KIND.get(name, "") in space.name)
 
 
 def spread(a, space):
@@ -96,6 +102,11 @@ def paired(space, alpha, v):
 def ambient(space, seed):
     real, imaginary = np.random.default_rng(seed).standard_normal((2, BATCH, *space.shape))
     return real + 1j * imaginary if space.dtype.kind == "c" else real
+
+
+def needs_geodesics(space):
+    if not space.geodesics:
+        pytest.skip(f"{space.name} has no geodesics in closed form")
 
 
 @pytest.fixture(scope="module", params=SPACES)
@@ -185,6 +196,7 @@ def test_exp_and_log(S, seed):
 @pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_parallel_transport(S, seed):
+    needs_geodesics(S)
     x = points(S, seed)
     u, w = unit(S, seed + 1, x), unit(S, seed + 2, x)
     for length in lengths(S):
@@ -205,6 +217,7 @@ def test_parallel_transport(S, seed):
 
 @given(seed=seeds)
 def test_midpoints(S, seed):
+    needs_geodesics(S)
     x = points(S, seed)
     for length in lengths(S)[1:]:
         v = length * unit(S, seed + 1, x)
@@ -244,6 +257,8 @@ TWINS = {
     "SE(3)": Twin(lambda: gs_se.SpecialEuclidean(3), scale=np.nan),
     "SPD(3)": Twin(lambda: gs_spd.SPDMatrices(3)),
     "St(4, 2)": Twin(_tight_stiefel, transport="ladder"),
+    "Gr(3, 1)": Twin(lambda: gs_grassmannian.Grassmannian(3, 1)),
+    "Gr(4, 2)": Twin(lambda: gs_grassmannian.Grassmannian(4, 2)),
     "(S^2)^4": Twin(lambda: gs_nfold.NFoldManifold(gs_hypersphere.Hypersphere(2), 4), transport="none"),
     "S^2 x R^3": Twin(
         lambda: gs_product.ProductManifold((gs_hypersphere.Hypersphere(2), gs_euclidean.Euclidean(3))),
@@ -260,6 +275,7 @@ WITHOUT_TWIN = {
     "SU(3)": "geomstats has no SU(n): compared with its totally geodesic subgroup SO(3) below",
     "Heisenberg(1)": "its exponential is that of the group, with a test suite of its own",
     "SL(2)": "likewise",
+    "level set": "geomstats has none of one's own: see test_level_set for a sphere as one",
 }
 
 
