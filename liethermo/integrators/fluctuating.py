@@ -23,6 +23,10 @@ MISFIT = 1e-10
 """Largest difference of ``B B^T`` from the friction matrix, relative to that."""
 
 
+AWAY = 20_241
+"""Seed of covectors in no special direction: another one than that of test points."""
+
+
 class Fluctuating(Wrapping):
     """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [:doc:`/explanation/fluctuations`].
 
@@ -183,6 +187,7 @@ def _moved(model: tuple[System, Energy], x):
     system, function = model
     assert system.dissipation is not None
     B, gradient = beside([B for _, B in factors_at(system.dissipation, system, x)]), function.gradient(x)
-    away = jnp.asarray(np.random.default_rng(0).standard_normal(gradient.shape))  # sees columns as large as any
-    size = jnp.max(jnp.abs(B.transposed(away))) * jnp.linalg.norm(gradient)
+    others = np.random.default_rng(AWAY).standard_normal((2, *gradient.shape))  # they see columns as large as any
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in jnp.asarray(others)]))
+    size = size * jnp.linalg.norm(gradient)
     return jnp.stack([jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size])
