@@ -52,7 +52,7 @@ def factors_at(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Diss
 def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
     """What the factors miss of what they are to be, at a state and relative to what cancels: the largest of each."""
     dH = system.energy.gradient(x)
-    away = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape[0]))
+    (away,) = elsewhere(x.shape[0], 1)
     found: dict[str, list[jax.Array]] = {SQUARE: [], KERNEL: [], DIVERGENCE: []}
     parts = factors_at(dissipation, system, x)
     for (part, B), (_, own) in zip(parts, _noisy(dissipation, dissipation.preserve), strict=True):
@@ -68,6 +68,11 @@ def residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Ar
             varies = jnp.max(jnp.abs(changes)) + size / (1.0 + jnp.linalg.norm(x))  # the former may be rounding alone
             found[DIVERGENCE].append(_relative(jnp.sum(changes, axis=0), varies))
     return {name: jnp.max(jnp.stack(values)) for name, values in found.items() if values}
+
+
+def elsewhere(n: int, number: int) -> jax.Array:
+    """Covectors in no special direction, shape (number, n): not those of the test points, which are drawn from 0 on."""
+    return jnp.asarray(np.random.default_rng(20_241).standard_normal((number, n)))
 
 
 def _noisy(dissipation: Dissipation, preserved: Sequence | None = None) -> list[tuple[Dissipation, tuple]]:

@@ -39,6 +39,25 @@ class Joined(Module):
         return self.function(z[:-1], z[-1])
 
 
+class Steady(Module):
+    """A function as one of an argument more, the last, which it does not depend on."""
+
+    function: Callable
+
+    def __call__(self, *arguments):
+        return self.function(*arguments[:-1])
+
+
+class Constant(Module):
+    """A value as a function of anything."""
+
+    value: jax.Array
+
+    def __call__(self, *arguments):
+        del arguments
+        return self.value
+
+
 class Minus(Module):
     """Minus a function of both."""
 

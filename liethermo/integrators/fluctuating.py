@@ -10,7 +10,7 @@ import numpy as np
 
 from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor, beside
-from ..dissipation.noise import SQUARE, divergence, factors, factors_at, residuals
+from ..dissipation.noise import SQUARE, divergence, elsewhere, factors, factors_at, residuals
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..systems import System
@@ -21,10 +21,6 @@ from .midpoint import MetriplecticMidpoint
 
 MISFIT = 1e-10
 """Largest difference of ``B B^T`` from the friction matrix, relative to that."""
-
-
-AWAY = 20_241
-"""Seed of covectors in no special direction: another one than that of test points."""
 
 
 class Fluctuating(Wrapping):
@@ -187,7 +183,7 @@ def _moved(model: tuple[System, Energy], x):
     system, function = model
     assert system.dissipation is not None
     B, gradient = beside([B for _, B in factors_at(system.dissipation, system, x)]), function.gradient(x)
-    others = np.random.default_rng(AWAY).standard_normal((2, *gradient.shape))  # they see columns as large as any
-    size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in jnp.asarray(others)]))
+    # they see columns as large as any
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in elsewhere(len(gradient), 2)]))
     size = size * jnp.linalg.norm(gradient)
     return jnp.stack([jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size])

@@ -129,19 +129,13 @@ class Course:
                 done += kept * every
                 yield h, kept, every, each or part.every is not None or done >= part.steps
 
-    def part_of(self, step: int) -> Timetable:
-        """The part that the step after so many belongs to."""
-        for part in self.parts[:-1]:
-            if step < part.steps:
-                return part
-            step -= part.steps
-        return self.parts[-1]
-
     def size(self, step: int) -> float:
-        """The size of the step after so many."""
-        part = self.part_of(step)
-        before = sum(other.steps for other in self.parts[: self.parts.index(part)])
-        return part.last if step - before >= part.full else part.h
+        """The size of the step after so many; of the last where there are no more."""
+        for part in self.parts:
+            if step < part.steps or part is self.parts[-1]:
+                break
+            step -= part.steps
+        return part.last if step >= part.full else part.h
 
     @property
     def longest(self) -> np.ndarray:

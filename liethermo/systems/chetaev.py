@@ -15,7 +15,7 @@ from manifolds._module import Module
 
 from ..dissipation.base import Law
 from ..errors import FunctionError, InputError
-from ..functions.arguments import needed_arguments
+from ..functions.arguments import Steady, needed_arguments
 from ..functions.checks import check_shape
 from ..tracing.interpret import at_points
 from .simple_closed import Forces, SimpleClosedSystem, in_one_array
@@ -101,10 +101,11 @@ class Form(Module):
         if not callable(eta):
             raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
         implicit, at = needed_arguments(eta) == 4, "(q, v, S, S')"
-        given = eta if implicit else _Explicit(eta)
+        given = eta if implicit else Steady(eta)
         shapes = (n,), (n,), (), ()
         try:
-            size = jax.eval_shape(given, *(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes)).shape
+            arguments = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
+            size = jax.eval_shape(lambda *a: jnp.asarray(given(*a)), *arguments).shape
         except (TypeError, ValueError, IndexError) as error:
             raise FunctionError(f"eta could not be evaluated at {at}: {type(error).__name__}: {error}") from error
         if size not in ((n,), (n + 1,)):
@@ -132,16 +133,6 @@ class Form(Module):
         """``eta_q / eta_S``, shape (n,), at the S' that goes with (q, v, S)."""
         found = self.function(q, v, S, self.rate(q, v, S) if self.implicit else jnp.zeros(()))
         return found[:-1] / found[-1]
-
-
-class _Explicit(Module):
-    """A function of (q, v, S) as one of (q, v, S, S')."""
-
-    function: Callable
-
-    def __call__(self, q, v, S, s):
-        del s
-        return jnp.asarray(self.function(q, v, S))
 
 
 class _Unit(Module):

@@ -14,7 +14,6 @@ from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
-from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, Function, as_energy
@@ -22,7 +21,7 @@ from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component
-from .ledger import BesideLedger, WithLedger, field
+from .ledger import BesideLedger, ForcesAndHeat, WithLedger, field
 
 
 class EulerPoincareClosedSystem(WithLedger):
@@ -196,18 +195,8 @@ class OnAlgebra(mf.PoissonStructure):
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
 
-class AlgebraForces(SkewFriction):
-    """Friction and the heat that it makes, external force and heat power, for discrete gradients too."""
-
-    friction: Callable | None
-    external: Callable | None
-    heat_power: Callable | None
-
-    @property
-    def entropy_law(self) -> Law | None:
-        if self.heat_power is not None:
-            return None
-        return "conserved" if self.friction is None else "nondecreasing"
+class AlgebraForces(ForcesAndHeat):
+    """Friction, external force and heat power, as they act on (xi, S), for discrete gradients too."""
 
     def force(self, system, x, dH, dS, dL):
         n = system.algebra.dim
@@ -216,8 +205,7 @@ class AlgebraForces(SkewFriction):
         xi = solve(W, dH[:n, None])[:, 0]  # the velocity and the temperature that the gradient stands for
         T = dH[n] - jnp.dot(by_S, xi)
         friction, push, power = (f(xi, S, t) for f in (system.friction_force, system.external_force, system.heating))
-        S_dot = (power - jnp.dot(friction, xi)) / jnp.where(T > 0.0, T, jnp.nan)
-        xi_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
+        xi_dot, S_dot = self.slopes(W, by_S, xi, T, friction, push, power)
         return jnp.concatenate([xi_dot, S_dot[None], system.entries(jnp.dot(push, xi), power)])
 
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds.matrices.linear import solve
 
-from ..functions.arguments import needed_arguments
+from ..dissipation.base import Law, SkewFriction
+from ..functions.arguments import Constant, Steady, needed_arguments
 from ..functions.checks import check_shape
 from ..functions.energy import Energy, Quadratic
 from .base import System
@@ -85,29 +86,32 @@ class BesideLedger(mf.PoissonStructure):
         return jnp.pad(self.inner.sharp(x[:-LEDGER], alpha[:-LEDGER]), (0, LEDGER))
 
 
+class ForcesAndHeat(SkewFriction):
+    """Friction and the heat that it makes, an external force and a heat power: what such a system is driven by."""
+
+    friction: Callable | None
+    external: Callable | None
+    heat_power: Callable | None
+
+    @property
+    def entropy_law(self) -> Law | None:
+        if self.heat_power is not None:
+            return None
+        return "conserved" if self.friction is None else "nondecreasing"
+
+    @staticmethod
+    def slopes(W, by_S, v, T, friction, push, power) -> tuple[jax.Array, jax.Array]:
+        """``v'`` and ``S'`` by them, where the momentum changes by ``W v' + by_S S'``; NaN unless T is positive."""
+        S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
+        return solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0], S_dot
+
+
 # -- functions of a state and the time --------------------------------------------------------------------------------
-
-
-class _Steady(Module):
-    """A function of a state as one of that and the time."""
-
-    function: Callable
-
-    def __call__(self, *arguments):
-        return self.function(*arguments[:-1])
-
-
-class _Constant(Module):
-    value: jax.Array
-
-    def __call__(self, *arguments):
-        del arguments
-        return self.value
 
 
 def timed(function: Callable, parts: int = 3) -> Callable:
     """A function of so many parts of a state, or of those and t, as one of those and t."""
-    return _Steady(function) if needed_arguments(function) == parts else function
+    return Steady(function) if needed_arguments(function) == parts else function
 
 
 def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str) -> Callable:
@@ -122,5 +126,5 @@ def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], 
     what, at : str
         For messages: what it is, and of what.
     """
-    found = timed(function, len(parts)) if callable(function) else _Constant(jnp.asarray(function, dtype=jnp.float64))
+    found = timed(function, len(parts)) if callable(function) else Constant(jnp.asarray(function, dtype=jnp.float64))
     return check_shape(found, (*parts, ()), shape, what, at)

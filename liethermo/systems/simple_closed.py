@@ -13,7 +13,6 @@ import manifolds as mf
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
-from ..dissipation.base import Law, SkewFriction
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.arguments import needed_arguments
@@ -22,25 +21,15 @@ from ..functions.energy import Energy
 from ..tracing.interpret import at_points
 from .evolution import entropy_component
 from .herglotz import OnVelocities
-from .ledger import BesideLedger, WithLedger, field
+from .ledger import BesideLedger, ForcesAndHeat, WithLedger, field
 
 
-class Forces(SkewFriction):
+class Forces(ForcesAndHeat):
     """Friction, external force and heat power, as they act on (q, v, S) [GBY 2.4].
 
     ``d/dt L_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the
     energy ``v . L_v - L - W - Q`` of system and surroundings is constant, for discrete gradients too.
     """
-
-    friction: Callable | None
-    external: Callable | None
-    heat_power: Callable | None
-
-    @property
-    def entropy_law(self) -> Law | None:
-        if self.heat_power is not None:
-            return None
-        return "conserved" if self.friction is None else "nondecreasing"
 
     def force(self, system, x, dH, dS, dL):
         n = system.degrees_of_freedom
@@ -51,8 +40,7 @@ class Forces(SkewFriction):
         T = dH[2 * n] - jnp.dot(by_S, v)
         friction, push = system.friction_at(q, v, S, t, T), system.external_force(q, v, S, t)
         power = system.heating(q, v, S, t)
-        S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
-        v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
+        v_dot, S_dot = self.slopes(W, by_S, v, T, friction, push, power)
         return jnp.concatenate([jnp.zeros(n), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
 
 

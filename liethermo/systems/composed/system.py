@@ -20,7 +20,7 @@ from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
 from ...dissipation.matter import MatterExchange, Process, conserved_numbers
 from ...errors import InputError
-from ...functions.arguments import needed_arguments
+from ...functions.arguments import Constant, Steady, needed_arguments
 from ...functions.checks import check_scalar
 from ...functions.edges import Edges, edges, parts
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
@@ -344,38 +344,24 @@ def _by_law(conductance, bodies: int) -> tuple[Any, tuple[Callable, ...]]:
     listed = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
     if not listed or not any(callable(edge[-1]) for edge in conductance):
         return conductance, ()
-    ordered = [edge if edge[0] < edge[1] else (edge[1], edge[0], _exchanged(edge[2])) for edge in conductance]
-    return [(i, j, 1.0) for i, j, _ in ordered], tuple(_as_law(k) for _, _, k in ordered)
+    laws = [(i, j, _as_law(k)) if i < j else (j, i, _Exchanged(_as_law(k))) for i, j, k in conductance]
+    return [(i, j, 1.0) for i, j, _ in laws], tuple(law for _, _, law in laws)
 
 
-def _exchanged(k):
-    return Exchanged(k) if callable(k) else k
+def _as_law(k) -> Callable:
+    """A law of (T_i, T_j), or a number, as one of (T_i, T_j, x)."""
+    if not callable(k):
+        return Constant(jnp.asarray(k, dtype=jnp.float64))
+    return k if needed_arguments(k) == 3 else Steady(k)
 
 
-class Exchanged(Module):
+class _Exchanged(Module):
     """A law of two bodies, told of them in the other order."""
 
     law: Callable
 
-    def __call__(self, T_i, T_j, *x):
-        return self.law(T_j, T_i, *x)
-
-
-class OfTemperatures(Module):
-    """A law of (T_i, T_j), or a number, as one of (T_i, T_j, x)."""
-
-    law: Any
-
     def __call__(self, T_i, T_j, x):
-        del x
-        return self.law(T_i, T_j) if callable(self.law) else self.law
-
-
-def _as_law(k) -> Callable:
-    inner = k.law if isinstance(k, Exchanged) else k
-    if callable(inner) and needed_arguments(inner) == 3:
-        return k
-    return OfTemperatures(k if callable(k) else jnp.asarray(k, dtype=jnp.float64))
+        return self.law(T_j, T_i, x)
 
 
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,9 @@ def eta(q, v, S):
     return jnp.append(turned - jnp.array([1.0 + v @ v, jnp.exp(q[1])]) * v, 2.0 + jnp.sin(S))
 
 
-SYSTEM = lt.ChetaevSystem(L, eta, 5, validate=False)
+@functools.cache
+def tangled():
+    return lt.ChetaevSystem(L, eta, 5, validate=False)
 
 
 def by_hand(t, y):
@@ -42,11 +46,11 @@ def by_hand(t, y):
 
 def test_the_equations_and_their_laws():
     points = np.random.default_rng(1).standard_normal((8, 5))
-    field = at_points(lambda system, x: system.vector_field(x), SYSTEM, points)
+    field = at_points(lambda system, x: system.vector_field(x), tangled(), points)
     expected = np.array([by_hand(0.0, x) for x in points])
     assert np.abs(field - expected).max() < 1e-12 * np.abs(expected).max()
-    assert (SYSTEM.energy_law, SYSTEM.entropy_law) == ("conserved", "nondecreasing")
-    assert SYSTEM.check(points).passed
+    assert (tangled().energy_law, tangled().entropy_law) == ("conserved", "nondecreasing")
+    assert tangled().check(points).passed
 
 
 def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
@@ -79,7 +83,7 @@ def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
 )
 def test_methods_and_their_orders(method, order):
     exact = solve_ivp(by_hand, (0.0, 2.0), X0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    runs = [lt.integrate(SYSTEM, X0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
+    runs = [lt.integrate(tangled(), X0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
     errors = [np.abs(run.x[-1] - exact).max() for run in runs]
     assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2, errors
     assert np.diff(runs[0].entropy).min() > 0.0
