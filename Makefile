@@ -23,7 +23,7 @@ help:
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
-	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes docs/reference/benchmarks.md"
+	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes docs/reference/benchmarks*.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for all locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
@@ -116,6 +116,6 @@ lock:
 	headed "a run of the library needs" < "$$folder/run" > requirements.lock
 
 clean:
-	rm -rf .venv build dist *.egg-info demo_output benchmarks/results docs/_build docs/gallery docs/generated docs/reference/generated
+	rm -rf .venv build dist *.egg-info demo_output docs/_build docs/gallery docs/generated docs/reference/generated
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""The driver: ``python -m benchmarks [names] [--quick] [--page FILE]``."""
+"""The driver: ``python -m benchmarks [names] [--quick | --kept] [--page FILE]``."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("names", nargs="*", metavar="name", help=f"all by default: {', '.join(NAMES)}")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; the figures mean nothing")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results")
-    parser.add_argument("--page", type=Path, help="write the results kept in the folder to this page, with its figure")
+    parser.add_argument("--kept", action="store_true", help="measure nothing: write the page from what is kept")
+    parser.add_argument("--page", type=Path, help="write this page, and that of every run, from what is kept")
     options = parser.parse_args(arguments)
     unknown = set(options.names) - set(NAMES)
     if unknown:
         parser.error(f"no measurement {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
     if options.quick and options.page:
         parser.error("quick results mean nothing on a page")
-    for name in options.names or NAMES:
+    for name in [] if options.kept else options.names or NAMES:
         print(f"-- {name}", flush=True)
         about = {"date": datetime.date.today().isoformat(), "load": load(), "machine": description()}
         start = time.perf_counter()

@@ -1,10 +1,14 @@
-"""The picture of the work-precision page."""
+"""The pictures of the pages of benchmarks."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import matplotlib
+
+from .front import Comparison
+
+WIN, LOSS = "#0072b2", "#d55e00"
 
 STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
 """Lines by what runs a method, whose colour is the same for all."""
@@ -31,6 +35,34 @@ def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
         axes.grid(True, which="major", linewidth=0.4, alpha=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, metadata={"Date": None})
+        plt.close(figure)
+
+
+def beside(themes: dict[str, list[Comparison]], path: Path) -> None:
+    """The ratio of times, a bar for each work, by theme: to the left of one this library is the faster."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = [(theme, c) for theme, found in themes.items() for c in found]
+    with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 8}):
+        figure, axes = plt.subplots(figsize=(8.0, 0.6 + 0.19 * len(rows)), layout="constrained")
+        for i, (_, c) in enumerate(rows):
+            axes.barh(i, c.ratio - 1.0, left=1.0, height=0.7, color=WIN if c.ratio < 1.0 else LOSS)
+        axes.set_yticks(range(len(rows)), [f"{c.work} · {c.peer.split(',')[0]}" for _, c in rows])
+        axes.set_xscale("log")
+        axes.axvline(1.0, color="black", linewidth=0.8)
+        axes.invert_yaxis()
+        ends = [i for i in range(1, len(rows)) if rows[i][0] != rows[i - 1][0]]
+        for end in ends:
+            axes.axhline(end - 0.5, color="black", linewidth=0.3, alpha=0.5)
+        axes.set_xlabel("time here / time there")
+        axes.grid(True, axis="x", which="major", linewidth=0.4, alpha=0.5)
+        axes.set_axisbelow(True)
+        axes.margins(y=0.01)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.tick_params(axis="y", length=0)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})
         plt.close(figure)

@@ -1,60 +1,98 @@
-"""The page of the documentation, from the results that are kept as JSON."""
+"""The two pages of the documentation, from the results that are kept as JSON: wins and losses, and every run."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
+from . import front
 from .measurements import NAMES
-from .report import Report, Target, targets_table
+from .report import Report, Table, Target, targets_table
 
-INTRODUCTION = """\
+RUNS = "benchmarks_runs"
+"""The name of the second page."""
+
+FIRST = """\
 # Benchmarks
 
-The library against hand-written C (`-O3 -march=native`), SciPy, diffrax and heyoka.py. Contestants take turns and the
-best time of each counts; ratios are between times of one run. Work in one thread is timed by the processor's clock, so
-that a busy machine does not count; where threads or processes are compared the wall's clock is used, and the load
-average below says how far to trust it. *Laws* compares the relative drift of the energy and the least increment of the
-entropy in a step, relative to its maximum, with the tolerances of the tests. `make bench` measures everything anew and
-writes this page; the programs are in `benchmarks/`."""
+How fast this library is beside other programs, and where it loses. Bars to the left of the line are wins.
+
+![Time of this library over the time of another program, work by work, on a logarithmic axis](benchmarks.svg)
+"""
+
+HOW = f"""\
+## How it was measured
+
+Contestants take turns, and the best time of each counts. Both times of a row come from one run on one machine. Work in
+one thread is timed by the clock of the processor; where threads or processes are compared, the clock on the wall is
+used. *Equal accuracy* means that the other program has the loosest tolerance with which it is at least as accurate.
+*Laws* compares the drift of the energy and the least increment of the entropy in a step with the tolerances of the
+tests. {{missed}}. {{{{doc}}}}`{RUNS}` has the machine, the targets and the figures of every run. `make bench` measures
+everything anew and writes both pages; the programs are in `benchmarks/`."""
+
+SECOND = """\
+# Benchmarks: every run
+
+The figures behind {doc}`benchmarks`: the machine, the targets, and each measurement with all of its rows. Contestants
+take turns, and the best time of each counts; ratios are between times of one run. The load average says how far to
+trust times by the clock on the wall. *Laws* compares the relative drift of the energy and the least increment of the
+entropy in a step, relative to its maximum, with the tolerances of the tests."""
 
 
 def write(results: Path, page: Path) -> None:
-    """Write the page from every result in the folder.
+    """Write both pages and their figures from every result in the folder; the second lies beside the first.
 
     Raises
     ------
     ValueError
-        If there is none, or they are of different machines.
+        If there is no result.
     """
     files = [file for name in NAMES if (file := results / f"{name}.json").is_file()]
     found = [result for file in files if not (result := json.loads(file.read_text()))["quick"]]
     if not found:
         raise ValueError(f"{results} holds no results; run the measurements first")
-    machines = [result["machine"] for result in found]
-    if any(machine != machines[0] for machine in machines):
-        raise ValueError("the results are of different machines or versions; run all measurements again")
     reports = {result["name"]: Report.from_dict(result["report"]) for result in found}
-    sections = [INTRODUCTION, _machine(found), _targets(reports)]
+    targets = [target for report in reports.values() for target in report.targets]
+    from .figures import beside, work_precision
+
+    beside(front.compare(reports), page.parent / "benchmarks.svg")
+    first, *themes = front.sections(reports)
+    _save(page, [FIRST + "\n" + first, *themes, HOW.format(missed=front.missed(targets))])
+
+    machines, differing = _machines(found)
+    parts = [SECOND, machines, _targets(targets)]
     for name, report in reports.items():
-        sections.append(report.markdown())
+        parts.append(report.markdown())
+        if name in differing:
+            parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:
-            from .figures import work_precision
-
-            figure = page.parent / f"{name}.svg"
-            work_precision(report.series, figure)
-            sections.append(f"![Time against error]({figure.name})")
-    page.write_text("\n\n".join(sections) + "\n")
+            work_precision(report.series, figure := page.parent / f"{name}.svg")
+            parts.append(f"![Time against error]({figure.name})")
+    _save(page.parent / f"{RUNS}.md", parts)
 
 
-def _machine(found: list[dict]) -> str:
+def _save(page: Path, parts: list[str]) -> None:
+    page.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n")
+
+
+def _machines(found: list[dict]) -> tuple[str, dict[str, str]]:
+    """The machine of most measurements, and by name how that of another measurement differs."""
+    counted = Counter(json.dumps(result["machine"]) for result in found)
+    usual = json.loads(counted.most_common(1)[0][0])
     dates = sorted({result["date"] for result in found})
-    rows = dict(found[0]["machine"])
-    rows["Measured"] = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
-    rows["Load average before each measurement"] = ", ".join(result["load"] for result in found)
-    return "## Machine\n\n| | |\n| --- | --- |\n" + "\n".join(f"| {name} | {text} |" for name, text in rows.items())
+    rows = [*usual.items(), ("Measured", " to ".join(dict.fromkeys([dates[0], dates[-1]])))]
+    rows.append(("Load average before each measurement", ", ".join(result["load"] for result in found)))
+    table = Table("", {"Part": "text", "Here": "text"}, [list(row) for row in rows])
+    others = {result["name"]: result["machine"] for result in found if result["machine"] != usual}
+    differing = {
+        name: "; ".join(f"{part} {text}" for part, text in machine.items() if usual.get(part) != text)
+        for name, machine in others.items()
+    }
+    return "## Machine" + table.markdown(), differing
 
 
-def _targets(reports: dict[str, Report]) -> str:
-    targets: list[Target] = [target for report in reports.values() for target in report.targets]
-    return "## Targets" + targets_table(targets).markdown()
+def _targets(targets: list[Target]) -> str:
+    """Those that are missed come first."""
+    order = sorted(targets, key=lambda target: target.verdict != "missed")
+    return "## Targets" + targets_table(order).markdown()

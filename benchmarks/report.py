@@ -24,11 +24,9 @@ class Table:
 
     def markdown(self) -> str:
         kinds = list(self.columns.values())
-        lines = [
-            " | ".join(self.columns),
-            " | ".join("---" if kind == "text" else "---:" for kind in kinds),
-            *(" | ".join(_text(a, kind) for a, kind in zip(row, kinds, strict=True)) for row in self.rows),
-        ]
+        cells = [[_text(a, kind) for a, kind in zip(row, kinds, strict=True)] for row in self.rows]
+        rule = ["---" if kind == "text" else "---:" for kind in kinds]
+        lines = [" | ".join(row) for row in (map(_in_cell, self.columns), rule, *(map(_in_cell, row) for row in cells))]
         return "\n".join([self.caption, "", *(f"| {line} |" for line in lines)])
 
 
@@ -113,6 +111,11 @@ def ratio(a: float | None, b: float | None) -> float | None:
     return None if a is None or b is None else a / b
 
 
+def _in_cell(text: str) -> str:
+    """Bars that belong to the text, not to the table."""
+    return text.replace("|", r"\|")
+
+
 def _seconds(s: float) -> str:
     for unit, size in ("s", 1.0), ("ms", 1e-3), ("µs", 1e-6):
         if s >= size:
@@ -124,6 +127,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {
     "text": str,
     "seconds": _seconds,
     "ratio": lambda a: f"{a:.3g} ×",
+    "about": lambda a: f"{a:.2g} ×",
     "number": lambda a: f"{a:.3g}",
     "count": lambda a: f"{a:,}",
     "error": lambda a: f"{a:.1e}",

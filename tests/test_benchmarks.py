@@ -6,23 +6,26 @@ import dataclasses
 import json
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import child, laws, native, page, reference, simulators
-from benchmarks.__main__ import main
+from benchmarks import child, front, laws, native, page, reference, simulators
+from benchmarks.__main__ import RESULTS, main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
 from benchmarks.measurements import memory, spin, tumbling, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
-from benchmarks.report import Target, UnavailableError
+from benchmarks.report import Report, Table, Target, UnavailableError
 from benchmarks.timing import race
 from liethermo import MetriplecticGauss
 from liethermo.engines.codes import Code
 from liethermo.engines.rules import RULES
+
+ROOT = Path(__file__).resolve().parent.parent
 
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
 
@@ -59,8 +62,37 @@ def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
     result["quick"] = False
     (tmp_path / "work_precision.json").write_text(json.dumps(result))
     page.write(tmp_path, tmp_path / "page.md")
-    assert "| midpoint, array engine | 500 steps |" in (tmp_path / "page.md").read_text()
+    assert "| midpoint, array engine | 500 steps |" in (tmp_path / "benchmarks_runs.md").read_text()
     assert (tmp_path / "work_precision.svg").read_text().count("SciPy DOP853") == 1
+
+
+PAGES = ROOT / "docs" / "reference"
+
+
+def test_both_pages_are_those_of_the_kept_results(tmp_path):
+    page.write(RESULTS, tmp_path / "benchmarks.md")
+    for name in ("benchmarks.md", "benchmarks_runs.md"):
+        assert (tmp_path / name).read_text() == (PAGES / name).read_text(), (
+            f"{name}: python -m benchmarks --kept --page"
+        )
+    first = (tmp_path / "benchmarks.md").read_text()
+    assert len(first.split()) <= 3500
+    assert first.index("![") < first.index("\n- **") < first.index("\n| ")  # the chart, the sentences, the tables
+
+
+def test_a_page_has_one_row_a_comparison_and_escapes_bars():
+    table = Table("", {"": "text", "| |s| - 1 |": "error", "Time": "seconds"}, [["a | b", 1e-16, 2e-6]])
+    lines = table.markdown().strip().splitlines()
+    assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines] == [4, 4, 4]
+    rows = [["ours", 2.0, "hold"], ["peer, slow", 9.0, "hold"], ["peer, quick", 1.0, "broken: energy"]]
+    report = Report("", "", [Table("", {"": "text", "Time": "seconds", "Laws": "text"}, rows)])
+    pair = front.Pair("some", 0, "work", "ours", "peer")
+    found = front._compared(report, pair)
+    assert found == front.Comparison("work", "peer, quick", 2.0, 1.0, "hold", "broken: energy")  # the fastest counts
+    (sentence, laws) = front.sentences([dataclasses.replace(found, peer="heyoka")])
+    assert "faster in 0 of 1 works" in sentence
+    assert "1 of 1 runs of this library and in 0 of theirs" in laws
+    assert front._compared(report, dataclasses.replace(pair, theirs="nobody")) is None
 
 
 def test_the_driver_refuses_unknown_names(capsys):

@@ -1,0 +1,205 @@
+"""The first page of the benchmarks: which rows of the measurements stand beside each other on it, theme by theme.
+
+A measurement that is to be on the page has a line in :data:`THEMES` or :data:`COSTS`; nothing else has to change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from .report import Report, Table, Target
+
+COMPILED, EXPLICIT = "compiled engine", "explicit, order 8, compiled engine"
+GAUSS = "this library, Gauss, order 6"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two rows of one table of a measurement.
+
+    Attributes
+    ----------
+    measurement, table : str, int
+        The name of the measurement, and which of its tables.
+    work : str
+        What both did.
+    ours, theirs : str
+        What the rows begin with. Of several rows of another program the fastest counts, unless ``which`` is given.
+    column : str, optional
+        The heading of the times; by default the first that begins with "Time".
+    which : int, optional
+        Which of several rows that begin alike, where they are of different settings.
+    """
+
+    measurement: str
+    table: int
+    work: str
+    ours: str
+    theirs: str
+    column: str = "Time"
+    which: int | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a pair was measured to be; a verdict on the laws is None where the table has none."""
+
+    work: str
+    peer: str
+    ours: float
+    theirs: float
+    our_laws: str | None
+    their_laws: str | None
+
+    @property
+    def ratio(self) -> float:
+        return self.ours / self.theirs
+
+
+def _at_accuracy(table: int, what: str) -> list[Pair]:
+    return [Pair("ensemble", table, what, COMPILED, peer) for peer in ("heyoka", "diffrax")]
+
+
+THEMES: dict[str, list[Pair]] = {
+    "The same scheme in C": [
+        Pair("single_body", 0, "midpoint, quadratic H and S", "compiled engine, plain functions", "C"),
+        Pair("single_body", 1, "a call of 1000 midpoint steps, every state kept", COMPILED, "C"),
+        Pair("general", 0, "midpoint, quartic H and logarithmic S", COMPILED, "C"),
+        *(Pair("variational", i, f"variational scheme {i + 1}", COMPILED, "C") for i in range(3)),
+        Pair("spin", 0, "midpoint, a spin on its sphere", COMPILED, "C"),
+        Pair("ensemble", 0, "10,000 bodies, 200 midpoint steps", COMPILED, "C with SIMD"),
+    ],
+    "One trajectory at equal accuracy": [
+        Pair("work_precision", 0, f"one body to an error of {error}", EXPLICIT, peer, f"≤ {error}")
+        for error in ("1e-05", "1e-09")
+        for peer in ("heyoka", "diffrax", "SciPy")
+    ],
+    "Many trajectories at equal accuracy": [
+        *_at_accuracy(3, "10,000 bodies to 1e-3"),
+        *_at_accuracy(4, "10,000 bodies to 1e-5"),
+        *_at_accuracy(5, "10,000 bodies to 1e-8"),
+        *_at_accuracy(6, "10,000 bodies to 1e-12"),
+        *(
+            Pair("ensemble", 2, "10,000 bodies, Gauss of order 6, to 3e-8", COMPILED, peer)
+            for peer in ("heyoka", "diffrax")
+        ),
+        Pair("others", 0, "10,000 states, quartic H, to 7e-14", COMPILED, "heyoka", which=2),
+        Pair("others", 1, "10,000 states of su(3) to 3e-13", COMPILED, "heyoka", which=2),
+        Pair("others", 2, "10,000 spins, each with a bath, to 7e-11", COMPILED, "heyoka", which=2),
+    ],
+    "Satellites": [
+        Pair(
+            "tumbling", table, f"{body}, 1000 s with attitude", "this library, Gauss, order 6", peer, "Time of the run"
+        )
+        for table, body in enumerate(("a free body", "a body with a damped wheel"))
+        for peer in ("SciPy DOP853", "MuJoCo, RK4", "Basilisk, RK4")
+    ],
+    "Large algebras and lattices": [
+        *(
+            Pair("fluids", 0, f"a fluid on the sphere, su({N})", "this library", "isospectral midpoint", which=i)
+            for i, N in enumerate((32, 64, 128, 256, 512))
+            if N in (32, 128, 512)
+        ),
+        Pair("lattice", 0, "10⁵ coupled spins, two cores", "array engine", "C, 2 threads"),
+    ],
+    "Manifolds": [],
+    "Quantum systems": [],
+    "Learning": [],
+}
+"""Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
+
+COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body")
+"""Measurements without another program: their targets that are no ratios are a table of their own."""
+
+NOTES = {"The same scheme in C": "That the energy drifts is in the nature of two of the variational schemes."}
+"""What a reader has to know before a table."""
+
+GROUPS = {
+    "C by hand, the same scheme": ("C",),
+    "heyoka": ("heyoka",),
+    "diffrax and SciPy": ("diffrax", "SciPy"),
+    "MuJoCo and Basilisk": ("MuJoCo", "Basilisk"),
+}
+"""Whom a sentence is about, and how the names of the rows begin."""
+
+
+def compare(reports: Mapping[str, Report]) -> dict[str, list[Comparison]]:
+    """By theme, the pairs of which both rows were measured."""
+    found = {theme: [_compared(reports[p.measurement], p) for p in pairs if p.measurement in reports]
+             for theme, pairs in THEMES.items()}  # fmt: skip
+    return {theme: kept for theme, pairs in found.items() if (kept := [pair for pair in pairs if pair is not None])}
+
+
+def _compared(report: Report, pair: Pair) -> Comparison | None:
+    if pair.table >= len(report.tables):
+        return None
+    table = report.tables[pair.table]
+    column = next(i for i, name in enumerate(table.columns) if name.startswith(pair.column))
+    laws = list(table.columns).index("Laws") if "Laws" in table.columns else None
+    rows = [_row(table, column, start, pair.which) for start in (pair.ours, pair.theirs)]
+    if None in rows or None in (times := [row[column] for row in rows if row]):
+        return None
+    said = [None if laws is None else row[laws] for row in rows if row]
+    return Comparison(pair.work, _name(rows[1] or []), *times, *said)
+
+
+def _row(table: Table, column: int, start: str, which: int | None) -> list | None:
+    """The row of this name, or else of those that begin so; the fastest of them or the one asked for."""
+    named = [row for row in table.rows if _name(row) == start]
+    named = named or [row for row in table.rows if _name(row).startswith(start)]
+    if which is not None:
+        return named[which] if which < len(named) else None
+    return min((row for row in named if row[column] is not None), key=lambda row: row[column], default=None)
+
+
+def _name(row: list) -> str:
+    return next((cell for cell in row if isinstance(cell, str)), "")
+
+
+def sections(reports: Mapping[str, Report]) -> Iterator[str]:
+    """The sentences, and a table for each theme."""
+    themes = compare(reports)
+    yield "\n".join(f"- {sentence}" for sentence in sentences([c for found in themes.values() for c in found]))
+    for theme, found in themes.items():
+        note = f"\n\n{NOTES[theme]}" if theme in NOTES else ""
+        yield f"## {theme}{note}" + _table(found).markdown()
+    targets = [t for name in COSTS if name in reports for t in reports[name].targets if t.kind != "ratio"]
+    if targets:
+        table = Table("", {"Work": "text", "Measured": "text"}, [target.row()[::2] for target in targets])
+        yield "## Other costs" + table.markdown()
+
+
+def _table(found: list[Comparison]) -> Table:
+    columns = {"Work": "text", "Beside": "text", "Here": "seconds", "There": "seconds", "Here / there": "about"}
+    rows = [[c.work, c.peer, c.ours, c.theirs, c.ratio] for c in found]
+    if any(c.our_laws for c in found):
+        columns |= {"Laws here": "text", "Laws there": "text"}
+        rows = [[*row, c.our_laws, c.their_laws] for row, c in zip(rows, found, strict=True)]
+    return Table("", columns, rows)
+
+
+def sentences(found: list[Comparison]) -> Iterator[str]:
+    """Wins and losses, a sentence for each group of peers and one for the laws."""
+    for name, starts in GROUPS.items():
+        ours = sorted((c for c in found if c.peer.startswith(starts)), key=lambda c: c.ratio)
+        if ours:
+            best, worst, won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
+            yield (
+                f"**{name}**: this library is faster in {won} of {len(ours)} works. It takes {best.ratio:.2g} times "
+                f"the other's time at best ({best.work}) and {worst.ratio:.2g} times at worst ({worst.work})."
+            )
+    judged = [c for c in found if c.our_laws is not None and not c.peer.startswith("C")]
+    if judged:
+        kept = sum(c.our_laws == "hold" for c in judged)
+        theirs = sum(c.their_laws == "hold" for c in judged)
+        yield (
+            f"**the laws**: beside programs that do not run the same scheme, the laws hold in {kept} of {len(judged)} "
+            f"runs of this library and in {theirs} of theirs."
+        )
+
+
+def missed(targets: list[Target]) -> str:
+    """How many targets there are, and how many are missed."""
+    count = sum(target.verdict == "missed" for target in targets)
+    return f"{count} of {len(targets)} targets are missed"
