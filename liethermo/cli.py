@@ -95,7 +95,7 @@ def run(
     system = plan.system()
     folder = _folder(spec, Path(spec.stem) if out is None else out)
     start, end = plan.run.t_span
-    typer.echo(plan.told)
+    typer.echo(plan.summary)
     file = folder / plan.outputs.netcdf
     solution = integrate(
         system,
@@ -138,7 +138,7 @@ def study(
     plan = read(spec, change or (), allow or ())
     store = Path(f"{spec.stem}.zarr") if out is None else out
     found = study_of(plan, store)
-    typer.echo(plan.told)
+    typer.echo(plan.summary)
     with _client(cluster, spec.resolve().parent) as client:
         reached = found.run(client)
     typer.echo(str(reached))

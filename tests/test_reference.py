@@ -76,6 +76,6 @@ def test_everything_public_is_described(package):
 
 def test_an_argument_that_nobody_tells_is_found():
     arguments, attributes = _told()
-    assert {"x", "system", "low"} <= arguments
+    assert {"x", "system", "compensation"} <= arguments
     assert {"dim", "order"} <= attributes
     assert "colour" not in arguments | attributes

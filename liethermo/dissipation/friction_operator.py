@@ -70,8 +70,8 @@ class FrictionOperator(Dissipation):
         K, dH = form_at(self.K, x), system.energy.gradient(x)
         dH = dH if system.space is None else system.lowered(x, system.raised(x, dH))
         size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
-        missed = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
-        return {KERNEL: missed / jnp.where(size > 0.0, size, 1.0)}
+        defect = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
+        return {KERNEL: defect / jnp.where(size > 0.0, size, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
         along = self._along(system, x, dH)

@@ -81,5 +81,5 @@ def _noisy(dissipation: Dissipation, preserved: Sequence | None = None) -> list[
     return [(part, own) for part, own in parts if not part.noiseless]
 
 
-def _relative(missed, size) -> jax.Array:
-    return jnp.max(jnp.abs(missed), initial=0.0) / jnp.where(size > 0.0, size, 1.0)
+def _relative(defect, size) -> jax.Array:
+    return jnp.max(jnp.abs(defect), initial=0.0) / jnp.where(size > 0.0, size, 1.0)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..integrators import OneStepMethod
+from ..integrators.fluctuating import driven_by
 from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
@@ -40,7 +41,7 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
     system, method, state, back = in_order(system, method, state, rules)
 
     def step(s: State) -> State:
-        own = method if noise is None else method.driven_by(noise[s.step - first])
+        own = method if noise is None else driven_by(method, noise[s.step - first])
         return take_step(system, own, s, h, rules)
 
     def one_save(index, carry: tuple[State, tuple]):

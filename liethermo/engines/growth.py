@@ -40,7 +40,7 @@ def stretch(system: System, x) -> jax.Array:
 @program
 def growing(system, method, x):
     """The matrix of the Jacobian in a Krylov space, shape (m, m): its eigenvalues lie near the outer ones [Arnoldi]."""
-    system, x = method.judged(system, x)
+    system, x = system.solved_for(x)
     stretched, n = _linearised(system, x), x.shape[0]
     m = min(n, KRYLOV)
 

@@ -20,11 +20,11 @@ def krylov(product: Callable, b: jax.Array, rules: Rules) -> jax.Array:
     """
 
     def goes_on(carry):
-        _, r, _, _, made = carry
-        return (made < rules.products) & (jnp.linalg.norm(r) > rules.forcing * size) | (made == 0)
+        _, r, _, _, number = carry
+        return (number < rules.products) & (jnp.linalg.norm(r) > rules.forcing * size) | (number == 0)
 
     def extended(carry):
-        x, r, directions, images, made = carry
+        x, r, directions, images, number = carry
         p, q = r, product(r)
         shares = jnp.tensordot(images, q, q.ndim)
         p, q = p - jnp.tensordot(shares, directions, 1), q - jnp.tensordot(shares, images, 1)
@@ -32,9 +32,9 @@ def krylov(product: Callable, b: jax.Array, rules: Rules) -> jax.Array:
         over = jnp.where(length > 0.0, 1.0 / jnp.where(length > 0.0, length, 1.0), 0.0)
         p, q = over * p, over * q
         along = jnp.vdot(q, r)
-        place = made % rules.kept
+        place = number % rules.kept
         directions, images = directions.at[place].set(p), images.at[place].set(q)
-        return x + along * p, r - along * q, directions, images, made + 1
+        return x + along * p, r - along * q, directions, images, number + 1
 
     size = jnp.linalg.norm(b)
     none = jnp.zeros((rules.kept, *b.shape))

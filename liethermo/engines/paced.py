@@ -280,4 +280,4 @@ class Guide:
             rates = np.array([rate_of(self.member(int(i)), self.method, x[j]) for j, i in enumerate(chosen)])
         longest = np.divide(reach(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
         paces.write("growth", chosen, rates)
-        paces.write("wish", chosen, np.minimum(paces.read("wish", chosen), longest))
+        paces.write("proposed", chosen, np.minimum(paces.read("proposed", chosen), longest))

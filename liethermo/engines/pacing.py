@@ -21,6 +21,7 @@ import numpy as np
 from manifolds._module import Module
 
 from ..integrators import OneStepMethod
+from ..integrators.base import event_shares
 from ..systems import System
 from ..tracing.programs import program
 from . import searching
@@ -110,9 +111,9 @@ class Pace(NamedTuple):
     stop: jax.Array  # when a step has to end next
     base: jax.Array  # when one had to last,
     since: jax.Array  # and the steps taken until then
-    wish: jax.Array  # size of the next step, unless it has to end somewhere
+    proposed: jax.Array  # size of the next step, unless it has to end somewhere
     taken: jax.Array  # size of the last one tried
-    fair: jax.Array  # the size with which the last one that counts would have had the allowed error; 0 before
+    optimal: jax.Array  # the size with which the last one that counts would have had the allowed error; 0 before
     tried: jax.Array
     rejected: jax.Array
     cause: jax.Array  # status of the last one tried
@@ -126,7 +127,7 @@ class Pace(NamedTuple):
 def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> Pace:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
     state, zero = first_state(system, method, x), jnp.zeros(())
-    own, at = method.judged(system, x)
+    own, at = system.solved_for(x)
     size = jnp.max(jnp.abs(at))
     unit = jnp.where(size > 0.0, size, 1.0)
     speed = jnp.max(jnp.abs(own.vector_field(at))) / unit
@@ -134,7 +135,7 @@ def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
     # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
     found = 0.5 * share ** (1.0 / method.order) / jnp.where(speed > 0.0, speed, 1.0)
     found = jnp.where((speed > 0.0) & (size > 0.0), jnp.minimum(length, found), 1e-3 * length)
-    wish = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
+    proposed = jnp.minimum(jnp.where(pacing.first > 0.0, pacing.first, found), pacing.largest)
     now = stretch(own, at) if pacing.adaptive else jnp.zeros((1, 1))
     pace = Pace(
         state=state,
@@ -142,9 +143,9 @@ def begun(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
         stop=zero + stop,
         base=zero + t,
         since=zero,
-        wish=wish,
+        proposed=proposed,
         taken=zero,
-        fair=zero,
+        optimal=zero,
         tried=zero,
         rejected=zero,
         cause=zero,
@@ -162,7 +163,7 @@ def shape_seen(system: System, method: OneStepMethod, pacing: Pacing) -> tuple[i
     if not pacing.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: stretch(*method.judged(system, x)), x).shape
+    return jax.eval_shape(lambda x: stretch(*system.solved_for(x)), x).shape
 
 
 def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
@@ -179,16 +180,18 @@ def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
     """The same for one that is no part of another: none ends just short of where one has to end."""
     if pacing.adaptive:
         left = pace.stop - pace.t
-        arrives = left <= pace.wish * (1 + 1e-12)
-        h = jnp.where(arrives, left, jnp.where(left < 2.0 * pace.wish, 0.5 * left, pace.wish))
+        arrives = left <= pace.proposed * (1 + 1e-12)
+        h = jnp.where(arrives, left, jnp.where(left < 2.0 * pace.proposed, 0.5 * left, pace.proposed))
         return h, jnp.where(arrives, pace.stop, pace.t + h)
     # as a timetable has them
     length, done = pace.stop - pace.base, pace.state.step - pace.since
-    full = jnp.floor(length / pace.wish * (1 + 1e-12))
-    last = pace.stop - (pace.base + full * pace.wish)
+    full = jnp.floor(length / pace.proposed * (1 + 1e-12))
+    last = pace.stop - (pace.base + full * pace.proposed)
     short = last > 1e-12 * length
     arrives = done + 1.0 >= jnp.where(short, full + 1.0, full)
-    return jnp.where(done < full, pace.wish, last), jnp.where(arrives, pace.stop, pace.base + (done + 1.0) * pace.wish)
+    return jnp.where(done < full, pace.proposed, last), jnp.where(
+        arrives, pace.stop, pace.base + (done + 1.0) * pace.proposed
+    )
 
 
 def attempted(
@@ -202,37 +205,37 @@ def attempted(
 def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h, reached, new: State) -> Pace:
     """The pace after an attempt: the step from it to the state ``new`` counts, or another is to be tried."""
     old, solved, cause = pace.state, new.status == Code.COMPLETED, 1.0 * new.status
-    good, wish, code = solved, pace.wish, new.status
-    speed, fair = pace.speed, pace.fair
+    good, proposed, code = solved, pace.proposed, new.status
+    speed, optimal = pace.speed, pace.optimal
     if pacing.adaptive:
-        here, there = (method.judged(system, x)[1] for x in (old.x, new.x))
+        here, there = (system.solved_for(x)[1] for x in (old.x, new.x))
         size = jnp.maximum(jnp.max(jnp.abs(here)), jnp.max(jnp.abs(there)))
         gone = jnp.max(jnp.abs(there - here)) / jnp.where(size > 0.0, size, 1.0)
         speed = jnp.maximum(speed, jnp.where(solved, gone / h, 0.0))
         part = h * speed  # of the time in which the state, at its fastest, changes by its size
         allowed = jnp.maximum(pacing.allowed(size) * jnp.minimum(part, 1.0), ROUNDED * size + RULES.vanished)
-        error = method.error(system, old.x, old.low, h, new.k) / allowed
+        error = method.error(system, old.x, old.compensation, h, new.k) / allowed
         error = jnp.where(solved, error, jnp.inf)
         good = error <= 1.0
         power = 1.0 / (method.order + jnp.where(part < 1.0, 0.0, 1.0))
-        fair = h * jnp.maximum(error, 1e-12) ** -power
-        longer = after_good(fair, pace.fair, h, wish, power, pacing.largest, method.explicit)
-        fair = jnp.where(h < CUT * wish, pace.fair, fair)
-        wish = jnp.where(good, longer, after_bad(error, h, power))
-        code = jnp.where(good | (wish >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
+        optimal = h * jnp.maximum(error, 1e-12) ** -power
+        longer = after_good(optimal, pace.optimal, h, proposed, power, pacing.largest, method.explicit)
+        optimal = jnp.where(h < CUT * proposed, pace.optimal, optimal)
+        proposed = jnp.where(good, longer, after_bad(error, h, power))
+        code = jnp.where(good | (proposed >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
     sight = Sight(
         good=good,
         ends=jnp.zeros((), dtype=bool),
         value=pace.value,
         reached=reached,
-        wish=wish,
+        proposed=proposed,
         code=code,
         rejected=1.0 * ~good,
         search=pace.search,
     )
     if pacing.watched is not None:
         sight = sighted(system, method, pacing, pace, h, new, sight)
-    good, ends, value, reached, wish, code, rejected, search = sight
+    good, ends, value, reached, proposed, code, rejected, search = sight
     goes_on = good & ~ends
 
     def kept(after, before):
@@ -247,9 +250,9 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         stop=pace.stop,
         base=pace.base,
         since=pace.since,
-        wish=wish,
+        proposed=proposed,
         taken=h,
-        fair=kept(fair, pace.fair),
+        optimal=kept(optimal, pace.optimal),
         tried=tried,
         rejected=pace.rejected + rejected,
         cause=cause,
@@ -261,7 +264,7 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
     )
     if not pacing.adaptive:
         return after
-    looked = held_back(method, after, stretch(*method.judged(system, new.x)))
+    looked = held_back(method, after, stretch(*system.solved_for(new.x)))
     after = jax.tree_util.tree_map(kept, looked, after)
     spent = (tried >= pacing.most) & (after.state.status == Code.COMPLETED)
     status = jnp.where(spent, Code.STEP_LIMIT, after.state.status).astype(old.status.dtype)
@@ -278,7 +281,7 @@ class Sight(NamedTuple):
     ends: jax.Array  # whether an event is there
     value: jax.Array  # of what is watched
     reached: jax.Array  # when it ends
-    wish: jax.Array  # size of the next
+    proposed: jax.Array  # size of the next
     code: jax.Array  # whether the run goes on, pauses or fails
     rejected: jax.Array  # 1 for an attempt in vain, or 0
     search: jax.Array
@@ -307,12 +310,12 @@ def sighted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h
     at_start = looking & solved & ~found & (narrower.share <= 4.0 * EPS)
     later = sight.reached > pace.t
     lost, ends = looking & ~solved, at_root | at_start
-    wish = jnp.where(cut, first * h, jnp.where(looking | begins, pace.wish, sight.wish))
+    proposed = jnp.where(cut, first * h, jnp.where(looking | begins, pace.proposed, sight.proposed))
     code = jnp.where(ends, CAUGHT, jnp.where(looking, Code.COMPLETED, sight.code))
     if pacing.adaptive:
-        wish = jnp.where(lost, UNSOLVED * search.whole, wish)
+        proposed = jnp.where(lost, UNSOLVED * search.whole, proposed)
         short = jnp.where(new.status == Code.COMPLETED, Code.NON_FINITE, Code.STEP_UNDERFLOW)
-        code = jnp.where(lost & (wish < pacing.shortest), short, code)
+        code = jnp.where(lost & (proposed < pacing.shortest), short, code)
     else:
         code = jnp.where(lost, jnp.where(new.status == Code.COMPLETED, Code.NON_FINITE, new.status), code)
     begun = jnp.stack(searching.begun(h, pace.value, value))
@@ -323,7 +326,7 @@ def sighted(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h
         ends=ends,
         value=jnp.where(jnp.isnan(value), jnp.inf * pace.value, value),
         reached=jnp.where(at_start, pace.t + narrower.share * search.whole, sight.reached),
-        wish=wish,
+        proposed=proposed,
         code=code,
         rejected=jnp.where(looking, 1.0 * lost, jnp.where(cut, 1.0, sight.rejected)),
         search=jnp.where(begins, begun, goes_on),
@@ -337,17 +340,18 @@ def changes(pacing: Pacing, before, after) -> jax.Array:
 
 
 def first_change(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, d, end):
-    """The first share of a step, among the method's looks, with another sign; and whether a later one undoes that.
+    """The first share of a step, among `event_shares`, with another sign; and whether a later one undoes that.
 
     An end at which what is watched is not a number does so too.
     """
 
     def value(weights) -> jax.Array:
-        return pacing.watch(system, method.along(system, pace.state.x, weights @ d))
+        return pacing.watch(system, method.displaced(system, pace.state.x, weights @ d))
 
     share, changed, undone = jnp.ones(()), jnp.zeros((), dtype=bool), jnp.zeros((), dtype=bool)
-    seen = jax.vmap(value)(jnp.asarray(method.weights(method.looks))) if len(method.looks) else ()
-    for theta, there in zip([*method.looks, 1.0], [*seen, end], strict=True):
+    shares = event_shares(method.order)
+    seen = jax.vmap(value)(jnp.asarray(method.weights(shares))) if len(shares) else ()
+    for theta, there in zip([*shares, 1.0], [*seen, end], strict=True):
         other = pace.value * there < 0.0
         undone = undone | (changed & (pace.value * there > 0.0))
         share = jnp.where(other & ~changed, theta, share)
@@ -358,19 +362,19 @@ def first_change(system: System, method: OneStepMethod, pacing: Pacing, pace: Pa
 # -- the size of the next step ----------------------------------------------------------------------------------------
 
 
-def after_good(fair, before, h, wish, power, largest, explicit: bool) -> jax.Array:
-    """The size of the next step, after one of size h that would have had the allowed error with the size ``fair``.
+def after_good(optimal, before, h, proposed, power, largest, explicit: bool) -> jax.Array:
+    """The size of the next step, after one of size h that would have had the allowed error with the size ``optimal``.
 
-    Where the fair size shrinks, from ``before``, it is taken to go on as it does [Gustafsson; Hairer & Wanner 1996,
+    Where the optimal size shrinks, from ``before``, it is taken to go on as it does [Gustafsson; Hairer & Wanner 1996,
     IV.8]. The size of an implicit method's steps is kept where the change would be small. A step that is cut short to
     end somewhere says little about the next.
     """
     most = EXPLICIT_GROWTH if explicit else GROWTH
-    trend = jnp.where(fair < before, fair / jnp.where(before > 0.0, before, 1.0), 1.0)
-    factor = jnp.clip(AIM**power * fair / h * trend, SHRINKAGE, most)
-    proposed = jnp.minimum(h * factor, largest)
+    trend = jnp.where(optimal < before, optimal / jnp.where(before > 0.0, before, 1.0), 1.0)
+    factor = jnp.clip(AIM**power * optimal / h * trend, SHRINKAGE, most)
+    longer = jnp.minimum(h * factor, largest)
     same = (DEADBAND[0] < factor) & (factor < DEADBAND[1]) & (not explicit)
-    return jnp.where(h < CUT * wish, jnp.maximum(wish, proposed), jnp.where(same, wish, proposed))
+    return jnp.where(h < CUT * proposed, jnp.maximum(proposed, longer), jnp.where(same, proposed, longer))
 
 
 def after_bad(error, h, power) -> jax.Array:
@@ -400,14 +404,14 @@ def held_back(method: OneStepMethod, pace: Pace, now) -> Pace:
 
     ``now`` is how the motion stretches what lies near, as :func:`.growth.stretch` finds it.
     """
-    short = ~((reach(method) < size_of(now) * pace.wish) & jnp.isfinite(size_of(now)))
+    short = ~((reach(method) < size_of(now) * pace.proposed) & jnp.isfinite(size_of(now)))
     same = norm(now - pace.seen) <= CHANGED * norm(pace.seen)
     limit = jnp.where(pace.growth > 0.0, reach(method) / jnp.where(pace.growth > 0.0, pace.growth, 1.0), jnp.inf)
     unknown = ~short & ~same
     paused = jnp.where(unknown & (pace.state.status == Code.COMPLETED), LOOKING, pace.state.status)
     return pace._replace(
         state=pace.state._replace(status=paused.astype(pace.state.status.dtype)),
-        wish=jnp.where(short | unknown, pace.wish, jnp.minimum(pace.wish, limit)),
+        proposed=jnp.where(short | unknown, pace.proposed, jnp.minimum(pace.proposed, limit)),
         seen=jnp.where(unknown, now, pace.seen),
         growth=jnp.where(unknown, jnp.nan, pace.growth),
     )
@@ -453,12 +457,12 @@ def follow(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, mo
 
 def followed(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules) -> Pace:
     def goes_on(carry):
-        pace, made = carry
-        return (pace.state.status == Code.COMPLETED) & (made < most)
+        pace, attempts = carry
+        return (pace.state.status == Code.COMPLETED) & (attempts < most)
 
     def again(carry):
-        pace, made = carry
-        return attempted(system, method, pacing, pace, rules), made + 1
+        pace, attempts = carry
+        return attempted(system, method, pacing, pace, rules), attempts + 1
 
     return jax.lax.while_loop(goes_on, again, (pace, jnp.zeros((), dtype=jnp.int64)))[0]
 

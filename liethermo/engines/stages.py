@@ -20,6 +20,7 @@ from manifolds.matrices.linear import inverse
 
 from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
+from ..integrators.explicit import defect
 from ..systems import System
 from .krylov import krylov
 from .rules import RULES, Rules
@@ -59,7 +60,7 @@ class Iteration(NamedTuple):
     best: jax.Array
     stalled: jax.Array  # iterations in a row that did not shrink the update
     previous: jax.Array  # update that the last one is compared with; over it, it is the rate of contraction
-    made: jax.Array  # iterations so far
+    iterations: jax.Array  # iterations so far
 
     @classmethod
     def begin(cls, k) -> Iteration:
@@ -71,10 +72,10 @@ class Iteration(NamedTuple):
         previous = self.update
         if k.shape[-1] > rules.large:  # the rate is a geometric mean
             mean = jnp.sqrt(update) * jnp.sqrt(self.previous)
-            previous = jnp.where(self.made > 1, mean, previous)
+            previous = jnp.where(self.iterations > 1, mean, previous)
         stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
         best = jnp.where(update < self.best, update, self.best)
-        return Iteration(k, update, best, stalled, previous, self.made + 1)
+        return Iteration(k, update, best, stalled, previous, self.iterations + 1)
 
     def slower(self, rate: float) -> jax.Array:
         """Whether updates shrink by less than a rate of contraction."""
@@ -92,10 +93,10 @@ class Iteration(NamedTuple):
 
     def stands(self, scale, rules: Rules) -> tuple[jax.Array, jax.Array]:
         """How a fixed-point iteration that has begun stands: whether it has converged, and whether to go on."""
-        slow = (self.made >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * scale)
+        slow = (self.iterations >= 3) & self.slower(rules.slow) & (self.best > rules.plateau * scale)
         finite = jnp.isfinite(self.update)
         settled = self.settled(scale, rules)
-        return settled & finite, ~settled & ~slow & finite & (self.made < rules.fixed_point)
+        return settled & finite, ~settled & ~slow & finite & (self.iterations < rules.fixed_point)
 
 
 def fixed_point(equations: Equations, rules: Rules = RULES) -> Solved:
@@ -107,12 +108,14 @@ def fixed_point(equations: Equations, rules: Rules = RULES) -> Solved:
 
     begin = Iteration.begin(equations.guess), jnp.asarray(False), jnp.asarray(True)
     s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, begin)
-    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, s.made, jnp.zeros_like(s.made), jnp.zeros(()))
+    return Solved(
+        s.k, converged, jnp.isfinite(s.update), s.update, s.iterations, jnp.zeros_like(s.iterations), jnp.zeros(())
+    )
 
 
 def noise_of(system: System, method: OneStepMethod, x, rules: Rules = RULES) -> jax.Array:
     """The size at which the motion from a state is rounded, as a whole."""
-    system, x = method.judged(system, x)
+    system, x = system.solved_for(x)
     return rules.size(x.size)(with_rounding(system.vector_field, x)[1])
 
 
@@ -133,7 +136,7 @@ def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -
         return slopes(k) - k
 
     def lost(s: Iteration, damped):
-        return (s.made >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
+        return (s.iterations >= jnp.where(damped, 2, 1) * rules.newton) | ~jnp.isfinite(jnp.sum(s.k))
 
     def unsolved(s: Iteration, found):
         return jnp.logical_not(done) & ~s.settled(scale(s.k), rules, measure(found), size)
@@ -156,9 +159,9 @@ def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -
     def newton(carry):
         s, found, damped = carry
         again = lost(s, damped)
-        restart = Iteration.begin(start)._replace(made=s.made), start_misfit
+        restart = Iteration.begin(start)._replace(iterations=s.iterations), start_misfit
         s, found = jax.tree_util.tree_map(lambda a, b: jnp.where(again, a, b), restart, (s, found))
-        damped, step_from, before = damped | again, inverted(s.k), s.made
+        damped, step_from, before = damped | again, inverted(s.k), s.iterations
 
         def reuse(carry):
             inner, found, _ = carry
@@ -166,14 +169,14 @@ def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -
                 inner.k, step_from(found), jnp.linalg.norm(found), rules.plateau * scale(inner.k), damped
             )
             inner = inner.after(k, rules)
-            return inner, found, jnp.where(whole, inner.made - before, rules.reuse)
+            return inner, found, jnp.where(whole, inner.iterations - before, rules.reuse)
 
         def goes_on(carry):
             inner, found, used = carry
             fresh = (used == 0) | ((used < rules.reuse) & ~inner.slower(rules.stale))
             return fresh & unsolved(inner, found) & ~lost(inner, damped)
 
-        s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.made)))
+        s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.iterations)))
         return s, found, damped
 
     def to_do(carry):
@@ -184,7 +187,7 @@ def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -
     s, found, _ = jax.lax.while_loop(to_do, newton, (Iteration.begin(start), start_misfit, jnp.asarray(False)))
     converged = ~unsolved(s, found) & jnp.isfinite(jnp.sum(s.k))
     size = jnp.where(s.settled(scale(s.k), rules), 0.0, size)
-    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, iterations, s.made, size)
+    return Solved(s.k, converged, jnp.isfinite(s.update), s.update, iterations, s.iterations, size)
 
 
 def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -197,10 +200,10 @@ def better_start(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Arr
     def tried(carry):
         tries, k, found, size = carry
         start = jnp.where(tries == 0, rest, guess)
-        missed = misfit(start)
-        new = jnp.linalg.norm(missed)
+        defect = misfit(start)
+        new = jnp.linalg.norm(defect)
         better = (tries == 0) | (new <= size)
-        return tries + 1, *(jnp.where(better, a, b) for a, b in ((start, k), (missed, found), (new, size)))
+        return tries + 1, *(jnp.where(better, a, b) for a, b in ((start, k), (defect, found), (new, size)))
 
     # a loop, so that programs hold the equations once
     return jax.lax.while_loop(lambda carry: carry[0] < 2, tried, (none, rest, rest, jnp.zeros(())))[1:3]
@@ -226,37 +229,37 @@ batching.primitive_batchers[_inverse] = _inverses
 mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results=False))
 
 
-def explicit(system: System, method: OneStepMethod, x, low, h, k, rules: Rules = RULES) -> Solved:
+def explicit(system: System, method: OneStepMethod, x, compensation, h, k, rules: Rules = RULES) -> Solved:
     """The slopes of an explicit method, which there is nothing to solve for."""
-    k = method.slopes(system, x, low, h, k)
-    missed, none = method.missed(system, x, low, h, k), jnp.zeros((), dtype=jnp.int64)
-    x = method.judged(system, x)[1]
-    missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(missed))  # it is the length of a vector
+    k = method.slopes(system, x, compensation, h, k)
+    x, none = system.solved_for(x)[1], jnp.zeros((), dtype=jnp.int64)
+    missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(defect(k)))  # it is the length of a vector
     converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
 
 
 def newton_steps(
-    system: System, method: OneStepMethod, x, low, h, rules: Rules = RULES, columns: Callable | None = None
+    system: System, method: OneStepMethod, x, compensation, h, rules: Rules = RULES, columns: Callable | None = None
 ) -> Callable:
     """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there.
 
-    ``columns``, of a linear function and vectors, makes the columns of a Jacobian matrix that the method leaves to
-    others; by default it is the method's own.
+    ``columns``, of a function and vectors, makes the columns of the Jacobian matrix; without it there is none of large
+    systems.
     """
 
     def linearised(k) -> Callable:
-        if columns is None and k.shape[-1] <= rules.large:
-            matrix = method.jacobian(system, x, low, h, k)
-        else:
-            product = jax.linearize(lambda d: method.change(system, x, low, h, k, d), jnp.zeros_like(k))[1]
-            if columns is None:
-                return lambda found: krylov(product, found, rules)
-            matrix = columns(lambda d: product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)).T
+        product = method.linearised(system, x, compensation, h, k)
+        if columns is None and k.shape[-1] > rules.large:
+            return lambda found: krylov(product, found, rules)
+        matrix = (columns or _side_by_side)(lambda d: product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)).T
         inverse = _inverse.bind(matrix)
         return lambda found: (inverse @ found.ravel()).reshape(k.shape)
 
     return linearised
+
+
+def _side_by_side(function: Callable, vectors) -> jax.Array:
+    return jax.vmap(function)(vectors)
 
 
 def scale_of(x, h, k, rules: Rules = RULES):

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from ..integrators import OneStepMethod
+from ..integrators.base import orderless, pulled
+from ..integrators.explicit import LEVELS
 from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
@@ -20,7 +22,7 @@ class State(NamedTuple):
     """Everything a run carries from step to step."""
 
     x: jax.Array
-    low: jax.Array  # what rounding has kept from x so far (compensated summation)
+    compensation: jax.Array  # what rounding has kept from x so far (compensated summation)
     k: jax.Array
     before: jax.Array  # the slopes of the step before the last; none of an explicit method, which guesses nothing
     energy: jax.Array
@@ -45,7 +47,7 @@ class State(NamedTuple):
     entropy_sensitivity: jax.Array
 
 
-TELLING = tuple(name for name in State._fields if name not in ("low", "k", "before", "steering"))
+TELLING = tuple(name for name in State._fields if name not in ("compensation", "k", "before", "steering"))
 """The fields that tell of a run: those that the next step alone needs are left out."""
 
 
@@ -57,7 +59,7 @@ def first_state(system: System, method: OneStepMethod, x) -> State:
     zero, count = jnp.zeros(()), jnp.zeros((), dtype=jnp.int64)
     return State(
         x=x,
-        low=jnp.zeros_like(x),
+        compensation=jnp.zeros_like(x),
         k=k,
         before=_of_guesses(method, k),
         energy=energy,
@@ -92,14 +94,16 @@ def in_order(
     system: System, method: OneStepMethod, state: State, rules: Rules = RULES
 ) -> tuple[System, OneStepMethod, State, Callable[[State], State]]:
     """The three with large states in the order of components in which steps are fastest, and what takes states back."""
-    found = system.arranged() if method.orderless and state.x.size > rules.large else None
+    found = system.arranged() if orderless(method) and state.x.size > rules.large else None
     if found is None:
         return system, method, state, lambda state: state
 
-    def turned(s: State, change: Callable) -> State:
-        return s._replace(x=change(s.x), low=change(s.low), k=method.turned(s.k, change), before=change(s.before))
+    def changed(s: State, change: Callable) -> State:
+        k = change(s.k)
+        k = k.at[LEVELS].set(s.k[LEVELS]) if method.explicit else k  # which are values of functions
+        return s._replace(x=change(s.x), compensation=change(s.compensation), k=k, before=change(s.before))
 
-    return found.system, method.pulled(found), turned(state, found.there), lambda s: turned(s, found.back)
+    return found.system, pulled(method, found), changed(state, found.there), lambda s: changed(s, found.back)
 
 
 def take_step(
@@ -107,11 +111,11 @@ def take_step(
 ) -> State:
     """One step; where it fails the state is left as it was, with a status.
 
-    ``second(first, x, low, h, k, before)`` is asked in place of Newton's method, with what the first attempt on the
-    equations has come to, by an engine that has it elsewhere.
+    ``second(first, x, compensation, h, k, before)`` is asked in place of Newton's method, with what the first attempt
+    on the equations has come to, by an engine that has it elsewhere.
     """
     system, method, state, back = in_order(system, method, state, rules)
-    given = state.x, state.low, h, state.k, state.before
+    given = state.x, state.compensation, h, state.k, state.before
     if method.explicit:
         solved = explicit(system, method, *given[:4], rules)
     elif second is None:
@@ -122,32 +126,40 @@ def take_step(
 
 
 def equations(
-    system: System, method: OneStepMethod, x, low, h, k, before, rules: Rules = RULES, columns: Callable | None = None
+    system: System,
+    method: OneStepMethod,
+    x,
+    compensation,
+    h,
+    k,
+    before,
+    rules: Rules = RULES,
+    columns: Callable | None = None,
 ) -> Equations:
     """What a step from a state has to solve, with a guess from the slopes of the steps before."""
-    own = method.judged(system, x)[1]
+    own = system.solved_for(x)[1]
     measure = rules.size(own.size)
     whole = measure(own) / h  # once a step
     return Equations(
-        slopes=lambda k: method.slopes(system, x, low, h, k),
+        slopes=lambda k: method.slopes(system, x, compensation, h, k),
         guess=method.predict(k, before),
         scale=lambda k: whole + measure(k) + rules.vanished,
-        inverted=newton_steps(system, method, x, low, h, rules, columns),
+        inverted=newton_steps(system, method, x, compensation, h, rules, columns),
         noise=lambda: noise_of(system, method, x, rules),
     )
 
 
 def conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved, rules: Rules = RULES) -> State:
     """The state after a step whose equations are solved, or as it was, with a status, where they are not."""
-    x, low = state.x, state.low
-    new, new_low, energy, entropy, check, *sizes = finish(system, method, x, low, h, solved.k)
+    x, compensation = state.x, state.compensation
+    new, new_compensation, energy, entropy, check, *sizes = finish(system, method, x, compensation, h, solved.k)
     pending = state.steering
     if holds_energy(system, method):  # by what the last step left: so no step waits for its own
-        new_low = shifted(system, new, new_low, pending)
-        pending = steering(system, new, new_low, energy, state.first_energy)
+        new_compensation = shifted(system, new, new_compensation, pending)
+        pending = steering(system, new, new_compensation, energy, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
-    own = method.judged(system, x)[1]
+    own = system.solved_for(x)[1]
     size = jnp.maximum(rules.size(own.size)(own), h * solved.noise)
     residual = h * solved.residual / jnp.where(size > 0.0, size, 1.0)
     iterations = solved.fixed_point + solved.newton
@@ -155,7 +167,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
 
     new_state = State(
         x=new,
-        low=new_low,
+        compensation=new_compensation,
         k=solved.k,
         before=_of_guesses(method, state.k),
         energy=energy,
@@ -183,24 +195,24 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
 
 
-def error_of_step(system: System, method: OneStepMethod, x, low, h, k):
+def error_of_step(system: System, method: OneStepMethod, x, compensation, h, k):
     """The method's estimate of its local error, a number; for both engines."""
-    return _error(system, method, jnp.asarray(x), jnp.asarray(low), jnp.asarray(h), jnp.asarray(k))
+    return _error(system, method, jnp.asarray(x), jnp.asarray(compensation), jnp.asarray(h), jnp.asarray(k))
 
 
 @program
-def _error(system, method, x, low, h, k):
-    return method.error(system, x, low, h, k)
+def _error(system, method, x, compensation, h, k):
+    return method.error(system, x, compensation, h, k)
 
 
-def finish(system: System, method: OneStepMethod, x, low, h, k):
+def finish(system: System, method: OneStepMethod, x, compensation, h, k):
     """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are.
 
     And the sizes at which energy and entropy are rounded there.
     """
-    new, new_low = method.move(system, x, low, h, k)
+    new, new_compensation = method.move(system, x, compensation, h, k)
     energy, entropy = values(system, new)
-    return new, new_low, energy, entropy, jnp.sum(new) + energy + entropy, *sensitivities(system, new)
+    return new, new_compensation, energy, entropy, jnp.sum(new) + energy + entropy, *sensitivities(system, new)
 
 
 def holds_energy(system: System, method: OneStepMethod) -> bool:
@@ -208,7 +220,7 @@ def holds_energy(system: System, method: OneStepMethod) -> bool:
     return system.energy_law == "conserved" and "energy" in method.preserves
 
 
-def steering(system: System, x, low, energy, first_energy) -> jax.Array:
+def steering(system: System, x, compensation, energy, first_energy) -> jax.Array:
     """How far along the gradient of the energy a state is to be shifted back: by ``eps |x| / 4`` at most.
 
     Each step is exact but for a few roundings, whose sum walks at random: by 1e-13 in 1e6 steps for a general energy.
@@ -217,7 +229,7 @@ def steering(system: System, x, low, energy, first_energy) -> jax.Array:
     of it is taken back.
     """
     gradient = system.energy.gradient(x)
-    error = (energy - first_energy) + jnp.dot(gradient, low)
+    error = (energy - first_energy) + jnp.dot(gradient, compensation)
     value, size = jnp.abs(first_energy), system.energy.sensitivity(x)
     most = EPS * jnp.maximum(0.25 * size, value - RULES.constant * size)
     amount = jnp.where(jnp.abs(error) > RULES.steered * jnp.maximum(value, size), error, 0.0)
@@ -225,9 +237,9 @@ def steering(system: System, x, low, energy, first_energy) -> jax.Array:
     return jnp.clip(amount, -most, most) / jnp.where(square > 0.0, square, 1.0)
 
 
-def shifted(system: System, x, low, amount) -> jax.Array:
-    """``low`` of a state that is shifted back along the gradient of the energy."""
-    return low - amount * system.raised(x, system.energy.gradient(x))
+def shifted(system: System, x, compensation, amount) -> jax.Array:
+    """``compensation`` of a state that is shifted back along the gradient of the energy."""
+    return compensation - amount * system.raised(x, system.energy.gradient(x))
 
 
 def values(system: System, x) -> tuple[jax.Array, jax.Array]:

@@ -84,22 +84,28 @@ class Each(Energy):
             jax.vmap(lambda y, *a: self._at(a).gradient(y))(self._gathered(x), *self.parameters), x.shape[0]
         )
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         def one(y, step, kept, *a):
             return self._at(a).discrete_gradient(scheme, y, step, kept)
 
-        y, step, kept = map(self._gathered, (x, d, jnp.zeros_like(x) + low))
+        y, step, kept = map(self._gathered, (x, d, jnp.zeros_like(x) + compensation))
         return self._spread(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def one(start, low, step, points, slopes, further, symmetries, *a):
+        def one(start, compensation, step, points, slopes, further, symmetries, *a):
             mine = path._replace(
-                start=start, low=low, step=step, points=points, slopes=slopes, further=further, symmetries=symmetries
+                start=start,
+                compensation=compensation,
+                step=step,
+                points=points,
+                slopes=slopes,
+                further=further,
+                symmetries=symmetries,
             )
             return self._at(a).stage_gradients(scheme, mine)
 
         n = path.start.shape[0]
-        ends = map(self._gathered, (path.start, jnp.zeros_like(path.start) + path.low, path.step))
+        ends = map(self._gathered, (path.start, jnp.zeros_like(path.start) + path.compensation, path.step))
         stages = map(self._gathered, (path.points, path.slopes))
         further = None if path.further is None else tuple(map(self._gathered, path.further))
         symmetries = None if path.symmetries is None else self._gathered(path.symmetries)

@@ -75,9 +75,13 @@ class Energy(Module):
         """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
         return False
 
-    def discrete_gradient(self, scheme: Scheme, x, d, low) -> jax.Array:
-        """The discrete gradient of one term by a scheme, shape (n,), from x + low to x + low + d."""
-        return scheme.quadratic(self, x, d, low) if self.is_quadratic else scheme.general(self, x, d, low)
+    def discrete_gradient(self, scheme: Scheme, x, d, compensation) -> jax.Array:
+        """The discrete gradient of one term by a scheme, shape (n,), from x + compensation to x + compensation + d."""
+        return (
+            scheme.quadratic(self, x, d, compensation)
+            if self.is_quadratic
+            else scheme.general(self, x, d, compensation)
+        )
 
     def stage_gradients(self, scheme: Callable, path: Path) -> jax.Array:
         """Those of one term at the stages of a collocation method, shape (s, n)."""
@@ -274,11 +278,11 @@ class WithTime(Energy):
     def value(self, x) -> jax.Array:
         return self.energy.value(x)
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         if self.is_quadratic:
-            return scheme.quadratic(self, x, d, low)
-        low = jnp.zeros_like(x) + low
-        ends = jnp.stack([x + low, x + (low + d)])
+            return scheme.quadratic(self, x, d, compensation)
+        compensation = jnp.zeros_like(x) + compensation
+        ends = jnp.stack([x + compensation, x + (compensation + d)])
 
         def mean(states, times):
             values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
@@ -290,8 +294,8 @@ class WithTime(Energy):
         def of_time(t):
             return mean(ends[:, :-1], jnp.concatenate([t, t]))
 
-        by_state = scheme.general(Function(of_state), x[:-1], d[:-1], low[:-1])
-        return jnp.concatenate([by_state, scheme.general(Function(of_time), x[-1:], d[-1:], low[-1:])])
+        by_state = scheme.general(Function(of_state), x[:-1], d[:-1], compensation[:-1])
+        return jnp.concatenate([by_state, scheme.general(Function(of_time), x[-1:], d[-1:], compensation[-1:])])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         return scheme(self, path, along=_squares)
@@ -340,9 +344,9 @@ class Pullback(Energy):
         own = self.function is None or chosen  # no more than a choice of components, in units
         return self.term.sensitivity(self.of(x)) if own else super().sensitivity(x)
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        low = jnp.zeros_like(x) + low
-        middle, kept = x + (low + 0.5 * d), jax.jvp(self.of, (x + 0.5 * low,), (low,))[1]
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        compensation = jnp.zeros_like(x) + compensation
+        middle, kept = x + (compensation + 0.5 * d), jax.jvp(self.of, (x + 0.5 * compensation,), (compensation,))[1]
         step = jax.jvp(self.of, (middle,), (d,))[1]
         (back,) = jax.vjp(self.of, middle)[1](self.term.discrete_gradient(scheme, self.of(x), step, kept))
         return back
@@ -391,8 +395,8 @@ class Negative(Energy):
     def sensitivity(self, x) -> jax.Array:
         return self.term.sensitivity(x)
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        return -self.term.discrete_gradient(scheme, x, d, low)
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        return -self.term.discrete_gradient(scheme, x, d, compensation)
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         return -self.term.stage_gradients(scheme, path)

@@ -53,9 +53,9 @@ class DiscreteGradient(Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
     A sum of energies is treated term by term: discrete gradients add, and each term knows which of the methods below is
-    its own (:meth:`liethermo.Energy.discrete_gradient`). ``low`` is what rounding has kept from x
-    (compensated summation): points along the step are ``x + (low + c d)``, so that a step far below the rounding of
-    x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
+    its own (:meth:`liethermo.Energy.discrete_gradient`). ``compensation`` is what rounding has kept from x
+    (compensated summation): points along the step are ``x + (compensation + c d)``, so that a step far below the
+    rounding of x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
     """
 
     @property
@@ -68,16 +68,16 @@ class DiscreteGradient(Module):
         """Whether it does not depend on the order of the coordinates."""
         return False
 
-    def __call__(self, energy: Energy, x, d, low=0.0) -> jax.Array:
-        parts = [term.discrete_gradient(self, x, d, low) for term in energy.terms]
+    def __call__(self, energy: Energy, x, d, compensation=0.0) -> jax.Array:
+        parts = [term.discrete_gradient(self, x, d, compensation) for term in energy.terms]
         return sum(parts[1:], parts[0])
 
-    def quadratic(self, term: Energy, x, d, low) -> jax.Array:
+    def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
         """The midpoint gradient: exact for quadratic functions."""
-        return term.gradient(x + (low + 0.5 * d))
+        return term.gradient(x + (compensation + 0.5 * d))
 
     @abstractmethod
-    def general(self, term: Energy, x, d, low) -> jax.Array:
+    def general(self, term: Energy, x, d, compensation) -> jax.Array:
         """The discrete gradient of a term that need not be quadratic."""
 
     def __str__(self) -> str:
@@ -97,11 +97,11 @@ class Gonzalez(DiscreteGradient):
     def orderless(self) -> bool:
         return True
 
-    def general(self, term: Energy, x, d, low) -> jax.Array:
-        left, middle, right = jax.vmap(lambda c: term.gradient(x + (low + c * d)))(_NODES_3)
+    def general(self, term: Energy, x, d, compensation) -> jax.Array:
+        left, middle, right = jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(_NODES_3)
         second = left + right - 2.0 * middle  # the prediction minus grad H(z).d is 5/18 second.d, free of cancellation
         predicted = jnp.dot(middle, d) + (5 / 18) * jnp.dot(second, d)
-        difference = _difference(term, x, d, low, middle)
+        difference = _difference(term, x, d, compensation, middle)
         slope, size, length = (jnp.linalg.norm(v) for v in (middle, x, d))
         along = jnp.dot(second, d)
         defect = _gated_defect(*difference, predicted, slope * size, along, slope * length, self.noisy)
@@ -125,10 +125,10 @@ class MeanValue(DiscreteGradient):
         if not isinstance(self.nodes, int) or self.nodes < 1:
             raise InputError(f"the number of quadrature nodes is a positive integer, not {self.nodes!r}")
 
-    def general(self, term: Energy, x, d, low) -> jax.Array:
+    def general(self, term: Energy, x, d, compensation) -> jax.Array:
         points, weights = _gauss(self.nodes)
-        mean = weights @ jax.vmap(lambda c: term.gradient(x + (low + c * d)))(points)
-        difference = _difference(term, x, d, low, mean)
+        mean = weights @ jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(points)
+        difference = _difference(term, x, d, compensation, mean)
         rounding = jnp.linalg.norm(mean) * jnp.linalg.norm(x)
         defect = _gated_defect(*difference, jnp.dot(mean, d), rounding, 0.0, 1.0)
         return mean + _divide(defect, jnp.dot(d, d)) * d
@@ -147,14 +147,14 @@ class CoordinateIncrement(DiscreteGradient):
     def order(self) -> int:
         return 2 if self.symmetric else 1
 
-    def quadratic(self, term: Energy, x, d, low) -> jax.Array:
+    def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
         if self.symmetric:
-            return term.gradient(x + (low + 0.5 * d))
+            return term.gradient(x + (compensation + 0.5 * d))
         A = jax.hessian(term.value)(x)
-        return term.gradient(x + low) + (jnp.tril(A, -1) + 0.5 * jnp.diag(jnp.diag(A))) @ d
+        return term.gradient(x + compensation) + (jnp.tril(A, -1) + 0.5 * jnp.diag(jnp.diag(A))) @ d
 
-    def general(self, term: Energy, x, d, low) -> jax.Array:
-        x = x + low
+    def general(self, term: Energy, x, d, compensation) -> jax.Array:
+        x = x + compensation
         forwards = self._quotients(term, x, d)
         return 0.5 * (forwards + self._quotients(term, x + d, -d)) if self.symmetric else forwards
 
@@ -204,7 +204,7 @@ HARMLESS = 1e-10
 
 
 def stage_gradients(
-    energy: Energy, x, low, h, k, A, b, finer: Finer | None = None, symmetries: jax.Array | None = None
+    energy: Energy, x, compensation, h, k, A, b, finer: Finer | None = None, symmetries: jax.Array | None = None
 ) -> jax.Array:
     """Discrete gradients at the stages of a collocation method, shape (s, n) [:doc:`/explanation/exact_laws`].
 
@@ -215,8 +215,8 @@ def stage_gradients(
 
     Parameters
     ----------
-    x, low : array, shape (n,)
-        The state is x + low.
+    x, compensation : array, shape (n,)
+        The state is x + compensation.
     k : array, shape (s, n)
     A, b : array, shapes (s, s) and (s,)
     finer : Finer, optional
@@ -226,9 +226,9 @@ def stage_gradients(
     symmetries : array, shape (s, r, n), optional
         Vectors at the stages along which H does not change.
     """
-    u = x + (low + h * (A @ k))
-    further = None if finer is None else (x + (low + h * (finer.A @ k)), finer.slopes @ k)
-    path = Path(x, low, h * (b @ k), u, k, further, symmetries, h, b, finer)
+    u = x + (compensation + h * (A @ k))
+    further = None if finer is None else (x + (compensation + h * (finer.A @ k)), finer.slopes @ k)
+    path = Path(x, compensation, h * (b @ k), u, k, further, symmetries, h, b, finer)
     parts = [term.stage_gradients(_stage_gradients, path) for term in energy.terms]
     return sum(parts[1:], parts[0])
 
@@ -240,8 +240,10 @@ def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
     """
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
-    x, low, k, h, b = path.start, path.low, path.slopes, path.h, path.b
-    change = Change.of(term, x, low, path.step, [path.points, *(() if path.further is None else path.further[:1])])
+    x, compensation, k, h, b = path.start, path.compensation, path.slopes, path.h, path.b
+    change = Change.of(
+        term, x, compensation, path.step, [path.points, *(() if path.further is None else path.further[:1])]
+    )
     gradients, between = change.gradients[: len(k)], change.gradients[len(k) :]
     smooth, spread = jnp.zeros(()), jnp.zeros(())
     if path.finer is not None and path.further is not None:
@@ -302,15 +304,15 @@ class Change(NamedTuple):
     gradients: jax.Array
 
     @classmethod
-    def of(cls, term: Energy, x, low, d, points: list[jax.Array]) -> Change:
-        """The change over the step from x + low to x + low + d."""
-        new, new_low = compensated(x, low + d)
+    def of(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> Change:
+        """The change over the step from x + compensation to x + compensation + d."""
+        new, new_compensation = compensated(x, compensation + d)
         # one map for all points, as one is what a compiler has to work on
         found = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
         gradients, ends = found[:-2], found[-2:]
         before, after = _values(term, jnp.stack([x, new]))
-        # of the states x + low: else a step takes back what rounding, or a steering of the energy, has put into low
-        difference = (after - before) + (jnp.dot(ends[1], new_low) - jnp.dot(ends[0], low))
+        # of the compensated states: else a step takes back what rounding, or a steering of the energy, has put there
+        difference = (after - before) + (jnp.dot(ends[1], new_compensation) - jnp.dot(ends[0], compensation))
         slope = jnp.max(jnp.linalg.norm(ends, axis=1))
         size = _largest(before, after, term.rounded(x))
         noise = DIFFERENCE_NOISE * size + 4 * EPS * slope * jnp.linalg.norm(x)
@@ -349,15 +351,18 @@ def _values(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
-def _difference(term: Energy, x, d, low, gradient) -> tuple[jax.Array, jax.Array]:
-    """``H(x + low + d) - H(x + low)``, and the size at which it is rounded; ``gradient`` is one in between.
+def _difference(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, jax.Array]:
+    """``H(y + d) - H(y)`` from y = x + compensation, and the size at which it is rounded.
+
+    ``gradient`` is one in between.
 
     From values where steps begin and end, so that their rounding cancels from step to step, and the gradient for what
-    these points leave out: else a step would take back what rounding, or a steering of the energy, has put into low.
+    these points leave out: else a step would take back what rounding, or a steering of the energy, has put there.
     """
-    new, new_low = compensated(x, low + d)
+    new, new_compensation = compensated(x, compensation + d)
     before, after = _values(term, jnp.stack([x, new]))
-    return (after - before) + jnp.dot(gradient, new_low - low), _largest(before, after, term.rounded(x))
+    difference = (after - before) + jnp.dot(gradient, new_compensation - compensation)
+    return difference, _largest(before, after, term.rounded(x))
 
 
 def _largest(before, after, terms):

@@ -46,19 +46,19 @@ class Kinetic(Energy):
         q, p = _halves(x)
         return 0.5 * jnp.dot(p, _apply(self.at(q), p))
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        (q, p), (dq, dp), (low_q, low_p) = map(_halves, (x, d, jnp.zeros_like(x) + low))
-        middle, nothing = p + (low_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        (q, p), (dq, dp), (compensation_q, compensation_p) = map(_halves, (x, d, jnp.zeros_like(x) + compensation))
+        middle, nothing = p + (compensation_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
         if not callable(self.G):
             return jnp.concatenate([jnp.zeros_like(q), _apply(self.G, middle), nothing])
-        first, last = p + low_p, p + (low_p + dp)
+        first, last = p + compensation_p, p + (compensation_p + dp)
 
         def mean(q):  # over both ends in p, of the kinetic energy at q
             G = self.at(q)
             return 0.25 * (jnp.dot(first, _apply(G, first)) + jnp.dot(last, _apply(G, last)))
 
-        by_p = 0.5 * (_apply(self.at(q + low_q), middle) + _apply(self.at(q + (low_q + dq)), middle))
-        return jnp.concatenate([scheme.general(Function(mean), q, dq, low_q), by_p, nothing])
+        by_p = 0.5 * (_apply(self.at(q + compensation_q), middle) + _apply(self.at(q + (compensation_q + dq)), middle))
+        return jnp.concatenate([scheme.general(Function(mean), q, dq, compensation_q), by_p, nothing])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         size = len(path.start)

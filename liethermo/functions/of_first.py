@@ -32,10 +32,10 @@ class OfFirst(Energy):
     def hidden(self, x) -> jax.Array:
         return sum((term.hidden(x[: self.dim]) for term in self.energy.terms), jnp.zeros(()))
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """That of the function itself: it may have a closed form, and what is behind it has units of its own."""
         if self.is_quadratic:
-            return scheme.quadratic(self, x, d, low)
-        ends, n = (x, d, jnp.zeros_like(x) + low), self.dim
+            return scheme.quadratic(self, x, d, compensation)
+        ends, n = (x, d, jnp.zeros_like(x) + compensation), self.dim
         parts = [term.discrete_gradient(scheme, *(v[:n] for v in ends)) for term in self.energy.terms]
         return jnp.concatenate([sum(parts[1:], parts[0]), jnp.zeros(x.shape[0] - n)])

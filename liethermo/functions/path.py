@@ -32,8 +32,8 @@ class Path(NamedTuple):
 
     Attributes
     ----------
-    start, low, step : array, shape (m,)
-        It leads from start + low to start + low + step.
+    start, compensation, step : array, shape (m,)
+        It leads from start + compensation to start + compensation + step.
     points, slopes : array, shape (s, m)
         At the stages.
     further : two arrays, shape (r, m), or None
@@ -43,7 +43,7 @@ class Path(NamedTuple):
     """
 
     start: jax.Array
-    low: jax.Array
+    compensation: jax.Array
     step: jax.Array
     points: jax.Array
     slopes: jax.Array
@@ -65,12 +65,12 @@ class Path(NamedTuple):
         def back(covectors):
             return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
 
-        low = jnp.zeros_like(self.start) + self.low
+        compensation = jnp.zeros_like(self.start) + self.compensation
         (points, slopes), step = jax.vmap(seen)(self.points, self.slopes), self.step
         path = self._replace(
             start=coordinates(self.start),
-            low=seen(self.start + 0.5 * low, low)[1],
-            step=seen(self.start + (low + 0.5 * step), step)[1],
+            compensation=seen(self.start + 0.5 * compensation, compensation)[1],
+            step=seen(self.start + (compensation + 0.5 * step), step)[1],
             points=points,
             slopes=slopes,
             further=None if self.further is None else jax.vmap(seen)(*self.further),
@@ -82,5 +82,5 @@ class Path(NamedTuple):
 class Scheme(Protocol):
     """What a term asks of a discrete gradient: see :class:`liethermo.functions.gradients.DiscreteGradient`."""
 
-    def quadratic(self, term: Any, x, d, low) -> jax.Array: ...
-    def general(self, term: Any, x, d, low) -> jax.Array: ...
+    def quadratic(self, term: Any, x, d, compensation) -> jax.Array: ...
+    def general(self, term: Any, x, d, compensation) -> jax.Array: ...

@@ -122,8 +122,8 @@ class Rearranged(Energy):
     def rounded(self, x) -> jax.Array:
         return self.term.rounded(self._of(x))
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        ends = (self._of(v) for v in (x, d, jnp.zeros_like(x) + low))
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        ends = (self._of(v) for v in (x, d, jnp.zeros_like(x) + compensation))
         return to_planes(self.term.discrete_gradient(scheme, *ends), self.count)
 
     def stage_gradients(self, scheme, path) -> jax.Array:

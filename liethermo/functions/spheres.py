@@ -41,20 +41,20 @@ class Spheres:
         s, part = self._vectors(x), self._vectors(v)
         return self._replaced(v, added(part, scaled(-_quotient(dotted(s, part), dotted(s, s)), s)))
 
-    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
-        """The displacement from x + low that ends where d does, but at the lengths of the start; nothing is missed.
+    def reached(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
+        """The displacement that ends where d does, but at the lengths of the start; nothing is missed.
 
         From what the squares change by, not from their values: so it is as exact as d is small.
         """
-        start, step = self._vectors(x + low), self._vectors(d)
+        start, step = self._vectors(x + compensation), self._vectors(d)
         end = added(start, step)
         share = _quotient(dotted(step, added(start, end)), dotted(end, end))
         root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
         return self._replaced(d, added(step, scaled(-share / (1.0 + root), end))), jnp.zeros(())
 
-    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+    def settled(self, x, compensation) -> tuple[jax.Array, jax.Array]:
         """The state as it is: the sum of the squares is steered with the other first integrals."""
-        return x, low
+        return x, compensation
 
     def _vectors(self, v) -> Planes:
         return spins_of(v, self.count, self.planar)

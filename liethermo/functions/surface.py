@@ -44,12 +44,12 @@ class Surface(Protocol):
         """v, the direction of a correction, along the surface."""
         ...
 
-    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
-        """The displacement from x + low that ends near where d does, on the surface; and a length that is missed."""
+    def reached(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
+        """The displacement that ends near where d does, on the surface; and the length by which it fails to."""
         ...
 
-    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
-        """A state x + low at the end of a step, less what rounding has moved it; NaN outside of the domain."""
+    def settled(self, x, compensation) -> tuple[jax.Array, jax.Array]:
+        """A state x + compensation at the end of a step, less what rounding has moved it; NaN outside of the domain."""
         ...
 
 
@@ -78,25 +78,25 @@ class LevelSet:
         """v itself: gradients that are raised in the space around are along it."""
         return v
 
-    def reached(self, x, low, d) -> tuple[jax.Array, jax.Array]:
+    def reached(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
         """By Newton's method, from what the constraints change by along d: as exact as d is small."""
         if _count(self.space) == 0:
             return d, jnp.zeros(())
-        end, changes = x + (low + d), []
+        end, changes = x + (compensation + d), []
         for _ in range(2):
-            changes.append(self._change(x, low, d))
+            changes.append(self._change(x, compensation, d))
             d = d - self._moved(end, changes[-1])
         left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY))
         return d, jnp.where(left <= REACHED, 0.0, left) * jnp.linalg.norm(x)
 
-    def settled(self, x, low) -> tuple[jax.Array, jax.Array]:
+    def settled(self, x, compensation) -> tuple[jax.Array, jax.Array]:
         if _count(self.space) == 0:
-            return jnp.where(self.inside(x), x, jnp.nan), low
+            return jnp.where(self.inside(x), x, jnp.nan), compensation
         point = self._point(x)
-        values, slopes = jax.jvp(self.space._constraints, (point,), (self._point(low),))
+        values, slopes = jax.jvp(self.space._constraints, (point,), (self._point(compensation),))
         size, off = self.space._rounded(point), values + slopes
         off = jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -TAKEN * size, TAKEN * size), 0.0)
-        return jnp.where(self.inside(x), x, jnp.nan), low - self._moved(x, off)
+        return jnp.where(self.inside(x), x, jnp.nan), compensation - self._moved(x, off)
 
     def inside(self, x) -> jax.Array:
         """Whether a state on the surface is in the space."""
@@ -106,11 +106,11 @@ class LevelSet:
         """A state nearer to the surface, for functions that are defined on it alone."""
         return x if _count(self.space) == 0 else x - self._moved(x, self.space._constraints(self._point(x)))
 
-    def _change(self, x, low, d) -> jax.Array:
+    def _change(self, x, compensation, d) -> jax.Array:
         """What the constraints change by along d, by a quadrature that is exact for polynomials of degree ten."""
         nodes, weights = _rule(int(min(np.ceil(0.5 * max(_degree(self.space), 2)), NODES)))
         way = self._point(d)
-        rates = [jax.jvp(self.space._constraints, (self._point(x + (low + c * d)),), (way,))[1] for c in nodes]
+        rates = [jax.jvp(self.space._constraints, (self._point(x + (compensation + c * d)),), (way,))[1] for c in nodes]
         return sum(w * rate for w, rate in zip(weights[1:], rates[1:], strict=True)) + weights[0] * rates[0]
 
     def _moved(self, x, c) -> jax.Array:

@@ -41,12 +41,12 @@ class Warmth(Energy):
         del x
         return jnp.zeros(())
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """The one that there is, of functions of one number each."""
-        return self.gradient(x + low) * _grown(d * self.rate)[1]
+        return self.gradient(x + compensation) * _grown(d * self.rate)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        start, k, h, b = path.start + path.low, path.slopes, path.h, path.b
+        start, k, h, b = path.start + path.compensation, path.slopes, path.h, path.b
         ahead = jnp.concatenate([path.points - start, path.step[None]])
         powers, grown = _grown(ahead * self.rate)
         first = self.gradient(start)

@@ -67,17 +67,17 @@ class WithBaths(Energy):
 
         return of(self.body, x[: self.size]) + of(self.baths, x[self.size :])
 
-    def discrete_gradient(self, scheme, x, d, low) -> jax.Array:
-        low, n = jnp.zeros_like(x) + low, self.size
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        compensation, n = jnp.zeros_like(x) + compensation, self.size
 
         def of(energy: Energy, *ends) -> jax.Array:
             return _total(term.discrete_gradient(scheme, *ends) for term in energy.terms)
 
         if self.body.is_quadratic:  # at points of whole states, which others look at too
-            by_body = scheme.quadratic(OfFirst(self.body, n), x, d, low)[:n]
+            by_body = scheme.quadratic(OfFirst(self.body, n), x, d, compensation)[:n]
         else:
-            by_body = of(self.body, x[:n], d[:n], low[:n])
-        return jnp.concatenate([by_body, of(self.baths, x[n:], d[n:], low[n:])])
+            by_body = of(self.body, x[:n], d[:n], compensation[:n])
+        return jnp.concatenate([by_body, of(self.baths, x[n:], d[n:], compensation[n:])])
 
     def stage_gradients(self, scheme, path: Path) -> jax.Array:
         def of(energy: Energy, components: slice) -> jax.Array:
@@ -106,7 +106,7 @@ def _part(path: Path, components: slice) -> Path:
     further = path.further
     return path._replace(
         start=path.start[components],
-        low=(jnp.zeros_like(path.start) + path.low)[components],
+        compensation=(jnp.zeros_like(path.start) + path.compensation)[components],
         step=path.step[components],
         points=path.points[:, components],
         slopes=path.slopes[:, components],

@@ -15,7 +15,7 @@ from manifolds._module import Module
 
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.gradients import EPS, compensated
+from ..functions.gradients import EPS, DiscreteGradient, compensated
 from ..functions.rounding import with_rounding
 from ..systems import System
 from .levels import ended
@@ -27,10 +27,10 @@ EVERY_SYSTEM = "every system"
 
 
 class OneStepMethod(Module):
-    """An implicit one-step method: slopes ``k``, shape (stages, n), that solve ``k = slopes(system, x, low, h, k)``.
+    """A one-step method: slopes ``k``, shape (stages, n), with ``k = slopes(system, x, compensation, h, k)``.
 
-    The state is ``x + low``, an unevaluated sum: low is what rounding has kept from x in the steps before (compensated
-    summation), and a scheme should form its points as ``x + (low + …)``.
+    The state is ``x + compensation``, an unevaluated sum: rounding has kept the compensation from x in the steps before
+    (compensated summation). A scheme should form its points as ``x + (compensation + …)``.
 
     A subclass is complete when it gives the abstract members and is registered with
     :func:`register`: the shared test-suite then holds it to its order and its guarantees. Both engines run it from
@@ -68,8 +68,8 @@ class OneStepMethod(Module):
     def preserves(self) -> frozenset[str]: ...
 
     @abstractmethod
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        """Right-hand side of the stage equations, shape (stages, n), at a state x + low, shape (n,), and step h."""
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        """Right-hand side of the stage equations, shape (stages, n), from x + compensation, shape (n,), in a step h."""
 
     @abstractmethod
     def increment(self, h, k) -> jax.Array:
@@ -79,17 +79,7 @@ class OneStepMethod(Module):
 
     @property
     def explicit(self) -> bool:
-        """Whether the slopes do not depend on k, so that there is nothing to iterate: see :meth:`missed`."""
-        return False
-
-    def missed(self, system: System, x, low, h, k) -> jax.Array:
-        """How far an explicit method misses the levels that its step has to end on, as a length of a slope."""
-        del system, x, low, h
-        return jnp.zeros_like(jnp.max(k))
-
-    @property
-    def orderless(self) -> bool:
-        """Whether a step does not depend on the order of components, so that large states may have another inside."""
+        """Whether the slopes do not depend on k, so that there is nothing to iterate: see :class:`.ExplicitMethod`."""
         return False
 
     @property
@@ -97,33 +87,27 @@ class OneStepMethod(Module):
         """How often one iteration evaluates the vector field."""
         return self.stages
 
-    def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
-        """The state at the end of the step as x' + low', the increment added with its rounding error caught."""
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
+        """The state at the end of the step and its compensation: the increment added, its rounding error caught."""
         d, surface = self.increment(h, k), system.surface
         if surface is None:
-            return compensated(x, low + d)
+            return compensated(x, compensation + d)
         if not (self.explicit or surface.collocated):
-            d = ended(system, surface, self.holds(system), x, low, d)
-        return surface.settled(*compensated(x, low + d))
+            d = ended(system, surface, self.held_functions(system), x, compensation, d)
+        return surface.settled(*compensated(x, compensation + d))
 
-    def holds(self, system: System) -> tuple[Energy, ...]:
+    def held_functions(self, system: System) -> tuple[Energy, ...]:
         """The functions besides energy and entropy that an implicit step keeps."""
         del system
         return ()
 
-    def along(self, system: System, x, v) -> jax.Array:
+    def displaced(self, system: System, x, v) -> jax.Array:
         """The state that a displacement v leads to from x: where the step is on its way, outside of the laws."""
         return x + v
 
     def weights(self, theta) -> np.ndarray:
         """Those w for which ``h sum_i w_i k_i`` displaces the state by a share theta of a step, shape (..., stages)."""
         return integrated(self.stages, theta)
-
-    @property
-    def looks(self) -> np.ndarray:
-        """Shares of an adaptive step at which the sign of an event is looked at, on its way: the more, the longer."""
-        count = 2 * self.order
-        return np.arange(1, count) / count
 
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""
@@ -133,41 +117,13 @@ class OneStepMethod(Module):
         """Slopes to begin the next step with, extrapolated from those of the last two steps."""
         return 2.0 * k - before
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """An estimate of the local error of a step, the size of a vector like x; needed for adaptive steps."""
         raise InputError(f"{self} has no error estimate: {self.fixed}")
 
-    @property
-    def has_estimate(self) -> bool:
-        """Whether it gives :meth:`error`."""
-        return type(self).error is not OneStepMethod.error
-
-    def unknowns(self, system: System) -> int:
-        """How many components a slope has: as many as a state, or as the part of it that a step is solved for."""
-        return system.dim
-
-    def judged(self, system: System, x) -> tuple[System, jax.Array]:
-        """The part of the system, and of the state, that a step is solved for; slopes and errors are of its size.
-
-        The rest of the state follows from it in :meth:`move`, and no tolerance of the one is measured by the other.
-        """
-        return system, x
-
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        """The velocities of a body at the stages, :meth:`.System.transport` of what the step takes for dH.
-
-        Shape (stages, n); an attitude follows them.
-        """
-        raise InputError(f"{self} does not say which velocities it moves with, so attitudes cannot be reconstructed")
-
-    def transports(self, system: System) -> bool:
-        """Whether an attitude can follow its steps exactly, so that the momentum in space is kept to rounding.
-
-        An implicit method can where its slopes at Gauss nodes are Pi times :meth:`velocities`. An explicit one can
-        where its steps end on the coadjoint orbit that they began on.
-        """
-        del system
-        return False
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+        """The derivative of ``slopes - k`` by k, for Newton's method: a linear function of directions like k."""
+        return jax.linearize(lambda k: self.slopes(system, x, compensation, h, k) - k, k)[1]
 
     def explain(self, system: System, x, k, h) -> str:
         """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
@@ -190,43 +146,13 @@ class OneStepMethod(Module):
             return casimir and quadratic and by_force
         return casimir and "casimirs" in self.preserves
 
-    def suited(self, tolerance: float | None) -> OneStepMethod:
-        """The method for adaptive steps of a relative tolerance, or None for steps of given sizes: itself, mostly."""
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold.
+
+        With the relative tolerance of adaptive steps, where steps are not of given sizes.
+        """
         del tolerance
         return self
-
-    def on(self, system: System) -> OneStepMethod:
-        """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold."""
-        return self
-
-    def pulled(self, local) -> OneStepMethod:
-        """The method in a chart: its own functions, if it has any, in the coordinates of the system ``local`` there."""
-        return self
-
-    def turned(self, k, change: Callable) -> jax.Array:
-        """Slopes with their components changed as those of states are, by ``change``, a function of arrays (..., n)."""
-        return change(k)
-
-    @property
-    def increments(self) -> int:
-        """Random numbers that a step is driven by: none of a method for equations without noise."""
-        return 0
-
-    def driven_by(self, dW) -> OneStepMethod:
-        """The method for one step, with its :attr:`increments`, shape (increments,)."""
-        del dW
-        return self
-
-    # -- what follows -------------------------------------------------------------------------------------------------
-
-    def change(self, system: System, x, low, h, k, d) -> jax.Array:
-        """The derivative of ``slopes - k`` by k in the direction d, shape (stages, n), for Newton's method."""
-        return jax.jvp(lambda k: self.slopes(system, x, low, h, k) - k, (k,), (d,))[1]
-
-    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
-        """The matrix of :meth:`change`, shape (stages * n, stages * n)."""
-        columns = jax.vmap(lambda d: self.change(system, x, low, h, k, d.reshape(k.shape)).ravel())(jnp.eye(k.size))
-        return columns.T
 
     def __str__(self) -> str:
         return type(self).__name__
@@ -262,17 +188,6 @@ class Wrapping(OneStepMethod):
     def evaluations(self) -> int:
         return self.method.evaluations
 
-    @property
-    def has_estimate(self) -> bool:
-        return self.method.has_estimate
-
-    @property
-    def increments(self) -> int:
-        return self.method.increments
-
-    def driven_by(self, dW) -> OneStepMethod:
-        return eqx.tree_at(lambda m: m.method, self, self.method.driven_by(dW))
-
     def increment(self, h, k) -> jax.Array:
         return self.method.increment(h, k)
 
@@ -282,11 +197,27 @@ class Wrapping(OneStepMethod):
     def predict(self, k, before) -> jax.Array:
         return self.method.predict(k, before)
 
-    def missed(self, system: System, x, low, h, k) -> jax.Array:
-        return self.method.missed(system, x, low, h, k)
-
     def check(self, system: System) -> None:
         self.method.check(system)
+
+
+class TransportingMethod(OneStepMethod):
+    """A method that says with which velocities it moves a body, so that an attitude can follow."""
+
+    @abstractmethod
+    def transports(self, system: System) -> bool:
+        """Whether an attitude can follow its steps exactly, so that the momentum in space is kept to rounding.
+
+        It can where the slopes at Gauss nodes are Pi times :meth:`velocities`, or the steps of an explicit method end
+        on the coadjoint orbit on which they began.
+        """
+
+    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+        """Those at the stages, :meth:`.System.transport` of what the step takes for dH, shape (stages, n).
+
+        An explicit method has none: an attitude follows its steps by angles of their own.
+        """
+        raise NotImplementedError
 
 
 class GaussMethod(OneStepMethod):
@@ -317,6 +248,33 @@ ONE_SIZE = (
 """Why variational schemes have steps of one size."""
 
 
+def event_shares(order: int) -> np.ndarray:
+    """Shares of an adaptive step at which the sign of an event is looked at: the higher the order, the longer it is."""
+    count = 2 * order
+    return np.arange(1, count) / count
+
+
+def orderless(method: OneStepMethod) -> bool:
+    """Whether a step does not depend on the order of components, as with some discrete gradients it does."""
+    parts = jax.tree_util.tree_leaves(method, is_leaf=lambda part: isinstance(part, DiscreteGradient))
+    return all(part.orderless for part in parts if isinstance(part, DiscreteGradient))
+
+
+def estimates_error(method) -> bool:
+    """Whether a method gives :meth:`OneStepMethod.error`, and the one that it wraps does."""
+    given = isinstance(method, OneStepMethod) and type(method).error is not OneStepMethod.error
+    return given and (not isinstance(method, Wrapping) or estimates_error(method.method))
+
+
+def pulled(method: OneStepMethod, local) -> OneStepMethod:
+    """The method with its own functions in the coordinates of ``local``: a system in a chart, or in another order."""
+
+    def changed(part):
+        return local.pulled(part) if isinstance(part, Energy) else part
+
+    return jax.tree_util.tree_map(changed, method, is_leaf=lambda part: isinstance(part, Energy))
+
+
 def checked_stages(stages) -> int:
     """How many Gauss nodes, where there is a tableau for them."""
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
@@ -328,7 +286,7 @@ ROUNDINGS = 30.0
 """Roundings that solved slopes may differ by."""
 
 
-def collocation_error(system: System, x, low, h, k) -> jax.Array:
+def collocation_error(system: System, x, compensation, h, k) -> jax.Array:
     """A local error O(h^{2s+1}) of collocation at s Gauss nodes, from how far its polynomial u misses the field.
 
     The defect ``f(x) - u'(0)`` at the start is O(h^s) of the speed [Hairer & Wanner 1996, IV.8]. The method being of
@@ -339,11 +297,11 @@ def collocation_error(system: System, x, low, h, k) -> jax.Array:
     the origin it is all there is.
     """
     s, weights = len(k), at_start(len(k))
-    field, size = with_rounding(system.vector_field, x + low)
+    field, size = with_rounding(system.vector_field, x + compensation)
     noise = ROUNDINGS * EPS * (1.0 + np.abs(weights).sum()) * jnp.max(size)
-    missed = jnp.maximum(jnp.max(jnp.abs(field - weights @ k)) - noise, 0.0)
+    defect = jnp.maximum(jnp.max(jnp.abs(field - weights @ k)) - noise, 0.0)
     speed = jnp.max(jnp.abs(k))
-    return h * missed * (missed / jnp.where(speed > 0.0, speed, 1.0)) / (2 * s + 1)
+    return h * defect * (defect / jnp.where(speed > 0.0, speed, 1.0)) / (2 * s + 1)
 
 
 def register(*methods: OneStepMethod) -> None:

@@ -14,7 +14,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System
-from .base import OneStepMethod, Wrapping, collocation_error
+from .base import OneStepMethod, Wrapping, collocation_error, pulled
 
 
 class InCharts(Wrapping):
@@ -45,35 +45,42 @@ class InCharts(Wrapping):
     def keeps(self, system: System, name: str) -> bool:
         return self.method.keeps(system, name) if self.explicit else super().keeps(system, name)
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        step = self._step(system, x, low, h, k)
-        return step.back(step.method.slopes(step.system, step.start, step.low, h, step.k))
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        step = self._step(system, x, compensation, h, k)
+        return step.back(step.method.slopes(step.system, step.start, step.compensation, h, step.k))
 
-    def move(self, system: System, x, low, h, k) -> tuple[jax.Array, jax.Array]:
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         """The point at the end of the step; NaN where the step is longer than the domain of the retraction."""
-        step = self._step(system, x, low, h, k)
-        end = step.start + (step.low + self.method.increment(h, step.k))
+        step = self._step(system, x, compensation, h, k)
+        end = step.start + (step.compensation + self.method.increment(h, step.k))
         inside = self._reach(system, x, self.increment(h, k)) < 1.0
         new = jnp.where(inside, self.retraction.space.to_vector(step.system.coordinates.point(end)), jnp.nan)
         return new, jnp.zeros_like(new)
 
-    def along(self, system: System, x, v) -> jax.Array:
+    def displaced(self, system: System, x, v) -> jax.Array:
         return self.retraction.space.to_vector(self.retraction.chart._point(system.points(x), system.points(v)))
 
-    def jacobian(self, system: System, x, low, h, k) -> jax.Array:
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
         """By one-sided differences, half of the digits, which is enough for Newton's method.
 
         The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
         what is hardly ever needed.
         """
-        step = EPS**0.5 * system.sizes(k).ravel()
-        shifts = jnp.concatenate([jnp.zeros((1, k.size)), jnp.diag(step)])
-        misfit = lambda v: self.slopes(system, x, low, h, v.reshape(k.shape)).ravel() - v  # noqa: E731
-        values = jax.lax.map(lambda shift: misfit(k.ravel() + shift), shifts)
-        return ((values[1:] - values[0]) / step[:, None]).T
+        sizes, misfit = system.sizes(k), self.slopes(system, x, compensation, h, k) - k
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
-        return self.method.error(system, x, low, h, k) if self.explicit else collocation_error(system, x, low, h, k)
+        def difference(d):
+            step = EPS**0.5 / jnp.max(jnp.abs(d) / sizes)
+            k_there = k + step * d
+            return (self.slopes(system, x, compensation, h, k_there) - k_there - misfit) / step
+
+        return difference
+
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
+        return (
+            self.method.error(system, x, compensation, h, k)
+            if self.explicit
+            else collocation_error(system, x, compensation, h, k)
+        )
 
     def explain(self, system: System, x, k, h) -> str:
         x, k = jnp.asarray(x), jnp.asarray(k)
@@ -91,20 +98,20 @@ class InCharts(Wrapping):
         point = system.points(x)
         return self.retraction._reach(point, self.retraction.space._project_tangent(point, system.points(v)))
 
-    def _step(self, system: System, x, low, h, k) -> _Step:
+    def _step(self, system: System, x, compensation, h, k) -> _Step:
         """The step in coordinates around z."""
         chart, space, start, x = self.retraction.chart, self.retraction.space, x, system.points(x)
         vectors = space.from_vector(k)
         around = mf.coordinates_around(chart, x)
         own = jax.vmap(around.components)(vectors)
-        low = around.components(system.points(low))
+        compensation = around.components(system.points(compensation))
         if isinstance(self.retraction, mf.Chart):
             local = ChartSystem(system, around, start=start)
 
             def back(slopes):
                 return space.to_vector(jax.vmap(around.vector)(slopes))
 
-            return _Step(local, self.method.pulled(local), jnp.zeros_like(low), low, own, back)
+            return _Step(local, pulled(self.method, local), jnp.zeros_like(compensation), compensation, own, back)
 
         half = 0.5 * around.vector(self.method.increment(h, own))
         z = chart._point(x, half)
@@ -120,12 +127,12 @@ class InCharts(Wrapping):
         local = ChartSystem(system, around_z, around_z.centre() if self.stages == 1 else None, start)
         own = jax.vmap(there)(own)
         begin = -0.5 * self.method.increment(h, own)
-        return _Step(local, self.method.pulled(local), begin, there(low), own, jax.vmap(back_there))
+        return _Step(local, pulled(self.method, local), begin, there(compensation), own, jax.vmap(back_there))
 
     def predict(self, k, before) -> jax.Array:
-        if self.increments:
+        if self.explicit or self.stages == 1:
             return self.method.predict(k, before)
-        return k if self.explicit else 2.0 * k - before  # whatever the method's own: the chart has changed
+        return 2.0 * k - before  # whatever the method's own: the chart has changed
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"
@@ -137,7 +144,7 @@ class _Step(NamedTuple):
     system: ChartSystem
     method: OneStepMethod
     start: jax.Array
-    low: jax.Array
+    compensation: jax.Array
     k: jax.Array
     back: Callable
 

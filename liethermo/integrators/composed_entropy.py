@@ -15,7 +15,7 @@ NEWTON = 3
 """Steps of Newton's method to a level of the Casimirs: the distance is O(h), so what is left is O(h^8)."""
 
 
-def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, low, h, k, A, b) -> jax.Array:
+def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, compensation, h, k, A, b) -> jax.Array:
     """Discrete gradients of ``S = f(C_1, …, C_m)`` at the stages of a collocation method, shape (s, n).
 
     Each is ``sum_j (f_j(c_i) + alpha r_ij) gC_ij``: a combination of the discrete gradients of the Casimirs at the
@@ -40,10 +40,10 @@ def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, low,
     def derivatives(change):
         y = x
         for _ in range(NEWTON):
-            missed = change - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
-            y = y + at(y).with_products(missed)
+            defect = change - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
+            y = y + at(y).with_products(defect)
         return at(y).coefficients(S.gradient(y))
 
     weights = jax.vmap(derivatives)(h * (A @ rates))
-    change = Change.of(S, x, low, h * (b @ k), [])
+    change = Change.of(S, x, compensation, h * (b @ k), [])
     return jnp.einsum("ij,jin->in", corrected(change, weights, rates, Direction.of(rates, b), h, b), gradients)

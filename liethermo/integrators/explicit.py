@@ -17,12 +17,12 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
-from .base import OneStepMethod
+from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, in_charts
 from .levels import CORRECTIONS, LAWS, Law, corrected
 from .preserved import check_preserved, preserved_functions, seen_on
 
-SLOPE, ERROR, MISSED, LEVELS, OWN = range(5)
+SLOPE, ERROR, DEFECT, LEVELS, OWN = range(5)
 """What stands in the vectors that a step hands on: its mean slope, the estimate of its local error; in each component,
 what is missed of the levels after the corrections; the levels that the run has begun on; from OWN on what a method adds
 for the states between. Error and what is missed are over h."""
@@ -53,7 +53,7 @@ class Unlawful(NamedTuple):
     between: jax.Array
 
 
-class ExplicitMethod(OneStepMethod):
+class ExplicitMethod(TransportingMethod):
     """A step y of some explicit method, and x' the point near y where
 
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + what it has produced,
@@ -76,7 +76,7 @@ class ExplicitMethod(OneStepMethod):
     Parameters
     ----------
     number : int or None
-        The order; None until :meth:`suited` has chosen one.
+        The order; None until the tolerance of a run has chosen one.
     preserve, retraction, held
         As of :class:`.MetriplecticRungeKutta`.
     """
@@ -95,8 +95,8 @@ class ExplicitMethod(OneStepMethod):
         self.retraction, self.held = retraction, held
 
     @abstractmethod
-    def uncorrected(self, system: System, laws: list[Law], x, low, h) -> Unlawful:
-        """The step from x + low, which ends near the levels."""
+    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
+        """The step from x + compensation, which ends near the levels."""
 
     @property
     def order(self) -> int:
@@ -124,7 +124,8 @@ class ExplicitMethod(OneStepMethod):
         held = bool(system.pushed_by) or casimirs.keys() <= set(self.held)  # of a torque, the impulse is made to fit
         return system.has_all_casimirs and held and system.body_dim - len(casimirs) <= 2
 
-    def on(self, system: System) -> OneStepMethod:
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        del tolerance
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
         method = in_charts(seen, system, self.retraction, "exp")
         if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
@@ -132,9 +133,6 @@ class ExplicitMethod(OneStepMethod):
                 f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
             )
         return method
-
-    def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled, self.held)
 
     def _with(self, change: Callable, held: tuple[str, ...]) -> Self:
         """The method with its preserved functions changed, holding these of the system."""
@@ -153,16 +151,16 @@ class ExplicitMethod(OneStepMethod):
 
     # -- the step -----------------------------------------------------------------------------------------------------
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """The vectors that the step hands on; of those before it the levels alone are needed."""
         laws = self._laws(system)
-        d, changes, error, between = self.uncorrected(system, laws, x, low, h)
+        d, changes, error, between = self.uncorrected(system, laws, x, compensation, h)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
-            changes = changes + self._steering(system, laws, x, low, k[LEVELS])
-        d, missed = corrected(system, laws, x, low, d, changes, self.corrections)
-        return jnp.stack([d / h, error, jnp.broadcast_to(missed / h, x.shape), k[LEVELS], *between])
+            changes = changes + self._steering(system, laws, x, compensation, k[LEVELS])
+        d, defect = corrected(system, laws, x, compensation, d, changes, self.corrections)
+        return jnp.stack([d / h, error, jnp.broadcast_to(defect / h, x.shape), k[LEVELS], *between])
 
-    def _steering(self, system: System, laws: list[Law], x, low, levels) -> jax.Array:
+    def _steering(self, system: System, laws: list[Law], x, compensation, levels) -> jax.Array:
         """What functions that are conserved are to change by, back to the levels that the run has begun on.
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
@@ -171,7 +169,7 @@ class ExplicitMethod(OneStepMethod):
         def back(law: Law, level) -> jax.Array:
             gradient = law.function.gradient(x)
             size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
-            off = (level - law.function.value(x)) - jnp.dot(gradient, low)
+            off = (level - law.function.value(x)) - jnp.dot(gradient, compensation)
             return jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -STEERED * size, STEERED * size), 0.0)
 
         found = [
@@ -212,13 +210,6 @@ class ExplicitMethod(OneStepMethod):
             laws.append(Law(system.entropy, LAWS[system.entropy_law]))
         return sorted(laws, key=lambda law: law.sign != 0.0)
 
-    def turned(self, k, change: Callable) -> jax.Array:
-        return change(k).at[LEVELS].set(k[LEVELS])
-
-    def missed(self, system: System, x, low, h, k) -> jax.Array:
-        del system, x, low, h
-        return jnp.max(jnp.abs(k[MISSED]))
-
     def increment(self, h, k) -> jax.Array:
         return h * k[SLOPE]
 
@@ -238,6 +229,11 @@ class ExplicitMethod(OneStepMethod):
     def __str__(self) -> str:
         kept = f", preserve={len(self.functions)} functions" if self.functions else ""
         return f"{type(self).__name__}(order={self.number}{kept})"
+
+
+def defect(k) -> jax.Array:
+    """How far an explicit step misses the levels that it has to end on, as a length of a slope."""
+    return jnp.max(jnp.abs(k[DEFECT]))
 
 
 def _room(system: System) -> int:

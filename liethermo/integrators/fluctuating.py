@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +14,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..systems import System
 from ..tracing.interpret import at_points
-from .base import OneStepMethod, Wrapping
+from .base import OneStepMethod, TransportingMethod, Wrapping
 from .charts import in_charts
 from .midpoint import MetriplecticMidpoint
 
@@ -23,7 +22,7 @@ MISFIT = 1e-10
 """Largest difference of ``B B^T`` from the friction matrix, relative to that."""
 
 
-class Fluctuating(Wrapping):
+class Fluctuating(Wrapping, TransportingMethod):
     """``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` (Itô) by midpoints [:doc:`/explanation/fluctuations`].
 
     As ``div K = sum_a (b_a . grad) b_a + b_a div b_a`` over the columns of B, the first of which is what turns
@@ -46,8 +45,8 @@ class Fluctuating(Wrapping):
         Of the bath, where there is one.
     density : Energy or None
         Logarithm of the density of the measure that the motion keeps.
-    dW : array, shape (increments,)
-        Those of a step.
+    dW : array, shape (noise_dimension,)
+        The increments of the noise in a step.
     """
 
     method: MetriplecticMidpoint
@@ -55,8 +54,6 @@ class Fluctuating(Wrapping):
     temperature: jax.Array
     density: Energy | None
     dW: jax.Array
-
-    has_estimate: ClassVar[bool] = False
 
     @property
     def order(self) -> int:
@@ -70,30 +67,16 @@ class Fluctuating(Wrapping):
     def retraction(self):
         return self.method.retraction
 
-    @property
-    def orderless(self) -> bool:
-        return self.method.orderless
-
-    @property
-    def increments(self) -> int:
-        return self.dW.shape[0]
-
-    def on(self, system: System) -> OneStepMethod:
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        del tolerance
         return in_charts(self, system, self.method.retraction, "midpoint")
 
-    def pulled(self, local) -> OneStepMethod:
-        density = None if self.density is None else local.pulled(self.density)
-        return Fluctuating(self.method, self.boltzmann, self.temperature, density, self.dW)
-
-    def driven_by(self, dW) -> OneStepMethod:
-        return Fluctuating(self.method, self.boltzmann, self.temperature, self.density, dW)
-
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        z, dH, dS, dL = self.method.at_midpoint(system, x, low, h, k)
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        z, dH, dS, dL = self.method.at_midpoint(system, x, compensation, h, k)
         return (system.field(z, dH, dS, dL) + sum(B.times(w) for B, w in self._pushes(system, z, dH, dL, h)))[None]
 
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        z, dH, dS, dL = self.method.at_midpoint(system, x, low, h, k)
+    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+        z, dH, dS, dL = self.method.at_midpoint(system, x, compensation, h, k)
         pushes = self._pushes(system, z, dH, dL, h)
         return sum((B.velocity(w) for B, w in pushes if B.velocity), start=system.transport(z, dH, dS, dL))[None]
 
@@ -165,6 +148,24 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
     size = sum(B.size for _, B in factors_at(system.dissipation, system, jnp.asarray(system.samples(1)[0])))
     T = 1.0 if temperature is None else temperature
     return Fluctuating(method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(size))
+
+
+def noise_dimension(method: OneStepMethod) -> int:
+    """How many random numbers drive a step of a method: none without noise."""
+    return sum(part.dW.shape[0] for part in jax.tree_util.tree_leaves(method, is_leaf=_noisy) if _noisy(part))
+
+
+def driven_by(method: OneStepMethod, dW) -> OneStepMethod:
+    """The method for one step, with its increments, shape (noise_dimension,)."""
+
+    def changed(part):
+        return eqx.tree_at(lambda m: m.dW, part, dW) if _noisy(part) else part
+
+    return jax.tree_util.tree_map(changed, method, is_leaf=_noisy)
+
+
+def _noisy(part) -> bool:
+    return isinstance(part, Fluctuating)
 
 
 def undisturbed(system: System, function: Energy) -> bool:

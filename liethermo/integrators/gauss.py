@@ -21,16 +21,16 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
-from ..systems import ChartSystem, System
+from ..systems import System
 from ..tracing.interpret import at_points
-from .base import GaussMethod, OneStepMethod, checked_stages, collocation_error, register
+from .base import GaussMethod, OneStepMethod, TransportingMethod, checked_stages, collocation_error, register
 from .charts import in_charts
 from .composed_entropy import composed_gradients
 from .preserved import check_preserved, preserved_functions, seen_on
 from .tableaus import finer, gauss
 
 
-class MetriplecticGauss(GaussMethod):
+class MetriplecticGauss(GaussMethod, TransportingMethod):
     """``k_i = Pi(u_i) gH_i + K_d gS_i`` at Gauss nodes ``u_i = x + h sum_j A_ij k_j``; ``x' = x + h sum_i b_i k_i``.
 
     The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
@@ -98,7 +98,8 @@ class MetriplecticGauss(GaussMethod):
         self.held = held
         self.moving = moving
 
-    def on(self, system: System) -> OneStepMethod:
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        del tolerance
         held = tuple(sorted(name for name in system.first_integrals() if self._holds(system, name)))
         method = self._with(lambda C: seen_on(system, C), held)
         if self.functions and not is_traced((system, method)):
@@ -106,16 +107,9 @@ class MetriplecticGauss(GaussMethod):
             method = method._with(lambda C: C, held, tuple(int(i) for i in np.flatnonzero(moved > STILL)))
         return in_charts(method, system, self.retraction, "exp")
 
-    def pulled(self, local: ChartSystem) -> OneStepMethod:
-        return self._with(local.pulled, self.held, self.moving)
-
     def _with(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
         """The method with its preserved functions changed, holding these of the system."""
         return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
-
-    @property
-    def orderless(self) -> bool:
-        return True
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -136,31 +130,31 @@ class MetriplecticGauss(GaussMethod):
 
     # -- the stage equations ------------------------------------------------------------------------------------------
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        return jax.vmap(lambda *stage: self._slope(system, *stage))(*self._at_stages(system, x, low, h, k))
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        return jax.vmap(lambda *stage: self._slope(system, *stage))(*self._at_stages(system, x, compensation, h, k))
 
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
+    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         names = tuple(system.preserved_by_name())
 
         def velocity(u, dH, dS, known):
             return system.transport(u, dH, dS, tuple(known[name].discrete for name in names))
 
-        return jax.vmap(velocity)(*self._at_stages(system, x, low, h, k))
+        return jax.vmap(velocity)(*self._at_stages(system, x, compensation, h, k))
 
-    def _at_stages(self, system: System, x, low, h, k) -> tuple:
+    def _at_stages(self, system: System, x, compensation, h, k) -> tuple:
         """The stages, shape (s, n), and there what the step takes for dH, dS and the other gradients, by name."""
         A, b, _ = gauss(self.number)
-        u = x + (low + h * (A @ k))
+        u = x + (compensation + h * (A @ k))
 
         def at_stages(C: Energy) -> Gradients:
             plain = jax.vmap(C.gradient)(u)
             if C.is_quadratic:
                 return Gradients(plain, plain)
-            return Gradients(stage_gradients(C, x, low, h, k, A, b, finer(self.number)), plain)
+            return Gradients(stage_gradients(C, x, compensation, h, k, A, b, finer(self.number)), plain)
 
         S, parts = system.entropy, _made_of(system)
         symmetries = self._symmetries(system, u)
-        dH = stage_gradients(system.energy, x, low, h, k, A, b, finer(self.number), symmetries)
+        dH = stage_gradients(system.energy, x, compensation, h, k, A, b, finer(self.number), symmetries)
         known = {name: at_stages(C) for name, C in (self._kept(system) | parts | system.preserved_by_name()).items()}
         if S is None:
             dS = jnp.zeros_like(k)
@@ -168,7 +162,7 @@ class MetriplecticGauss(GaussMethod):
             dS = known[ENTROPY].discrete
         else:
             discrete = jnp.stack([known[name].discrete for name in parts])
-            dS = composed_gradients(S, list(parts.values()), discrete, x, low, h, k, A, b)
+            dS = composed_gradients(S, list(parts.values()), discrete, x, compensation, h, k, A, b)
         return u, dH, dS, known
 
     def _slope(self, system: System, u, dH, dS, known: dict[str, Gradients]) -> jax.Array:
@@ -250,7 +244,7 @@ class MetriplecticGauss(GaussMethod):
         given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | given
 
-    def holds(self, system: System) -> tuple[Energy, ...]:
+    def held_functions(self, system: System) -> tuple[Energy, ...]:
         return tuple(self._kept(system).values())
 
     def _casimirs(self, system: System) -> set[str]:
@@ -269,8 +263,8 @@ class MetriplecticGauss(GaussMethod):
         sharp = system.poisson.sharp
         return jax.vmap(lambda point: jnp.stack([sharp(point, J.gradient(point)) for J in maps]))(u)
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
-        return collocation_error(system, x, low, h, k)
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
+        return collocation_error(system, x, compensation, h, k)
 
     def __str__(self) -> str:
         kept = f", preserve={len(self.functions)} functions" if self.functions else ""

@@ -111,8 +111,8 @@ class DiscreteHerglotz(OneStepMethod):
     def _shares(self) -> np.ndarray:
         return np.array([share for share, _ in PARTS[self.composed]])
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        y, found, n = x + low, [], len(x) // 2
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        y, found, n = x + compensation, [], len(x) // 2
         for (share, forward), guess in zip(PARTS[self.composed], k, strict=True):
             slope = (self._forward if forward else self._backward)(y, share * h, guess[:n])
             found.append(slope)

@@ -46,34 +46,34 @@ class Ended(NamedTuple):
     d: jax.Array
     left: jax.Array
     ends: list
-    missed: jax.Array
+    defect: jax.Array
     lengths: jax.Array
 
 
 def corrected(
-    system: System, laws: list[Law], x, low, d, changes, corrections: int = CORRECTIONS
+    system: System, laws: list[Law], x, compensation, d, changes, corrections: int = CORRECTIONS
 ) -> tuple[jax.Array, jax.Array]:
     """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
     change, surface = Gonzalez(NOISY), system.surface
     functions, blocks = [law.function for law in laws], system.blocks
-    before = [f.gradient(x + low) if f.is_quadratic else None for f in functions]
+    before = [f.gradient(x + compensation) if f.is_quadratic else None for f in functions]
 
     def landed(d) -> tuple[jax.Array, jax.Array]:
-        return (d, jnp.zeros(())) if surface is None else surface.reached(x, low, d)
+        return (d, jnp.zeros(())) if surface is None else surface.reached(x, compensation, d)
 
     def gradients(d) -> list:
-        return [f.gradient(x + (low + d)) for f in functions]
+        return [f.gradient(x + (compensation + d)) for f in functions]
 
     def misses(d, ends) -> jax.Array:
         """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
         along = [
-            change(f, x, d, low) if first is None else 0.5 * (first + last)
+            change(f, x, d, compensation) if first is None else 0.5 * (first + last)
             for f, first, last in zip(functions, before, ends, strict=True)
         ]
         return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
 
     def directions(d, ends) -> list:
-        end = x + (low + d)
+        end = x + (compensation + d)
         found = [system.raised(end, gradient) for gradient in ends]
         return found if surface is None else [surface.along(end, v) for v in found]
 
@@ -83,24 +83,24 @@ def corrected(
         These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
         of their own, as entropies beside a momentum, those by which a function changes most in d.
         """
-        missed = misses(d, ends)
+        defect = misses(d, ends)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
         else:
             moved = jnp.linalg.norm(d)
             most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
             lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
-        return Ended(d, left, ends, missed, lengths)
+        return Ended(d, left, ends, defect, lengths)
 
     def nearer(s: Ended, found) -> Ended:
-        new, left = landed(s.d + towards(found, s.missed, passes=min(len(blocks), 2)))
+        new, left = landed(s.d + towards(found, s.defect, passes=min(len(blocks), 2)))
         return measured(new, left, gradients(new), found)
 
     def again(s: Ended, _) -> tuple[Ended, None]:
         return jax.lax.cond(done(s), lambda: s, lambda: nearer(s, directions(s.d, s.ends))), None
 
     def done(s: Ended) -> jax.Array:
-        small = jnp.abs(s.missed) <= EPS * s.lengths * jnp.linalg.norm(s.d)
+        small = jnp.abs(s.defect) <= EPS * s.lengths * jnp.linalg.norm(s.d)
         return (s.left == 0.0) & (small | (s.lengths <= VANISHED_LENGTH)).all()
 
     def hidden() -> jax.Array:
@@ -113,12 +113,12 @@ def corrected(
     s = measured(d, left, ends, found)
     if corrections > 0:
         s, _ = jax.lax.scan(again, nearer(s, found), length=corrections - 1)  # of a short step one is enough
-    rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.missed), hidden)
-    vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.missed) - rounding, 0.0)
+    rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.defect), hidden)
+    vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
 
 
-def ended(system: System, surface: Surface, held: Sequence[Energy], x, low, d) -> jax.Array:
+def ended(system: System, surface: Surface, held: Sequence[Energy], x, compensation, d) -> jax.Array:
     """The displacement of an implicit step, which has changed all functions as it has to, brought to the surface.
 
     The functions ``held`` stay as they were, and so does an energy that is conserved; what else has a law changes by
@@ -129,12 +129,14 @@ def ended(system: System, surface: Surface, held: Sequence[Energy], x, low, d) -
         if law in LAWS and function is not None:
             laws.append(Law(function, LAWS[law]))
     if not laws:
-        return surface.reached(x, low, d)[0]
+        return surface.reached(x, compensation, d)[0]
     change = Gonzalez(NOISY)
-    changes = [jnp.zeros(()) if law.sign == 0.0 else jnp.dot(change(law.function, x, d, low), d) for law in laws]
-    d, missed = corrected(system, laws, x, low, d, jnp.stack(changes))
-    return jnp.where(missed <= MISSED * jnp.linalg.norm(x), d, jnp.nan)
+    changes = [
+        jnp.zeros(()) if law.sign == 0.0 else jnp.dot(change(law.function, x, d, compensation), d) for law in laws
+    ]
+    d, defect = corrected(system, laws, x, compensation, d, jnp.stack(changes))
+    return jnp.where(defect <= UNREACHED * jnp.linalg.norm(x), d, jnp.nan)
 
 
-MISSED = 1e-12
+UNREACHED = 1e-12
 """What a step may miss of the surface and the levels, relative to the state."""

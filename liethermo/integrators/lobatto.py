@@ -58,10 +58,10 @@ def lobatto(order: int) -> ExplicitTableau:
     tall = [np.ones(len(b))]
     for _ in range(order):
         tall.append(A @ tall[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
-    missed = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ tall[order])
+    defect = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ tall[order])
     seen = abs(d @ tall[q])
     assert seen > 0.0
-    return ExplicitTableau(A, b, d, q, missed / seen ** (order / q))
+    return ExplicitTableau(A, b, d, q, defect / seen ** (order / q))
 
 
 def _estimate(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:

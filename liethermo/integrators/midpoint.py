@@ -9,11 +9,11 @@ import manifolds as mf
 
 from ..functions.gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
-from .base import OneStepMethod, collocation_error, register
+from .base import OneStepMethod, TransportingMethod, collocation_error, register
 from .charts import in_charts
 
 
-class MetriplecticMidpoint(OneStepMethod):
+class MetriplecticMidpoint(TransportingMethod):
     """``(x' - x)/h = Pi(z) dgrad H + K_d(z) grad S(z)``, z the midpoint, dgrad a discrete gradient [BFM 4.5].
 
     K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly: for every H,
@@ -45,7 +45,8 @@ class MetriplecticMidpoint(OneStepMethod):
         self.gradient = discrete_gradient(gradient)
         self.retraction = retraction
 
-    def on(self, system: System) -> OneStepMethod:
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        del tolerance
         return in_charts(self, system, self.retraction, "midpoint")
 
     @property
@@ -57,33 +58,29 @@ class MetriplecticMidpoint(OneStepMethod):
         return self.gradient.order
 
     @property
-    def orderless(self) -> bool:
-        return self.gradient.orderless
-
-    @property
     def preserves(self) -> frozenset[str]:
         return frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
-        return system.field(*self.at_midpoint(system, x, low, h, k))[None]
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        return system.field(*self.at_midpoint(system, x, compensation, h, k))[None]
 
-    def at_midpoint(self, system: System, x, low, h, k) -> tuple:
+    def at_midpoint(self, system: System, x, compensation, h, k) -> tuple:
         """The midpoint z, and what the step takes for the gradients dH, dS and dL: the arguments of the field."""
         d = h * k[0]
-        z = x + (low + 0.5 * d)
-        dH = self.gradient(system.energy, x, d, low)
+        z = x + (compensation + 0.5 * d)
+        dH = self.gradient(system.energy, x, d, compensation)
         dS = None if system.entropy is None else system.entropy.gradient(z)
-        dL = tuple(self.gradient(L, x, d, low) for L in system.preserved)
+        dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved)
         return z, dH, dS, dL
 
-    def velocities(self, system: System, x, low, h, k) -> jax.Array:
-        return system.transport(*self.at_midpoint(system, x, low, h, k))[None]
+    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+        return system.transport(*self.at_midpoint(system, x, compensation, h, k))[None]
 
     def transports(self, system: System) -> bool:
         return True
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
-        return collocation_error(system, x, low, h, k)
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
+        return collocation_error(system, x, compensation, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..functions.frames import towards
 from ..functions.gradients import compensated
 from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
-from .base import Wrapping
+from .base import TransportingMethod, Wrapping, pulled
 from .explicit import LEVELS
 from .tableaus import gauss
 
@@ -69,11 +69,20 @@ class WithAttitude(Wrapping):
         if self.kind not in RECONSTRUCTIONS:
             raise InputError(f"the reconstruction is {', '.join(map(repr, RECONSTRUCTIONS))}, not {self.kind!r}")
 
+    @property
+    def _moving(self) -> TransportingMethod:
+        """The method, which says how it moves the body."""
+        if isinstance(self.method, TransportingMethod):
+            return self.method
+        raise InputError(
+            f"{self.method} does not say which velocities it moves with, so attitudes cannot be reconstructed"
+        )
+
     def keeps(self, system, name: str) -> bool:
         if name not in (SPATIAL_MOMENTUM, WITHOUT_IMPULSE):
             return self.method.keeps(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
-        return (self.explicit or follows) and self.method.transports(system.body)
+        return (self.explicit or follows) and self._moving.transports(system.body)
 
     def check(self, system) -> None:
         body = system.body
@@ -81,25 +90,17 @@ class WithAttitude(Wrapping):
 
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
-    def unknowns(self, system: AttitudeSystem) -> int:  # type: ignore[override]
-        if not self.explicit:
-            return self.method.unknowns(system.body)
-        return self.method.unknowns(TurningSystem(system, self.order, system.group.identity))
-
-    def judged(self, system: AttitudeSystem, x):  # type: ignore[override]
-        return self.method.judged(system.body_at(x), system.points(x))
-
-    def slopes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
+    def slopes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         """Those of the momentum; of an explicit method those of the angles beside it."""
-        method, mu, mu_low = self.method, system.points(x), system.points(low)
+        method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
         if self.explicit:
             local = TurningSystem(system, self.order, system.split(x)[1])
-            return method.pulled(local).slopes(local, local.around(x), local.around(low), h, k)
+            return pulled(method, local).slopes(local, local.around(x), local.around(compensation), h, k)
         body = system.body
         if not (isinstance(body, DrivenSystem) and body.needs_attitude):
-            return method.slopes(body, mu, mu_low, h, k)
-        pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_low, h, k))
-        found = pushed(self._torques(system, x, low, h, k))  # all stages with the torques of all
+            return method.slopes(body, mu, mu_compensation, h, k)
+        pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
+        found = pushed(self._torques(system, x, compensation, h, k))  # all stages with the torques of all
         return jnp.stack([found[i, i] for i in range(self.stages)])
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
@@ -110,43 +111,46 @@ class WithAttitude(Wrapping):
         k = self.method.start(local, local.around(x))  # behind the levels that it has begun on is room for more
         return k.at[LEVELS, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.to_space(g))
 
-    def missed(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        return self.method.missed(system.body, system.points(x), system.points(low), h, system.points(k))
-
-    def error(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:  # type: ignore[override]
-        return self.method.error(system.body_at(x), system.points(x), system.points(low), h, system.points(k))
+    def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
+        return self.method.error(system.body_at(x), system.points(x), system.points(compensation), h, system.points(k))
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
-    def move(self, system: AttitudeSystem, x, low, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
-        (mu, g), (mu_low, g_low) = system.split(x), system.split(low)
-        new, new_low = self.method.move(system.body, mu, mu_low, h, system.points(k))
+    def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
+        (mu, g), (mu_compensation, g_compensation) = system.split(x), system.split(compensation)
+        new, new_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
         if self.explicit:
-            return self._moved_explicitly(system, x, low, new, new_low, h, k)
-        xi = h * self.method.velocities(system.body, mu, mu_low, h, k)[:, : system.group.dim]
-        p, p_low = self._in_space(system, x, low, h, k, xi) if system.pushed_by else (None, None)
+            return self._moved_explicitly(system, x, compensation, new, new_compensation, h, k)
+        xi = h * self._moving.velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+        p, p_compensation = self._in_space(system, x, compensation, h, k, xi) if system.pushed_by else (None, None)
         if self.kind == "cayley":
-            gained = (g + g_low) @ _collocated(system.group.algebra.hat(xi))
-            turned, turned_low = compensated(g, g_low + gained)
-            return system.join(new, turned, p), system.join(new_low, turned_low + _missing(system.group, turned), p_low)
+            gained = (g + g_compensation) @ _collocated(system.group.algebra.hat(xi))
+            turned, turned_compensation = compensated(g, g_compensation + gained)
+            return system.join(new, turned, p), system.join(
+                new_compensation, turned_compensation + _missing(system.group, turned), p_compensation
+            )
         turned = system.group.restore_map(g @ self._turn(system.group, xi))
-        return system.join(new, turned, p), system.join(new_low, jnp.zeros_like(g), p_low)
+        return system.join(new, turned, p), system.join(new_compensation, jnp.zeros_like(g), p_compensation)
 
-    def _moved_explicitly(self, system: AttitudeSystem, x, low, new, new_low, h, k) -> tuple[jax.Array, jax.Array]:
+    def _moved_explicitly(
+        self, system: AttitudeSystem, x, compensation, new, new_compensation, h, k
+    ) -> tuple[jax.Array, jax.Array]:
         g, group, n = system.split(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         turned = g @ group.exp_map(group.algebra, local.angles(step))
-        follows, p_low = system.body.torque_free and self.method.transports(system.body), None
+        follows, p_compensation = system.body.torque_free and self._moving.transports(system.body), None
         if system.pushed_by:
-            p, p_low = compensated(system.in_space(x), system.in_space(low) + local.in_space(step))
+            p, p_compensation = compensated(system.in_space(x), system.in_space(compensation) + local.in_space(step))
             if follows:
-                p, p_low = _on_orbit(system.momenta, p, new), jnp.zeros_like(p)
+                p, p_compensation = _on_orbit(system.momenta, p, new), jnp.zeros_like(p)
         else:  # that of the start of the run, since the roundings of steps would add up
             p = k[LEVELS, system.body.dim : system.body.dim + n]
         if follows:
             turned = _carrying(group, turned, p, new[:n])
         turned = group.restore_map(turned)
-        return system.join(new, turned, p if system.pushed_by else None), system.join(new_low, jnp.zeros_like(g), p_low)
+        return system.join(new, turned, p if system.pushed_by else None), system.join(
+            new_compensation, jnp.zeros_like(g), p_compensation
+        )
 
     def _turn(self, group, xi) -> jax.Array:
         """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
@@ -154,38 +158,38 @@ class WithAttitude(Wrapping):
             return self._coadjoint(group, xi)
         return group.exp_map(group.algebra, gauss(len(xi)).b @ self._rates(group.algebra, xi))
 
-    def _attitudes(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:
+    def _attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Those at the stages, at which torques are taken, shape (stages, m, m), in the group."""
-        (mu, g), (mu_low, g_low), group = system.split(x), system.split(low), system.group
-        xi = h * self.method.velocities(system.body, mu, mu_low, h, k)[:, : system.group.dim]
+        (mu, g), (mu_compensation, g_compensation), group = system.split(x), system.split(compensation), system.group
+        xi = h * self._moving.velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
             return g @ group.exp_map(group.algebra, gauss(len(xi)).A @ self._rates(group.algebra, xi))
         if self.kind == "cayley":
-            found = (g + g_low) @ _stages(group.algebra.hat(xi))
+            found = (g + g_compensation) @ _stages(group.algebra.hat(xi))
         else:
             found = 0.5 * (g + g @ self._turn(group, xi))[None]  # the same from either end
         for _ in range(RESTORED):
             found = group.restore_map(found)
         return found
 
-    def _torques(self, system: AttitudeSystem, x, low, h, k) -> jax.Array:
+    def _torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Those at the stages, shape (stages, size of a state of the body without its clock)."""
-        body, states = system.body, system.points(x) + (system.points(low) + h * (gauss(len(k)).A @ k))
+        body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss(len(k)).A @ k))
         assert isinstance(body, DrivenSystem)
         if not body.needs_attitude:
             return jax.vmap(body.push)(states)
-        attitudes = self._attitudes(system, x, low, h, k)
+        attitudes = self._attitudes(system, x, compensation, h, k)
         return jax.vmap(lambda g, state: body.turned(g).push(state))(attitudes, states)
 
-    def _in_space(self, system: AttitudeSystem, x, low, h, k, xi) -> tuple[jax.Array, jax.Array]:
+    def _in_space(self, system: AttitudeSystem, x, compensation, h, k, xi) -> tuple[jax.Array, jax.Array]:
         """The momentum in space as the impulse of the step makes it, and what rounding keeps from it."""
-        torques = self._torques(system, x, low, h, k)[:, : system.group.dim]
+        torques = self._torques(system, x, compensation, h, k)[:, : system.group.dim]
         actions = _stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(-1, -2)  # Ad(inverse(g)), relative
         impulse = h * jnp.einsum("i,ia,iab->b", gauss(len(xi)).b, torques, actions)
         gained = impulse @ system.to_space(system.split(x)[1])
-        return compensated(system.in_space(x), system.in_space(low) + gained)
+        return compensated(system.in_space(x), system.in_space(compensation) + gained)
 
-    def along(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
+    def displaced(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """With the momentum displaced: what is looked at on the way of a step are functions of that."""
         mu, g = system.split(x)
         return system.join(mu + system.points(v), g, system.in_space(x))
@@ -268,8 +272,8 @@ def _on_orbit(momenta, p, mu) -> jax.Array:
     p, mu = p / size, mu[: momenta.algebra.dim] / size
     for _ in range(TURNS):
         whole = jnp.concatenate([p, mu[n:]])
-        missed = jnp.stack([C.value(mu) - C.value(whole) for C in casimirs])
-        p = p + towards([C.gradient(whole)[:n] for C in casimirs], missed)
+        defect = jnp.stack([C.value(mu) - C.value(whole) for C in casimirs])
+        p = p + towards([C.gradient(whole)[:n] for C in casimirs], defect)
     return size * p
 
 
@@ -283,14 +287,14 @@ def _carrying(group, g, p, new) -> jax.Array:
 
     def nearer(made: int, g) -> jax.Array:
         m = group.Ad_star(g, p)
-        missed, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
+        defect, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
         square = moved @ moved.T
         most = jnp.max(jnp.diagonal(square))
         damping = jnp.where(most > 0.0, DAMPING * most, 1.0)  # what moves m by rounding alone does not turn either
-        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (moved @ missed)[:, None])[:, 0]
+        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (moved @ defect)[:, None])[:, 0]
         g = g @ group.exp_map(algebra, eta)
         if made == TURNS:
             return g
-        return jax.lax.cond(jnp.max(jnp.abs(missed)) > DAMPING, lambda: nearer(made + 1, g), lambda: g)
+        return jax.lax.cond(jnp.max(jnp.abs(defect)) > DAMPING, lambda: nearer(made + 1, g), lambda: g)
 
     return nearer(1, g)

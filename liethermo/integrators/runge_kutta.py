@@ -69,10 +69,6 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return LAST + 1
 
     @property
-    def orderless(self) -> bool:
-        return True
-
-    @property
     def evaluations(self) -> int:
         return len(self.tableau.b)
 
@@ -80,13 +76,13 @@ class MetriplecticRungeKutta(ExplicitMethod):
     def tableau(self) -> ExplicitTableau:
         return lobatto(self.order)
 
-    def uncorrected(self, system: System, laws: list[Law], x, low, h) -> Unlawful:
+    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
         t = self.tableau
         s = len(t.b)
 
         def stage(slopes, row):
             i, weights = row
-            found, rates = self.rates(system, laws, x + (low + h * (weights @ slopes)))
+            found, rates = self.rates(system, laws, x + (compensation + h * (weights @ slopes)))
             return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
 
         slopes, rates = jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
@@ -102,9 +98,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
         found[..., LAST] = theta**2 * (theta - 1.0)
         return found
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """From weights that lower orders leave undetermined: see :class:`.lobatto.ExplicitTableau`."""
-        del system, x, low
+        del system, x, compensation
         t = self.tableau
         found, length = h * jnp.max(jnp.abs(k[ERROR])), h * jnp.max(jnp.abs(k[SLOPE]))
         return t.scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.q)

@@ -14,7 +14,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..systems import System
 from ..tracing.taylor import NoSeriesError, check_series, solution
-from .base import register
+from .base import OneStepMethod, register
 from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Law, Unlawful
 from .lobatto import lobatto_rule
 
@@ -26,7 +26,7 @@ TOLERANCE = 1e-10
 """What the order is chosen for where no tolerance is given."""
 
 
-def _asked_for(tolerance: float | None) -> int:
+def order_for(tolerance: float | None) -> int:
     """The order that a relative tolerance asks for [Jorba & Zou 2005]."""
     order = math.ceil(1.0 - 0.5 * math.log(TOLERANCE if tolerance is None else tolerance))
     return min(max(LOWEST, order), HIGHEST)
@@ -75,22 +75,18 @@ class MetriplecticTaylor(ExplicitMethod):
             raise InputError(f"the order is an integer from {LOWEST} to {HIGHEST}, or None, not {order!r}")
         super().__init__(order, preserve, retraction, held)
 
-    def suited(self, tolerance: float | None) -> MetriplecticTaylor:
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         if self.number is not None:
-            return self
-        return type(self)(_asked_for(tolerance), self.functions, self.retraction, self.held)
+            return super().on(system)
+        return type(self)(order_for(tolerance), self.functions, self.retraction, self.held).on(system)
 
     @property
     def order(self) -> int:
-        return _asked_for(None) if self.number is None else self.number
+        return order_for(None) if self.number is None else self.number
 
     @property
     def stages(self) -> int:
         return OWN + self.order
-
-    @property
-    def orderless(self) -> bool:
-        return True
 
     @property
     def evaluations(self) -> int:
@@ -116,11 +112,11 @@ class MetriplecticTaylor(ExplicitMethod):
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
                 ) from None
 
-    def uncorrected(self, system: System, laws: list[Law], x, low, h) -> Unlawful:
+    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
         nodes, b = self._rule
         numbers = np.arange(1.0, self.order + 1.0)
         c = solution(lambda y: self.rates(system, laws, y)[0], x, h, self.order)  # from the centre of a chart, exactly
-        points = jnp.concatenate([x[None], x + (low + nodes[1:, None] ** numbers @ c)])
+        points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** numbers @ c)])
         fields, rates = jax.vmap(lambda y: self.rates(system, laws, y))(points)
         defect = fields[-1] - (numbers @ c) / h
         return Unlawful(jnp.sum(c, axis=0), h * (b @ rates), defect / (self.order + 1), c / h)
@@ -134,13 +130,13 @@ class MetriplecticTaylor(ExplicitMethod):
         found[..., SLOPE] = last[..., 0]
         return found
 
-    def error(self, system: System, x, low, h, k) -> jax.Array:
+    def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """From how far the polynomial X misses the field at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also sees where a test has been decided otherwise on the way.
         """
-        del system, x, low
+        del system, x, compensation
         return h * jnp.max(jnp.abs(k[ERROR]))
 
 

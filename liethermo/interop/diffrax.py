@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators.base import estimates_error
 from ..runs.flow import first_carry, one_step
 from ..systems import System
 
@@ -83,11 +84,11 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         del args, made_jump
         system, method = self._on(terms)
         h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to turn time around
-        low, k, before = solver_state
-        y1, *state = one_step(system, method, (y0, low, k, before), h)
+        compensation, k, before = solver_state
+        y1, *state = one_step(system, method, (y0, compensation, k, before), h)
         solved = jnp.isfinite(jnp.sum(y1))
         slopes = state[1]
-        error = method.error(system, y0, low, jnp.abs(h), slopes) if method.has_estimate else jnp.zeros(())
+        error = method.error(system, y0, compensation, jnp.abs(h), slopes) if estimates_error(method) else jnp.zeros(())
         estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(solved, error, jnp.inf)))
         field = system.vector_field
         dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}
@@ -104,4 +105,4 @@ class Solver(diffrax.AbstractAdaptiveSolver):
             raise InputError(
                 "an energy that depends on time needs a clock and a ledger in the state: use lt.integrate or lt.flow"
             )
-        return system, traced_energies(self.method.pulled(system).on(system), system.dim)
+        return system, traced_energies(self.method.on(system), system.dim)

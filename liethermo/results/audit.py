@@ -314,9 +314,9 @@ def _entropy_row(solution: Record, tolerances: Tolerances) -> tuple[float, Audit
 
 def _of_the_steps(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
     """Whether the steps resolve the motion, and whether it is that of the system."""
-    rows, missed = [accuracy_row(evidence, tolerances)], evidence.inconsistency
-    if missed is not None:
-        row = _verdict(CONSISTENCY, missed, tolerances.consistency)
+    rows, defect = [accuracy_row(evidence, tolerances)], evidence.inconsistency
+    if defect is not None:
+        row = _verdict(CONSISTENCY, defect, tolerances.consistency)
         note = "" if row.passed else "short steps of this method do not follow the vector field of this system"
         rows.append(replace(row, note=note))
     return rows

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.rounding import with_rounding
 from ..integrators import OneStepMethod
+from ..integrators.fluctuating import noise_dimension
 from ..systems import System
 from ..tracing.interpret import at_points
 from ..tracing.scalarize import UnsupportedPrimitive
@@ -140,7 +141,9 @@ class Witness:
         own = dict(zip(names, _largest(sensitivities), strict=True))
         energy, entropy = own.pop("energy"), own.pop("entropy", None)
         found = Evidence(energy, entropy, own, dict(zip(names, _largest(terms), strict=True)))
-        if not isinstance(self.method, OneStepMethod) or self.method.increments:  # noise is what a short step shows
+        if not isinstance(self.method, OneStepMethod) or noise_dimension(
+            self.method
+        ):  # noise is what a short step shows
             return found
         count = len(self.h)
         if not count:
@@ -148,18 +151,18 @@ class Witness:
         places = np.asarray(self.system.points(some)).reshape(len(some), -1).view(np.float64)
         whole = WHOLE * float(np.ptp(places, axis=0).max())
         looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
-        again, missed = self._worst(looked, whole)
+        again, defect = self._worst(looked, whole)
         least = self._least_field(looked.x[again])
         tried = [self._step(looked.x[i], looked.h[i], looked.t[i], f) for i, f in zip(again, least, strict=True)]
         steps = [step for step in tried if step is not None and step.length > STILL]
         if not steps:  # nothing moves
             return found
         found = dataclasses.replace(found, inconsistency=self._inconsistency(steps))
-        told = [step is None or step.moved > STILL * step.size for step in tried]
-        if not any(told):
+        moving = [step is None or step.moved > STILL * step.size for step in tried]
+        if not any(moving):
             return found
-        errors = np.array([self._local_error(*step, whole) for step in zip(tried, told, strict=True)])
-        errors = np.where(np.isfinite(errors), errors, missed)  # nothing better is known
+        errors = np.array([self._local_error(*step, whole) for step in zip(tried, moving, strict=True)])
+        errors = np.where(np.isfinite(errors), errors, defect)  # nothing better is known
         worst = int(np.argmax(errors))
         return dataclasses.replace(
             found, local_error=float(errors[worst]), error_time=float(looked.t[again[worst]]), looked=len(looked.h)
@@ -182,9 +185,9 @@ class Witness:
 
         return worst_of(steps, field, whole, taken_again(self.system.dim))
 
-    def _local_error(self, step: _Step | None, told: bool, whole: float) -> float:
+    def _local_error(self, step: _Step | None, moving: bool, whole: float) -> float:
         """How far from the end of a step the short ones in its place end; NaN where they cannot be taken."""
-        if step is None or not told:
+        if step is None or not moving:
             return np.nan if step is None else 0.0
         parts = taken_again(self.system.dim)
         short = self._step(step.x, step.h / parts, step.t, step.least, parts)
@@ -207,8 +210,8 @@ class Witness:
         if not starts:
             return None
         found = iter(field_at(self.system, np.array(starts + ends)).reshape(2, len(starts), -1).swapaxes(0, 1))
-        missed = [[_missed(step, blocks, *next(found)) for step in steps] for steps in short]
-        return max((np.nanmin(values) for values in missed if np.isfinite(values).any()), default=None)
+        defect = [[_missed(step, blocks, *next(found)) for step in steps] for steps in short]
+        return max((np.nanmin(values) for values in defect if np.isfinite(values).any()), default=None)
 
     def _step(self, x: np.ndarray, h: float, t: float, least: np.ndarray, steps: int = 1) -> _Step | None:
         """A step from a state at a time, or so many in its place; None where it cannot be taken."""
@@ -219,7 +222,7 @@ class Witness:
             return None
         if int(state.status) != 0:
             return None
-        d = (np.asarray(state.x) - x) + np.asarray(state.low)
+        d = (np.asarray(state.x) - x) + np.asarray(state.compensation)
         start = np.asarray(points(x))
         moved = float(np.abs(np.asarray(points(x + d)) - start).max())
         lengths = (
@@ -283,9 +286,9 @@ def worst_of(steps: Steps, field: Callable, whole, number: int) -> tuple[np.ndar
         The least distance that what they miss is taken relative to.
     """
     moved = np.abs(steps.end - steps.x).max(axis=1)
-    missed = misfit(field, steps) / np.fmax(np.fmax(moved, whole), TINY)
-    chosen = most_and_others(missed, number)
-    return chosen, missed[chosen]
+    defect = misfit(field, steps) / np.fmax(np.fmax(moved, whole), TINY)
+    chosen = most_and_others(defect, number)
+    return chosen, defect[chosen]
 
 
 def most_and_others(values: np.ndarray, number: int) -> np.ndarray:
@@ -313,8 +316,3 @@ def sizes(functions: Sequence[Energy], x) -> tuple[jnp.ndarray, jnp.ndarray]:
     """The sensitivities of functions at a state, and the sizes at which their values are rounded."""
     sensitivities = jnp.stack([f.sensitivity(x) for f in functions])
     return sensitivities, jnp.stack([with_rounding(f.value, x)[1] for f in functions])
-
-
-def has_estimate(method) -> bool:
-    """Whether a method knows the error of its steps."""
-    return isinstance(method, OneStepMethod) and method.has_estimate

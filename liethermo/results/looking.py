@@ -115,10 +115,10 @@ def misfit(field: Callable, steps: Steps) -> np.ndarray:
         slopes = h[:, None] * field(part, ends)
         data = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
         between = sum(c * v for c, v in zip(value, data, strict=True))
-        missed = np.abs(h[:, None] * field(part, between) - sum(c * v for c, v in zip(slope, data, strict=True))).max(
+        defect = np.abs(h[:, None] * field(part, between) - sum(c * v for c, v in zip(slope, data, strict=True))).max(
             axis=2
         )
-        found[part] = np.nan_to_num(missed, nan=0.0, posinf=1e300).mean(axis=1)
+        found[part] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..engines.pacing import Pacing
 from ..errors import InputError
 from ..integrators import OneStepMethod
-from ..results.evidence import has_estimate
+from ..integrators.base import estimates_error
 from .events import Event
 
 UNDERFLOW = 1e-14
@@ -78,7 +78,7 @@ def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, even
     """
     adaptive = isinstance(step, Adaptive)
     if isinstance(step, Adaptive):
-        if not has_estimate(method):
+        if not estimates_error(method):
             raise InputError(f"the steps of {method} cannot be adaptive: {method.fixed}")
         numbers = [step.rtol, step.atol, step.first or 0.0, step.largest or math.inf]
         numbers += [UNDERFLOW * length, step.most_steps]

@@ -13,6 +13,7 @@ from manifolds._precision import by_own_settings
 from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
@@ -127,10 +128,10 @@ def ensemble(
     if reasons:
         run = np.setdiff1d(run, list(reasons))
         family, states = family.select(run), states[run]
-    told = member = decided(family.representative, states)
+    given = member = decided(family.representative, states)
     one_body = _same_inertia(family, member)
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
-    paths = None if noise is None or not method.increments else Paths(noise, method.increments, run)
+    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
     attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
     family, states = as_family(family, member), np.asarray(begun(member, states, course.start, attitude, batch=True))
     method.check(member)
@@ -171,13 +172,17 @@ def ensemble(
         wall_time=time.perf_counter() - started,
         provenance={
             **provenance_of(
-                told, method, step if isinstance(step, Adaptive) else course.h, (course.start, course.end), course.every
+                given,
+                method,
+                step if isinstance(step, Adaptive) else course.h,
+                (course.start, course.end),
+                course.every,
             ),
             **({} if one_body else {"inertia": None}),
             "engine": chosen,
             "noise": None if noise is None else noise.listed(),
         },
-        witness=None if method.increments else followed,
+        witness=None if noise_dimension(method) else followed,
         alone=Alone(record, method, run),
     )
 

@@ -93,18 +93,21 @@ def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ..
 
 def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h) -> tuple[jax.Array, ...]:
     """A step that JAX differentiates, from what :func:`first_carry` says; NaN where it could not be solved."""
-    x, low, k, before = carry
+    x, compensation, k, before = carry
     if method.explicit:
-        solved = explicit(system, method, x, low, h, k)
+        solved = explicit(system, method, x, compensation, h, k)
         new = jnp.where(solved.converged, solved.k, jnp.nan)
     else:
-        new = _stages(system, method, x, low, h, method.predict(k, before))
-    after, after_low, energy, *_ = finish(system, method, x, low, h, new)
+        new = _stages(system, method, x, compensation, h, method.predict(k, before))
+    after, after_compensation, energy, *_ = finish(system, method, x, compensation, h, new)
     if holds_energy(system, method):
-        after_low = shifted(
-            system, after, after_low, steering(system, after, after_low, energy, system.energy.value(x))
+        after_compensation = shifted(
+            system,
+            after,
+            after_compensation,
+            steering(system, after, after_compensation, energy, system.energy.value(x)),
         )
-    return after, after_low, new, k
+    return after, after_compensation, new, k
 
 
 def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
@@ -115,21 +118,21 @@ def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: i
     return jax.lax.scan(one_save, carry, length=saves)
 
 
-def _stages(system: System, method: OneStepMethod, x, low, h, guess) -> jax.Array:
+def _stages(system: System, method: OneStepMethod, x, compensation, h, guess) -> jax.Array:
     """The solution of the stage equations, differentiated as the implicit function that it is."""
-    dynamic, static = eqx.partition((system, method, x, low, h), eqx.is_array)
+    dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
     def slopes(dynamic, k):
-        system, method, x, low, h = eqx.combine(dynamic, static)
-        return method.slopes(system, x, low, h, k)
+        system, method, x, compensation, h = eqx.combine(dynamic, static)
+        return method.slopes(system, x, compensation, h, k)
 
     def solve(dynamic, guess):
-        system, method, x, low, h = eqx.combine(dynamic, static)
+        system, method, x, compensation, h = eqx.combine(dynamic, static)
         own = Equations(
             slopes=lambda k: slopes(dynamic, k),
             guess=guess,
-            scale=lambda k: scale_of(method.judged(system, x)[1], h, k),
-            inverted=newton_steps(system, method, x, low, h),
+            scale=lambda k: scale_of(system.solved_for(x)[1], h, k),
+            inverted=newton_steps(system, method, x, compensation, h),
             noise=lambda: noise_of(system, method, x),
         )
         solved = solve_stages(own)

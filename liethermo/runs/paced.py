@@ -82,7 +82,7 @@ class Many:
         record.begin(places, before["x"], before["energy"], before["entropy"])
         followed = np.ones(len(places), dtype=bool)
         guide.resume()
-        record.rows["first_step"][places] = np.minimum(paces.read("wish"), self._times[2])
+        record.rows["first_step"][places] = np.minimum(paces.read("proposed"), self._times[2])
 
         def finish(ended: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray) -> None:
             at = {name: values[ended] for name, values in before.items()}

@@ -12,6 +12,8 @@ from manifolds._arrays import is_traced
 from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import OneStepMethod, WithAttitude
+from ..integrators.base import pulled
+from ..integrators.fluctuating import noise_dimension
 from ..results.status import Laws
 from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, LiePoissonSystem, System, driven, embedded
 from ..tracing.remembered import remembered
@@ -62,7 +64,7 @@ def of_steps(
     """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
     charts = getattr(method, "retraction", None) is not None
     found = driven(system if charts else embedded(system))
-    method = traced_energies(method.suited(tolerance).pulled(found).on(found), found.dim)
+    method = traced_energies(pulled(method, found).on(found, tolerance), found.dim)
     wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
     if wanted is None or not (attitude or system.needs_attitude):
         return found, method
@@ -111,7 +113,7 @@ def laws_of(system: System, method, invariants) -> Laws:
     unknown = tuple(name for name, (_, kept) in invariants.items() if kept is None)
     conserved = tuple(name for name in constants if keeps(system, name))
     unpromised = tuple(name for name in constants if name not in conserved)
-    if isinstance(method, OneStepMethod) and method.increments:  # what holds on paths, and what in the mean
+    if isinstance(method, OneStepMethod) and noise_dimension(method):  # what holds on paths, and what in the mean
         energy = "conserved" if system.energy_law == "conserved" else None
         mean = ("energy", "entropy") if energy is None else ("entropy",)
         return Laws(energy, None, conserved, tuple(system.ledger), (), system.balance, unpromised, mean, unknown)

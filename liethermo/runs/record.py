@@ -275,19 +275,19 @@ class Followed:
             flat = np.concatenate([given, x], axis=2).reshape(-1, own.shape[1] + x.shape[2])
             return _fields(model, flat).reshape(x.shape)
 
-        again, missed = worst_of(steps, field, whole[of], taken_again(self.x.shape[1]))
+        again, defect = worst_of(steps, field, whole[of], taken_again(self.x.shape[1]))
         chosen, x, h = self.family.select(of[again]), steps.x[again], steps.h[again]
         parts = taken_again(self.x.shape[1])
         (one, _), (short, _) = (self.follow(chosen, self.method, x, h / m, m) for m in (1, parts))
-        ends = [self._seen(after["x"] + after["low"]) for after in (one, short)]
+        ends = [self._seen(after["x"] + after["compensation"]) for after in (one, short)]
         start = self._seen(x)
         moved = np.abs(ends[0] - start).max(axis=1)
         known = (one["status"] == 0) & (short["status"] == 0)
-        told = ~known | (moved > STILL * np.abs(start).max(axis=1))
-        if not told.any():
+        moving = ~known | (moved > STILL * np.abs(start).max(axis=1))
+        if not moving.any():
             return found
         errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(np.fmax(moved, whole[of[again]]), TINY)
-        errors = np.where(told, np.where(known, errors, missed), 0.0)
+        errors = np.where(moving, np.where(known, errors, defect), 0.0)
         worst = int(np.argmax(errors))
         return replace(
             found, local_error=float(errors[worst]), error_time=float(steps.t[again[worst]]), looked=len(steps.h)

@@ -15,6 +15,7 @@ from ..engines.codes import Code
 from ..engines.stepping import values
 from ..errors import FileError
 from ..integrators import Reference
+from ..integrators.fluctuating import noise_dimension
 from ..results.dense import Dense
 from ..results.solution import Solution
 from ..results.status import Stats, Status
@@ -62,7 +63,7 @@ class Run:
         self.path = [(self.times[0], self.states[0])] if dense else None  # all states
         self.taken: list[np.ndarray] = []  # sizes of steps that are looked at, and whether states after them are kept
         self.noise = noise
-        path = None if noise is None or not method.increments else Path(noise, method.increments)
+        path = None if noise is None or not noise_dimension(method) else Path(noise, noise_dimension(method))
         self.engine = Chosen(system, method, engine, course.steps, path)
 
     @property

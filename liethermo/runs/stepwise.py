@@ -103,13 +103,13 @@ def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_
     guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
     outcome.jumps = guide.jumps
 
-    def told(name: str) -> float:
+    def scalar(name: str) -> float:
         return float(paces.read(name)[0])
 
     while True:
         guide.verify()
         guide.resume()
-        code, t = int(told("status")), told("t")
+        code, t = int(scalar("status")), scalar("t")
         if code == Code.EVENT:
             outcome.event_time = t
         if code != Code.COMPLETED:
@@ -119,7 +119,7 @@ def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_
             return
         before = outcome.state
         rows = paces.attempts(int(min(1 if watch else TOGETHER, max(1.0, most_kept - int(before.step)))))
-        outcome.rejected = int(told("rejected"))
+        outcome.rejected = int(scalar("rejected"))
         after: Any = paces.state()
         outcome.state = after._replace(status=np.int64(0))
         if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
@@ -134,11 +134,11 @@ def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_
     if code == Code.STEP_LIMIT:
         outcome.limit = "steps"
     elif code == Code.STEP_UNDERFLOW:
-        outcome.underflow = told("wish")
-        outcome.state = outcome.state._replace(status=np.int64(told("cause")), residual=told("residual"))
+        outcome.underflow = scalar("proposed")
+        outcome.state = outcome.state._replace(status=np.int64(scalar("cause")), residual=scalar("residual"))
     elif code not in (Code.EVENT, FINISHED):
-        outcome.state = outcome.state._replace(status=np.int64(code), residual=told("residual"))
-        outcome.limit = "sight" if told("cause") == Code.COMPLETED else ""
+        outcome.state = outcome.state._replace(status=np.int64(code), residual=scalar("residual"))
+        outcome.limit = "sight" if scalar("cause") == Code.COMPLETED else ""
 
 
 def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:

@@ -15,6 +15,7 @@ from ..engines.choice import Chosen
 from ..engines.pacing import DEADBAND, rate_of
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
+from ..integrators.taylor import order_for
 from ..systems import System
 from .adaptive import Adaptive, pacing_of
 from .preparation import begun, of_steps
@@ -95,7 +96,7 @@ class MethodSuggestion:
         return "\n".join([*lines, self.reason])
 
 
-CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), MetriplecticTaylor(), *map(MetriplecticGauss, (1, 2, 3, 4)))
+CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
 
 
 @by_own_settings
@@ -116,7 +117,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
         Where nothing moves at x0, or no method reaches the accuracy.
     """
     trials, refusals = [], []
-    for method in CANDIDATES:
+    for method in (*CANDIDATES, MetriplecticTaylor(order_for(rtol))):
         try:
             trials.append(_tried(system, x0, rtol, method, t0))
         except LiethermoError as error:
@@ -138,8 +139,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
 
 
 def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
-    method = method.suited(rtol)
-    system, used = of_steps(system, method)
+    system, used = of_steps(system, method, rtol)
     used.check(system)
     x = np.asarray(begun(system, x0, t0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())

@@ -14,6 +14,7 @@ from ..engines.rules import EPS
 from ..engines.stepping import State
 from ..errors import InputError
 from ..integrators import OneStepMethod
+from ..integrators.base import event_shares
 from ..systems import System
 from ..tracing.programs import program
 
@@ -21,7 +22,7 @@ from ..tracing.programs import program
 class Watch:
     """Events for ``integrate(until=...)`` with adaptive steps: any number, counted, and only some of them an end.
 
-    A step in which a function changes its sign, at its ends or at the looks of the method between, is taken again in
+    A step in which a function changes its sign, at its ends or at the shares between, is taken again in
     parts until one ends at the zero: :attr:`states` are ends of steps, so that the laws hold there.
 
     Parameters
@@ -80,11 +81,11 @@ class Watch:
         return (before < 0.0 <= after and direction >= 0.0) or (before > 0.0 >= after and direction <= 0.0)
 
     def _zeros(self, j: int, step: _Step, start: float, end: float) -> list[float]:
-        """The shares of a step at which a function is zero: the looks tell where a part of the step is to be tried."""
-        shares = [0.0, *step.looks, 1.0]
+        """The shares of a step at which a function is zero: values between show which parts of the step to try."""
+        shares = [0.0, *step.shares, 1.0]
         between = [
             float(self.functions[j](step.time(share), y, *self.args))
-            for share, y in zip(step.looks, step.between, strict=True)
+            for share, y in zip(step.shares, step.between, strict=True)
         ]
         values, known = [start, *between, end], {0, len(shares) - 1}
         while True:
@@ -136,7 +137,7 @@ class _Step:
         self.engine, self.t, self.h, self.reached = engine, t, h, reached
         self._states = {0.0: before, 1.0: after}
         self._seen: dict[float, np.ndarray] = {}
-        self.looks = [float(share) for share in engine.method.looks]
+        self.shares = [float(share) for share in event_shares(engine.method.order)]
         self._between: np.ndarray | None = None
 
     def time(self, share: float) -> float:
@@ -157,10 +158,10 @@ class _Step:
 
     @property
     def between(self) -> np.ndarray:
-        """About the states at the looks, by the polynomial of the step."""
+        """About the states at the shares, by the polynomial of the step."""
         if self._between is None:
             method, after = self.engine.method, self._states[1.0]
-            v = self.h * (np.asarray(method.weights(np.array(self.looks))) @ np.asarray(after.k))
+            v = self.h * (np.asarray(method.weights(np.array(self.shares))) @ np.asarray(after.k))
             x = _along(self.engine.system, method, np.asarray(self._states[0.0].x), v)
             self._between = np.asarray(self.engine.system.seen(np.asarray(x)))
         return self._between
@@ -183,4 +184,4 @@ def _count(function: Any) -> int | None:
 
 @program
 def _along(system: System, method: OneStepMethod, x, v):
-    return jax.vmap(lambda v: method.along(system, x, v))(v)
+    return jax.vmap(lambda v: method.displaced(system, x, v))(v)

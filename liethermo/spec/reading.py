@@ -72,7 +72,7 @@ class Spec:
         return {**defaults, **self.parameters}
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """The run in a line."""
         start, end = self.run.t_span
         step = self.step if isinstance(self.step, Adaptive) else f"step {self.step:g}"

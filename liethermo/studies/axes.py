@@ -69,8 +69,8 @@ def zipped(**columns) -> Zipped:
     if not found:
         raise InputError("zipped needs parameters: zipped(a=[1.0, 2.0], b=[3.0, 4.0])")
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
-        raise InputError(f"parameters that vary together need equally many values: {told}")
+        counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        raise InputError(f"parameters that vary together need equally many values: {counts}")
     return Zipped(found)
 
 
@@ -289,7 +289,7 @@ class Axes:
             (axis.states[i] for axis, i in zip(self.axes, places, strict=True) if axis.states is not None), None
         )
 
-    def told(self, place: tuple[int, ...]) -> str:
+    def describe(self, place: tuple[int, ...]) -> str:
         """A point in words."""
         return ", ".join(
             f"{name} = {column[i]:g}" if column.dtype.kind in "fiu" else f"{name} = {column[i]}"

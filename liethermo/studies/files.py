@@ -257,8 +257,8 @@ def locked(root: Path) -> Iterator[Callable[[int], None]]:
         except OSError as error:
             if isinstance(error, FileError):
                 raise
-            told = disk.why(error)
-            raise FileError(f"{root} cannot be locked ({told}): two runs at once could not be told") from error
+            reason = disk.why(error)
+            raise FileError(f"{root} cannot be locked ({reason}): two runs at once could not be told") from error
 
         def tell(done: int) -> None:
             now = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": done}
@@ -283,8 +283,8 @@ def _held(file, tries: int = 5) -> bool:
 
 def holder(root: Path) -> str:
     """Who works on a store, in words."""
-    told = running(root) or {}
-    return f"process {told.get('pid', '?')} on {told.get('host', '?')}"
+    run = running(root) or {}
+    return f"process {run.get('pid', '?')} on {run.get('host', '?')}"
 
 
 def running(root: Path) -> dict[str, Any] | None:

@@ -50,15 +50,19 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
         "method": repr(task.method),
         "until": _until(task.until),
         "noise": None if task.noise is None else task.noise.listed(),
-        "measures": {name: measure.told() for name, measure in task.measures.items()},
+        "measures": {name: measure.description() for name, measure in task.measures.items()},
         "values": {name: _numbers(columns.measures[name][0]) for name in task.measures},
     }
 
 
 def provenance(described: Mapping[str, Any], engine: str) -> dict[str, Any]:
     """Where the results come from, for people."""
-    told = {key: described[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
-    return {**told, **{f"{name}_version": version for name, version in described["versions"].items()}, "engine": engine}
+    chosen = {key: described[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
+    return {
+        **chosen,
+        **{f"{name}_version": version for name, version in described["versions"].items()},
+        "engine": engine,
+    }
 
 
 def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:

@@ -73,7 +73,7 @@ class Measure(Protocol):
         """Its values of at least the first ``count`` trajectories, and why it has none of some of them."""
         ...
 
-    def told(self) -> str:
+    def description(self) -> str:
         """What it is, in words that tell it from another."""
         ...
 
@@ -96,7 +96,7 @@ class Named:
             raise InputError(f"this system has no {field}, so that {self.name!r} is no measure of it")
         return _last(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
 
-    def told(self) -> str:
+    def description(self) -> str:
         return FIELDS[self.name]
 
 
@@ -119,7 +119,7 @@ class EventTime:
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         return ensemble.event_time, {}
 
-    def told(self) -> str:
+    def description(self) -> str:
         return f"time of {self.event}"
 
 
@@ -138,7 +138,7 @@ class AtTimes:
         places = [int(np.argmin(np.abs(ensemble.t - t))) for t in self.at.times]
         return values[:, places], {}
 
-    def told(self) -> str:
+    def description(self) -> str:
         return f"{self.at.what} at {list(self.at.times)}"
 
 
@@ -183,7 +183,7 @@ class OfSolution:
     def _name(self) -> str:
         return getattr(self.function, "__qualname__", type(self.function).__name__)
 
-    def told(self) -> str:
+    def description(self) -> str:
         return f"function {self._name}"
 
 

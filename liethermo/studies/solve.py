@@ -181,7 +181,7 @@ class Solver:
             part = self._ensemble(points, x0s, attitudes, chosen)
         except Exception as error:  # of one point, it is its status
             if len(chosen) == 1:
-                reasons[int(chosen[0])] = told(error)
+                reasons[int(chosen[0])] = reason_of(error)
                 return []
         else:
             refused = part[-1].reasons  # of those, as of others, nothing may depend on who else is there
@@ -296,7 +296,7 @@ def _terms_of_form(model, at):
     return sizes(laws_functions(form.build(at[:p])), at[p:])[1]
 
 
-def told(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """What was raised: the library's own messages as they are, others with their kind."""
     own = type(error).__module__.partition(".")[0] in ("liethermo", "manifolds")
     return str(error) if own else f"{type(error).__name__}: {error}"

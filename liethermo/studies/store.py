@@ -419,8 +419,8 @@ def matched(mine: Axes, theirs: Axes) -> Axes:
         If the axes are others, or mine lack values that the store has.
     """
     if mine.names != theirs.names or [tuple(a.columns) for a in mine.axes] != [tuple(a.columns) for a in theirs.axes]:
-        told = [", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (mine, theirs)]
-        raise InputError(f"the axes are {told[0]}, and those of the store {told[1]}")
+        names = [", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (mine, theirs)]
+        raise InputError(f"the axes are {names[0]}, and those of the store {names[1]}")
     found = []
     for axis, other in zip(mine.axes, theirs.axes, strict=True):
         if axis.same(other):  # what follows takes microseconds a value

@@ -86,7 +86,7 @@ def audit(path: Any, **tolerances: float) -> Audit:
             row = law.as_row(i)
             if law.law not in worst or _beyond(row) > _beyond(worst[law.law]):
                 place = tuple(int(p[np.flatnonzero(ended)[i]]) for p in store.places(index))
-                worst[law.law] = dataclasses.replace(row, note=f"worst at {axes.told(place)}")
+                worst[law.law] = dataclasses.replace(row, note=f"worst at {axes.describe(place)}")
     rows = list(worst.values())
     for name, code in STATUSES.items():
         if code not in (*GOOD, MISSING) and counts.get(code):

@@ -30,7 +30,7 @@ from .measures import At, AtTimes, Measure, OfSolution, measures_of
 from .members import ASKED, Watched, builder, plain
 from .progress import Bar, StudyStatus
 from .running import here, spread
-from .solve import MEASURE_FAILED, STATUSES, Columns, Solver, Task, told
+from .solve import MEASURE_FAILED, STATUSES, Columns, Solver, Task, reason_of
 from .store import FORMAT, Store, Survey, matched
 from .stored import audit, held_results, status, status_of
 
@@ -53,7 +53,7 @@ HOPELESS = 2
 """Systems that are built and cannot be run, after which no more are tried."""
 
 SLOW = 1_000
-"""Points from which one is told that each has to be built by itself."""
+"""Points from which one is reason_of that each has to be built by itself."""
 
 
 class Study:
@@ -157,7 +157,7 @@ class Study:
             for name in (*taken, *self._measures)
         }
         for name, what in self._measures.items():
-            self._about[name].setdefault("long_name", what.told())
+            self._about[name].setdefault("long_name", what.description())
         unknown = [name for name in (*(units or {}), *(names or {})) if name not in self._about]
         if unknown:
             raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
@@ -341,7 +341,7 @@ class Study:
             if self._solved is not None and not why:
                 self._place = place
                 return self._solved
-            first = first or f"{axes.told(place)}: {why}"
+            first = first or f"{axes.describe(place)}: {why}"
             failed += built
             if failed == HOPELESS:
                 break
@@ -360,7 +360,7 @@ class Study:
         try:
             solver = Solver(dataclasses.replace(self._task, example=point))
         except Exception as error:  # the builder may be anyone's, and may raise at some points
-            return told(error), False
+            return reason_of(error), False
         columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1, seeds)
         if columns.status[0] in (Code.INADMISSIBLE, MEASURE_FAILED):
             return columns.message[0], True
@@ -391,7 +391,7 @@ class Study:
                 if ASKED in str(error):
                     raise
                 return
-            except Exception:  # told as the reason of this point
+            except Exception:  # reason_of as the reason of this point
                 return
         unread = [name for name in self._axes.parameters if name not in watched.seen]
         if unread:

@@ -100,6 +100,9 @@ class AttitudeSystem(System):
         """The body, for use at the attitude of a state."""
         return self.body.turned(self.split(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
 
+    def solved_for(self, x) -> tuple[System, jax.Array]:
+        return self.body_at(x), self.points(x)
+
     def to_space(self, g) -> jax.Array:
         """The matrix, shape (..., n, n), that a dual vector is multiplied by from the left to become one in space."""
         return self.group.Ad(self.group.inverse_map(g))

@@ -290,6 +290,13 @@ class System(Kind):
         """
         return self, x
 
+    def solved_for(self, x) -> tuple[System, jax.Array]:
+        """The part of the system, and of a state, that a step is solved for; slopes and errors are of its size.
+
+        The rest of the state follows from it, and no tolerance of the one is measured by the other.
+        """
+        return self, x
+
     def arranged(self) -> Arranged | None:
         """This system with its components in another order, in which programs for large states are faster, if any."""
         return None
@@ -618,8 +625,8 @@ def _proportional(one: np.ndarray, other: np.ndarray) -> bool:
         return False
     at = int(np.argmax(lengths[1]))
     i = int(np.argmax(np.abs(other[at])))
-    missed = np.linalg.norm(one - (one[at, i] / other[at, i]) * other, axis=1)
-    return bool((missed <= AXIOM_TOLERANCE * lengths[0]).all())  # at each point by itself: their scales differ
+    defect = np.linalg.norm(one - (one[at, i] / other[at, i]) * other, axis=1)
+    return bool((defect <= AXIOM_TOLERANCE * lengths[0]).all())  # at each point by itself: their scales differ
 
 
 def _seen(system: System, x, alpha):

@@ -120,14 +120,14 @@ class Form(Module):
             return jnp.dot(found[:-1], v) + found[-1] * s, jnp.abs(found[:-1]) @ jnp.abs(v) + jnp.abs(found[-1] * s)
 
         def newton(_, s):
-            (missed, _), (slope, _) = jax.jvp(misfit, (s,), (jnp.ones(()),))
-            return s - missed / slope
+            (defect, _), (slope, _) = jax.jvp(misfit, (s,), (jnp.ones(()),))
+            return s - defect / slope
 
         s = jax.lax.fori_loop(0, NEWTON_STEPS if self.implicit else 1, newton, jnp.zeros(()))
         if not self.implicit:  # linear in S'
             return s
-        missed, size = misfit(s)
-        return jnp.where(jnp.abs(missed) <= SOLVED * size, s, jnp.nan)
+        defect, size = misfit(s)
+        return jnp.where(jnp.abs(defect) <= SOLVED * size, s, jnp.nan)
 
     def covector(self, q, v, S) -> jax.Array:
         """``eta_q / eta_S``, shape (n,), at the S' that goes with (q, v, S)."""

@@ -184,8 +184,8 @@ def _across(system: System, x):
     for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, off, strict=True)]):
         fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
     size = jnp.max(jnp.abs(fields[0]))
-    missed = jnp.maximum(jnp.abs(fields[1] - fields[0]), jnp.abs(fields[0] - _along(system, x, fields[0])))
-    return jnp.max(missed) / jnp.where(size > 0.0, size, 1.0)
+    defect = jnp.maximum(jnp.abs(fields[1] - fields[0]), jnp.abs(fields[0] - _along(system, x, fields[0])))
+    return jnp.max(defect) / jnp.where(size > 0.0, size, 1.0)
 
 
 def _along(system: System, x, w):

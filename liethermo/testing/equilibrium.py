@@ -112,9 +112,9 @@ def check_equilibrium(
         away = abs(float(found.mean()) - mean)
         if away <= 1e-12 * max(1.0, abs(mean)):  # what is constant has errors of rounding alone
             away = 0.0
-        missed = away / error if error > 0.0 else np.inf if away else 0.0
+        defect = away / error if error > 0.0 else np.inf if away else 0.0
         note = f"{found.mean():.5g}, exactly {mean:.5g} +- {own:.1g}"
-        suite.rows.append(Row(f"<{name}> in standard errors", float(missed), errors, bool(missed <= errors), note))
+        suite.rows.append(Row(f"<{name}> in standard errors", float(defect), errors, bool(defect <= errors), note))
     return suite.report()
 
 

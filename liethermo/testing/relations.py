@@ -24,6 +24,7 @@ from ..errors import InputError
 from ..functions.energy import Pullback
 from ..functions.gradients import EPS
 from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators.base import estimates_error, orderless
 from ..interop.scipy import solve_ivp
 from ..results.load import load
 from ..results.solution import Solution
@@ -259,7 +260,7 @@ def _turned(case: Case, what: str, matrix: np.ndarray) -> Outcome:
         return "the attitude is of a group with a basis of its own"
     change, system = Change(matrix), case.system
     run = case.run(changed(system, change), change.there(case.x0))
-    exact = case.method.orderless and not any(isinstance(term, Pullback) for term in system.energy.terms)
+    exact = orderless(case.method) and not any(isinstance(term, Pullback) for term in system.energy.terms)
     named = not isinstance(system, LiePoissonSystem)  # another basis has other Casimirs
     case.same(what, run, change.back, case.rounding if exact else case.resolved, named)
     return None
@@ -376,7 +377,7 @@ def scipy(case: Case) -> Outcome:
     """SciPy's call takes the steps of ``integrate``, and finds the event that ``until`` finds."""
     if case.system.sites or case.system.space is not None:
         return "SciPy's states are vectors"
-    if not case.method.has_estimate:
+    if not estimates_error(case.method):
         return "the method has no estimate of its error"
     step = case.step if isinstance(case.step, Adaptive) else Adaptive(1e-8)
 

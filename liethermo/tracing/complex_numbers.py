@@ -22,12 +22,12 @@ def flat(arrays: Sequence[np.ndarray]) -> list[Scalar]:
 
 def arranged(scalars: Iterator[Scalar], avals: Sequence) -> list[np.ndarray]:
     """Arrays of these shapes and types from real scalars one after another: the inverse of :func:`flat`."""
-    made = []
+    arrays = []
     for aval in avals:
         size, is_complex = math.prod(aval.shape), aval.dtype.kind == "c"
         entries = [Pair(next(scalars), next(scalars)) if is_complex else next(scalars) for _ in range(size)]
-        made.append(array(entries, aval.shape))
-    return made
+        arrays.append(array(entries, aval.shape))
+    return arrays
 
 
 def kinds(avals: Sequence) -> tuple[str, ...]:

@@ -31,14 +31,14 @@ def called(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[
     for x in matrices:
         entries = x.ravel().tolist()
         given += [a.re for a in entries] + [a.im for a in entries] if is_complex else entries
-    found, made = iter(b.real.block(call, *given)), []
+    found, arrays = iter(b.real.block(call, *given)), []
     for shape, real in call.results:
         size = math.prod(shape)
         parts = list(itertools.islice(found, size))
         if is_complex and not real:
             parts = [Pair(re, im) for re, im in zip(parts, list(itertools.islice(found, size)), strict=True)]
-        made.append(array(parts, shape))
-    return made
+        arrays.append(array(parts, shape))
+    return arrays
 
 
 def product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -205,10 +205,10 @@ class While(Block):
 
 @dataclass(frozen=True, eq=False)
 class Scan(Block):
-    """``carried, made[i] = body(constants, carried, [table[i] for table in tables])`` for every i.
+    """``carried, stacked[i] = body(constants, carried, [table[i] for table in tables])`` for every i.
 
     Its arguments are the constants, what is carried at the start, and the tables; its results what is carried at the
-    end, and the tables that were made, one after another.
+    end, and the stacked tables, one after another.
 
     Attributes
     ----------
@@ -217,31 +217,31 @@ class Scan(Block):
         Whether the last i is the first.
     body : Program
         Of three arrays, with two as its results.
-    carried, made : tuple of str
-        The kinds of what is carried, and of what is in a row that is made.
+    carried, stacked : tuple of str
+        The kinds of what is carried, and of what is in a row of each stacked table.
     """
 
     length: int
     reverse: bool
     body: Program
     carried: tuple[str, ...]
-    made: tuple[str, ...]
+    stacked: tuple[str, ...]
     name: str = field(default="scan", repr=False)
 
     @property
     def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.carried + tuple(kind for kind in self.made for _ in range(self.length))
+        return self.carried + tuple(kind for kind in self.stacked for _ in range(self.length))
 
     def __call__(self, *args) -> list:
         fixed = len(self.body.inputs[0])
         start = fixed + len(self.carried)
         constants, carried, tables = args[:fixed], list(args[fixed:start]), args[start:]
-        made: list[list] = [[None] * self.length for _ in self.made]
+        stacked: list[list] = [[None] * self.length for _ in self.stacked]
         for i in range(self.length)[::-1] if self.reverse else range(self.length):
             carried, row = self.body.run(constants, carried, [table[i] for table in tables])
-            for column, value in zip(made, row, strict=True):
+            for column, value in zip(stacked, row, strict=True):
                 column[i] = value
-        return carried + [a for column in made for a in column]
+        return carried + [a for column in stacked for a in column]
 
 
 @dataclass(frozen=True, eq=False)

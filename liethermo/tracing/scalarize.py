@@ -391,19 +391,19 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
             break
     if len(own.instructions) * length <= (LONG if length > SHORT else HEAVY):
         return None
-    moving, new, made = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
+    moving, new, rows = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
     inputs = [
         tuple(inside.outer.values()),
         [carried.entries[i] for i in moving],
         [f"x2_{j}" for j in range(len(columns))],
     ]
-    body = _program(own, inputs, [[new[i] for i in moving], made], [(len(moving),), (len(made),)])
+    body = _program(own, inputs, [[new[i] for i in moving], rows], [(len(moving),), (len(rows),)])
     out = [var.aval for var in closed.jaxpr.outvars[len(start) :]]
     loop = Scan(length, eqn.params["reverse"], body, carried.kinds, kinds(out))
     tables = [b.table(column) for column in columns]
     found = b.block(loop, *inside.outer, *(carried.start[i] for i in moving), *tables)
     rest = found[len(moving) :]
-    each = [arranged((rest[j * length + i] for j in range(len(made))), out) for i in range(length)]
+    each = [arranged((rest[j * length + i] for j in range(len(rows))), out) for i in range(length)]
     stacked = [
         array([a for row in each for a in row[k].ravel().tolist()], var.aval.shape)
         for k, var in enumerate(eqn.outvars[len(start) :])

@@ -61,19 +61,21 @@ def solution(field: Callable, x, h, order: int) -> jax.Array:
     NoSeriesError
         Where the field has none.
     """
-    made = _Recurrences(field, x)
-    if made.result is None:
-        return jnp.zeros((order, *x.shape)).at[0].set(h * made.constant)
-    histories = {i: _entered(jnp.zeros((order, *start.shape), start.dtype), start, 0) for i, start in made.kept()}
+    recurrences = _Recurrences(field, x)
+    if recurrences.result is None:
+        return jnp.zeros((order, *x.shape)).at[0].set(h * recurrences.constant)
+    histories = {
+        i: _entered(jnp.zeros((order, *start.shape), start.dtype), start, 0) for i, start in recurrences.kept()
+    }
 
     def coefficient(carry, numbers):
         histories, rate = carry
         n, number = numbers
-        rate, histories = made.coefficients(n, number, rate / number, histories)
+        rate, histories = recurrences.coefficients(n, number, rate / number, histories)
         return (histories, h * rate), carry[1] / number
 
     numbers = np.arange(1, order), np.arange(1.0, order)
-    (_, rate), found = jax.lax.scan(coefficient, (histories, h * made.terms[made.result].start), numbers)
+    (_, rate), found = jax.lax.scan(coefficient, (histories, h * recurrences.terms[recurrences.result].start), numbers)
     return jnp.concatenate([found, rate[None] / order])
 
 
@@ -209,15 +211,15 @@ class _Recurrences:
 # -- rules: rule(recurrences, equation, values) -> list of results ----------------------------------------------------
 
 
-def _refused(made: _Recurrences, eqn, values) -> list:
+def _refused(recurrences: _Recurrences, eqn, values) -> list:
     """Only the value at the start is known, which is all that a test needs."""
     return [
-        made.add(start, None, refusal=(eqn.primitive.name, origin(eqn)))
-        for start in _bound(eqn, map(made.start, values))
+        recurrences.add(start, None, refusal=(eqn.primitive.name, origin(eqn)))
+        for start in _bound(eqn, map(recurrences.start, values))
     ]
 
 
-def _linear(made: _Recurrences, eqn, values) -> list:
+def _linear(recurrences: _Recurrences, eqn, values) -> list:
     """Linear in all real arguments together: those that are constant have no further coefficients."""
     moving = [value.place for value in values if isinstance(value, _Series)]
 
@@ -226,10 +228,10 @@ def _linear(made: _Recurrences, eqn, values) -> list:
         given = [_further(value, rest) for value in values]
         return _bound(eqn, given)[which]
 
-    rising = all(made.terms[place].rising for place in moving)
+    rising = all(recurrences.terms[place].rising for place in moving)
     return [
-        made.add(start, _picking(rule, which), moving, rising=rising)
-        for which, start in enumerate(_bound(eqn, map(made.start, values)))
+        recurrences.add(start, _picking(rule, which), moving, rising=rising)
+        for which, start in enumerate(_bound(eqn, map(recurrences.start, values)))
     ]
 
 
@@ -244,61 +246,63 @@ def _picking(rule: Callable, which: int) -> Callable:
     return lambda *arguments: rule(*arguments, which)
 
 
-def _bilinear(made: _Recurrences, eqn, values) -> list:
-    (start,) = _bound(eqn, map(made.start, values))
+def _bilinear(recurrences: _Recurrences, eqn, values) -> list:
+    (start,) = _bound(eqn, map(recurrences.start, values))
     a, b = values
     if isinstance(a, _Series) and isinstance(b, _Series):
-        now = [x.place for x, y in ((a, b), (b, a)) if not made.rises(y)]  # beside coefficient 0 of the other
+        now = [x.place for x, y in ((a, b), (b, a)) if not recurrences.rises(y)]  # beside coefficient 0 of the other
 
         def rule(n, number, now, past):
             return convolved(lambda *pair: _bound(eqn, pair)[0], past[0], past[1], n)
 
-        return [made.add(start, rule, now, (a.place, b.place), rising=made.rises(a) or made.rises(b))]
+        return [
+            recurrences.add(start, rule, now, (a.place, b.place), rising=recurrences.rises(a) or recurrences.rises(b))
+        ]
     moving = a if isinstance(a, _Series) else b
 
     def single(n, number, now, past):
         return _bound(eqn, [now[0] if value is moving else value for value in values])[0]
 
-    return [made.add(start, single, (moving.place,), rising=made.rises(moving))]
+    return [recurrences.add(start, single, (moving.place,), rising=recurrences.rises(moving))]
 
 
-def _solved(made: _Recurrences, start, product: Callable, solve: Callable, a: _Series, b) -> list:
+def _solved(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _Series, b) -> list:
     """``c`` with ``product(a, c) = b``, a bilinear product, where ``solve(rhs)`` is it at the start."""
-    moving, rising = isinstance(b, _Series), made.rises(b)
+    moving, rising = isinstance(b, _Series), recurrences.rises(b)
     now = [*([b.place] if moving else ()), *(() if rising else (a.place,))]
 
     def rule(n, number, now, past):
         rest = convolved(product, past[0], past[1], n)  # without coefficient n of c, which is zero yet
         return solve(now[0] - rest if moving else -rest)
 
-    return [made.add(start, rule, now, (a.place, len(made.terms)), rising=rising)]
+    return [recurrences.add(start, rule, now, (a.place, len(recurrences.terms)), rising=rising)]
 
 
-def _divided(made: _Recurrences, eqn, values) -> list:
+def _divided(recurrences: _Recurrences, eqn, values) -> list:
     a, b = values
     if not isinstance(b, _Series):
-        return _bilinear(made, eqn, values)
-    first = made.start(b)
-    return _solved(made, made.start(a) / first, jnp.multiply, lambda rhs: rhs / first, b, a)
+        return _bilinear(recurrences, eqn, values)
+    first = recurrences.start(b)
+    return _solved(recurrences, recurrences.start(a) / first, jnp.multiply, lambda rhs: rhs / first, b, a)
 
 
-def _solved_linearly(made: _Recurrences, eqn, values) -> list:
+def _solved_linearly(recurrences: _Recurrences, eqn, values) -> list:
     """``custom_linear_solve``: its matrix from its products, its inverse from the user's way of solving."""
     sizes, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     constants, right = list(values[: sum(sizes)]), values[sum(sizes) :]
     if len(right) > 1:
-        return _refused(made, eqn, values)
-    (b,), starts = right, [made.start(value) for value in constants]
-    shape = np.shape(made.start(b))
+        return _refused(recurrences, eqn, values)
+    (b,), starts = right, [recurrences.start(value) for value in constants]
+    shape = np.shape(recurrences.start(b))
     axes = np.eye(int(np.prod(shape)))
 
     def columns(*own):
         product = jaxpr_as_fun(jaxprs.matvec)
         return [jax.vmap(lambda axis: product(*own, axis.reshape(shape))[0].ravel())(axes)]
 
-    (matrix,) = made.inlined(columns, values[: sizes.matvec])
+    (matrix,) = recurrences.inlined(columns, values[: sizes.matvec])
     if not isinstance(matrix, _Series):
-        return _linear(made, eqn, values)  # in b alone: what else is there are the constants of other ways
+        return _linear(recurrences, eqn, values)  # in b alone: what else is there are the constants of other ways
 
     def solve(rhs):
         return eqn.primitive.bind(*starts, rhs, **eqn.params)[0]
@@ -306,15 +310,15 @@ def _solved_linearly(made: _Recurrences, eqn, values) -> list:
     def product(columns, c):
         return (c.ravel() @ columns).reshape(shape)
 
-    return _solved(made, solve(made.start(b)), product, solve, matrix, b)
+    return _solved(recurrences, solve(recurrences.start(b)), product, solve, matrix, b)
 
 
-def _solved_by_substitution(made: _Recurrences, eqn, values) -> list:
+def _solved_by_substitution(recurrences: _Recurrences, eqn, values) -> list:
     """``triangular_solve``: of the matrix one triangle counts."""
     a, b = values
     if not isinstance(a, _Series):
-        return _bilinear(made, eqn, values)
-    params, first = eqn.params, made.start(a)
+        return _bilinear(recurrences, eqn, values)
+    params, first = eqn.params, recurrences.start(a)
 
     def product(a, c):
         a = jnp.tril(a) if params["lower"] else jnp.triu(a)
@@ -326,22 +330,22 @@ def _solved_by_substitution(made: _Recurrences, eqn, values) -> list:
     def solve(rhs):
         return eqn.primitive.bind(first, rhs, **params)
 
-    return _solved(made, solve(made.start(b)), product, solve, a, b)
+    return _solved(recurrences, solve(recurrences.start(b)), product, solve, a, b)
 
 
-def _by_derivative(made: _Recurrences, eqn, values) -> list:
+def _by_derivative(recurrences: _Recurrences, eqn, values) -> list:
     """``y = F(a, b, ...)`` from ``D y = dF(D a, D b, ...)``, by JAX's own rule for dF."""
-    (start,) = _bound(eqn, map(made.start, values))
+    (start,) = _bound(eqn, map(recurrences.start, values))
     key = (eqn.primitive.name, repr(eqn.params), tuple(value for value in values if isinstance(value, _Series)))
     whole = len(key[2]) == len(values)
-    if whole and key in made._known:
-        return [made._known[key]]  # which it may be itself: of y = exp(a) the derivative is y
-    y = made.add(start, None)
+    if whole and key in recurrences._known:
+        return [recurrences._known[key]]  # which it may be itself: of y = exp(a) the derivative is y
+    y = recurrences.add(start, None)
     if whole:
-        made._known[key] = y
-    rates = [_euler(made, value) for value in values if isinstance(value, _Series)]
+        recurrences._known[key] = y
+    rates = [_euler(recurrences, value) for value in values if isinstance(value, _Series)]
     if eqn.primitive.name == "pow":
-        (change,) = _change_of_power(made, y, *values)
+        (change,) = _change_of_power(recurrences, y, *values)
     else:
 
         def tangent(*arguments):
@@ -349,29 +353,29 @@ def _by_derivative(made: _Recurrences, eqn, values) -> list:
             tangents = tuple(next(rest) if isinstance(v, _Series) else jnp.zeros_like(v) for v in values)
             return [jax.jvp(lambda *a: _bound(eqn, a)[0], arguments[: len(values)], tangents)[1]]
 
-        (change,) = made.inlined(tangent, [*values, *rates])
-    made.terms[y.place] = _Term(start, lambda n, number, now, past: now[0] / number, (change.place,))
+        (change,) = recurrences.inlined(tangent, [*values, *rates])
+    recurrences.terms[y.place] = _Term(start, lambda n, number, now, past: now[0] / number, (change.place,))
     return [y]
 
 
-def _euler(made: _Recurrences, a: _Series) -> _Series:
-    zero = jnp.zeros_like(made.start(a))
-    return made.add(zero, lambda n, number, now, past: number * now[0], (a.place,), rising=True)
+def _euler(recurrences: _Recurrences, a: _Series) -> _Series:
+    zero = jnp.zeros_like(recurrences.start(a))
+    return recurrences.add(zero, lambda n, number, now, past: number * now[0], (a.place,), rising=True)
 
 
-def _change_of_power(made: _Recurrences, y: _Series, a, p) -> list:
+def _change_of_power(recurrences: _Recurrences, y: _Series, a, p) -> list:
     """``D y = y (p D a / a + log(a) D p)``: JAX's rule has another power in it, whose rule has another."""
     if not isinstance(p, _Series):
-        return made.inlined(lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _euler(made, a)])
+        return recurrences.inlined(lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _euler(recurrences, a)])
     if not isinstance(a, _Series):
-        return made.inlined(lambda y, a, p, dp: [y * (jnp.log(a) * dp)], [y, a, p, _euler(made, p)])
-    rates = _euler(made, a), _euler(made, p)
-    return made.inlined(lambda y, a, p, da, dp: [y * (p * (da / a) + jnp.log(a) * dp)], [y, a, p, *rates])
+        return recurrences.inlined(lambda y, a, p, dp: [y * (jnp.log(a) * dp)], [y, a, p, _euler(recurrences, p)])
+    rates = _euler(recurrences, a), _euler(recurrences, p)
+    return recurrences.inlined(lambda y, a, p, da, dp: [y * (p * (da / a) + jnp.log(a) * dp)], [y, a, p, *rates])
 
 
 def _rewritten(function: Callable) -> Callable:
     """A primitive in terms of others: ``function(parameters, arguments)``."""
-    return lambda made, eqn, values: made.inlined(lambda *a: [function(eqn.params, *a)], values)
+    return lambda recurrences, eqn, values: recurrences.inlined(lambda *a: [function(eqn.params, *a)], values)
 
 
 def _integer_power(params, x):
@@ -387,25 +391,25 @@ def _integer_power(params, x):
     return power(y) if y > 0 else 1.0 / power(-y)
 
 
-def _called(made: _Recurrences, eqn, values) -> list:
+def _called(recurrences: _Recurrences, eqn, values) -> list:
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     jaxpr, consts = (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
-    return made.walked(jaxpr, consts, values)
+    return recurrences.walked(jaxpr, consts, values)
 
 
-def _chosen(made: _Recurrences, eqn, values) -> list:
+def _chosen(recurrences: _Recurrences, eqn, values) -> list:
     """``cond``: every branch, then the one that is taken at the start."""
     which, *values = values
-    results = [made.walked(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
+    results = [recurrences.walked(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 
     def choice(which, *cases):
         which = jnp.clip(jnp.asarray(which, dtype=jnp.int32), 0, len(cases) - 1)
         return [jax.lax.select_n(which, *cases)]
 
-    return [made.inlined(choice, [made.start(which), *cases])[0] for cases in zip(*results, strict=True)]
+    return [recurrences.inlined(choice, [recurrences.start(which), *cases])[0] for cases in zip(*results, strict=True)]
 
 
-def _looped(made: _Recurrences, eqn, values) -> list:
+def _looped(recurrences: _Recurrences, eqn, values) -> list:
     """``scan``, unrolled."""
     params = eqn.params
     inner, first = params["jaxpr"], params["num_consts"]
@@ -413,13 +417,15 @@ def _looped(made: _Recurrences, eqn, values) -> list:
     consts, carry, slices = values[:first], list(values[first:last]), values[last:]
     rows, gathered = range(params["length"]), []
     for i in reversed(rows) if params["reverse"] else rows:
-        own = [made.inlined(lambda x, i=i: [x[i]], [x])[0] for x in slices]
-        found = made.walked(inner.jaxpr, inner.consts, [*consts, *carry, *own])
+        own = [recurrences.inlined(lambda x, i=i: [x[i]], [x])[0] for x in slices]
+        found = recurrences.walked(inner.jaxpr, inner.consts, [*consts, *carry, *own])
         carry = found[: len(carry)]
         gathered.append(found[len(carry) :])
     if params["reverse"]:
         gathered.reverse()
-    return carry + [made.inlined(lambda *rows: [jnp.stack(rows)], column)[0] for column in zip(*gathered, strict=True)]
+    return carry + [
+        recurrences.inlined(lambda *rows: [jnp.stack(rows)], column)[0] for column in zip(*gathered, strict=True)
+    ]
 
 
 CALLS = set("jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2".split())

@@ -104,15 +104,15 @@ class ProjectionRetraction(Chart):
             return self._point(z, space._from_coordinates(z, c)) - x
 
         def newton(_, c):
-            missed, push = jax.linearize(rest, c)
+            defect, push = jax.linearize(rest, c)
             axes = jnp.broadcast_to(jnp.eye(space.dim), (*c.shape, space.dim))
             columns = jax.vmap(lambda axis: space._coordinates(z, push(axis)), in_axes=-1, out_axes=-1)(axes)
-            return c - solve(columns, space._coordinates(z, missed)[..., None])[..., 0]
+            return c - solve(columns, space._coordinates(z, defect)[..., None])[..., 0]
 
         c = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
-        missed = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
+        defect = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
         size = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
-        return jnp.where(missed <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
+        return jnp.where(defect <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
 
 
 _NEWTON_STEPS = 8

@@ -71,8 +71,8 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
         def field(y):
             return M._project_tangent(y, M.from_vector(turn @ jnp.tanh(M.to_vector(y))))
 
-        missed = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
-        suite.small("divergences are those of the volume", missed, size, DIFFERENCES)
+        defect = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
+        suite.small("divergences are those of the volume", defect, size, DIFFERENCES)
     if not M.geodesics:
         suite.without("geodesics", "the space has none of its own: its charts project")
         return suite.report()

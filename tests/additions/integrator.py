@@ -11,8 +11,8 @@ class Simpson(lt.OneStepMethod):
     order = 2
     preserves = frozenset()
 
-    def slopes(self, system, x, low, h, k):
-        points = x + (low + jnp.array([[0.0], [0.5], [1.0]]) * h * k)
+    def slopes(self, system, x, compensation, h, k):
+        points = x + (compensation + jnp.array([[0.0], [0.5], [1.0]]) * h * k)
         weights = jnp.array([1.0, 4.0, 1.0]) / 6.0
         mean = lambda f: weights @ jax.vmap(f.gradient)(points)  # noqa: E731
         dS = None if system.entropy is None else mean(system.entropy)

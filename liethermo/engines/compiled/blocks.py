@@ -106,16 +106,16 @@ def _scan(writer: Any, loop: Scan, args: Sequence[Any]) -> Results:
     build, fixed = writer.builder, len(loop.body.inputs[0])
     start = fixed + len(loop.carried)
     constants, slots, tables = args[:fixed], _slots(writer, loop.carried, args[fixed:start]), args[start:]
-    made = [Table(writer, writer.kinds[kind], length=loop.length) for kind in loop.made]
+    stacked = [Table(writer, writer.kinds[kind], length=loop.length) for kind in loop.stacked]
     with writer.counted(writer.whole_number(loop.length)) as count:
         i = build.sub(writer.whole_number(loop.length - 1), count) if loop.reverse else count
         carried, row = [build.load(slot) for slot in slots], [table.read(i) for table in tables]
         new, out = writer.values(loop.body, _reader(constants, carried, row))
         for slot, kind, value in zip(slots, loop.carried, new, strict=True):
             build.store(writer.cast(value, kind), slot)
-        for table, kind, value in zip(made, loop.made, out, strict=True):
+        for table, kind, value in zip(stacked, loop.stacked, out, strict=True):
             table.write(i, writer.cast(value, kind))
-    return Results([build.load(slot) for slot in slots], made, loop.length)
+    return Results([build.load(slot) for slot in slots], stacked, loop.length)
 
 
 class Table:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...integrators import OneStepMethod
+from ...integrators.fluctuating import driven_by, noise_dimension
 from ...systems import System
 from ...tracing.calls import deferred
 from ...tracing.remembered import Latest
@@ -34,7 +35,7 @@ from .machine_code import MachineCode
 from .newton import solver
 
 FIELDS = State._fields
-GIVEN = ("dW", "x", "low", "h", "k", "before")
+GIVEN = ("dW", "x", "compensation", "h", "k", "before")
 """What it is given."""
 SOLVED = ("converged", "defined", "residual", "newton", "noise", "k")
 """What Newton's method may make better of :class:`..stages.Solved`."""
@@ -125,9 +126,12 @@ class Stepper:
         self._newton: MachineCode | None = None
         self._form, self._own, self._own_start = form, own, form.size
         system = form.build(parameters)
-        n, slopes = system.dim, (method.stages, method.unknowns(system))
-        self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "low": (n,), "k": slopes, "p": parameters.shape}
-        self._shapes |= {"before": (0 if method.explicit else method.stages, slopes[1]), "dW": (method.increments,)}
+        n, slopes = system.dim, jax.eval_shape(method.start, system, jnp.zeros(system.dim)).shape
+        self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "compensation": (n,), "k": slopes, "p": parameters.shape}
+        self._shapes |= {
+            "before": (0 if method.explicit else method.stages, slopes[1]),
+            "dW": (noise_dimension(method),),
+        }
         step = self._piece(self.step, (*self.given, *self.names), self.names)
         if method.explicit:
             changing = [i for i, a in enumerate(step.arguments) if a not in ("p", "h")]
@@ -155,7 +159,7 @@ class Stepper:
     def step(self, p, dW, h, *fields) -> tuple:
         """The fields after a step."""
         system, method = self.both(p)
-        return take_step(system, method.driven_by(dW), State(*fields), h, self._rules, self._second(dW))
+        return take_step(system, driven_by(method, dW), State(*fields), h, self._rules, self._second(dW))
 
     def _second(self, dW) -> Callable:
         """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
@@ -174,8 +178,8 @@ class Stepper:
         shapes = [self.shape(name) for name in (*SOLVED, *GIVEN)]
         ends = itertools.accumulate(map(math.prod, shapes))
         parts = [handed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
-        dW, x, low, h, k, before = parts[len(SOLVED) :]
-        own = equations(system, method.driven_by(dW), x, low, h, k, before, self._rules, jax.lax.map)
+        dW, x, compensation, h, k, before = parts[len(SOLVED) :]
+        own = equations(system, driven_by(method, dW), x, compensation, h, k, before, self._rules, jax.lax.map)
         found = by_newton(own, self._rules)
         return tuple(1.0 * getattr(found, name) for name in SOLVED)
 

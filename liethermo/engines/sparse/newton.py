@@ -95,7 +95,7 @@ class SparseEngine:
         k, misfit, scale = _better_start(self.system, self.method, state, h)
         s, renew = Iteration.begin(k), float(h) != self._h
         noise = jnp.zeros(())
-        while not self._settled(s, scale, misfit, noise) and int(s.made) < PATIENT.newton:
+        while not self._settled(s, scale, misfit, noise) and int(s.iterations) < PATIENT.newton:
             if renew or self._inverse is None:
                 self._inverse, self._h = self._inverted(state, h, s.k), float(h)
                 if self._inverse is None:
@@ -118,7 +118,7 @@ class SparseEngine:
             defined=jnp.asarray(defined),
             residual=s.update,
             fixed_point=jnp.asarray(before),
-            newton=s.made,
+            newton=s.iterations,
             noise=jnp.where(s.settled(scale, PATIENT), 0.0, noise),
         )
 
@@ -171,7 +171,7 @@ def _fixed_point(system: System, method: OneStepMethod, state: State, h) -> Solv
 
 
 def _given(system: System, method: OneStepMethod, state: State, h) -> Equations:
-    return equations(system, method, state.x, state.low, h, state.k, state.before, PATIENT)
+    return equations(system, method, state.x, state.compensation, h, state.k, state.before, PATIENT)
 
 
 @program
@@ -187,7 +187,7 @@ def _equations(system: System, method: OneStepMethod, state: State, h):
     slopes, guess, scale, *_ = _given(system, method, state, h)
 
     def misfit(k):
-        middle = state.x + (state.low + 0.5 * method.increment(h, k))
+        middle = state.x + (state.compensation + 0.5 * method.increment(h, k))
         return system.weights(middle) * (slopes(k) - k)
 
     return misfit, guess, scale

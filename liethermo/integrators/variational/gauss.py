@@ -51,9 +51,9 @@ class VariationalGauss(GaussMethod):
         """Raise InputError unless the system has a variational principle of this kind."""
         need_simple_closed(system, "VariationalGauss")
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         assert isinstance(system, SimpleClosedSystem)
-        (A, b, c), n, start = gauss(self.number), system.degrees_of_freedom, x + low
+        (A, b, c), n, start = gauss(self.number), system.degrees_of_freedom, x + compensation
         (q0, v0, S0, t0), V, s = system.parts(start), k[:, :n], k[:, 2 * n]
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)
 

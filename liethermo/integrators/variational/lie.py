@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -95,10 +96,10 @@ class LieVariational(OneStepMethod):
         n = system.algebra.dim
         return jnp.stack([system.vector_field(x), jnp.zeros_like(x).at[:n].set(x[:n])])
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         assert isinstance(system, EulerPoincareClosedSystem)
         n = system.algebra.dim
-        xi0, S0, t = system.parts(x + low)
+        xi0, S0, t = system.parts(x + compensation)
         step = _Step(system, self.tau, S0, h, t)
         mu0 = system.momentum(xi0, S0)
 
@@ -114,8 +115,8 @@ class LieVariational(OneStepMethod):
         rest = system.entries(*step.received(y))
         return jnp.stack([jnp.concatenate([xi_dot, y[n:], rest]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
-    def change(self, system: System, x, low, h, k, d) -> jax.Array:
-        return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+        return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]

@@ -130,12 +130,12 @@ class VariationalIntegrator(OneStepMethod):
 
     # -- the step ---------------------------------------------------------------------------------------------------
 
-    def slopes(self, system: System, x, low, h, k) -> jax.Array:
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         if isinstance(system, ComposedSystem):
-            return system.vector_field(x + (low + h * self._share(system) * k[0]))[None]
+            return system.vector_field(x + (compensation + h * self._share(system) * k[0]))[None]
         assert isinstance(system, SimpleClosedSystem)
         n = system.degrees_of_freedom
-        q0, v0, S0, t = system.parts(x + low)
+        q0, v0, S0, t = system.parts(x + compensation)
         discrete, p0 = self.discrete(system, h, t), system.momentum(q0, v0, S0)
         V, s = _solved(discrete, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
@@ -152,10 +152,10 @@ class VariationalIntegrator(OneStepMethod):
         share[q], share[p] = map.alpha, 1.0 - map.alpha
         return share
 
-    def change(self, system: System, x, low, h, k, d) -> jax.Array:
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
         if isinstance(system, ComposedSystem):
-            return super().change(system, x, low, h, k, d)
-        return -d  # the slopes are Newton's method already: their derivative vanishes at the solution
+            return super().linearised(system, x, compensation, h, k)
+        return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]
@@ -354,8 +354,8 @@ def _velocity(system: SimpleClosedSystem, q, S, p, v):
         return v - solve(W, (found - p)[:, None])[:, 0]
 
     v = jax.lax.fori_loop(0, 20, newton, v)
-    missed = jnp.max(jnp.abs(system.momentum(q, v, S) - p))
-    return jnp.where(missed <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
+    defect = jnp.max(jnp.abs(system.momentum(q, v, S) - p))
+    return jnp.where(defect <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
 
 
 @program

@@ -54,10 +54,10 @@ def test_factors(g, case):
         x = jnp.asarray(state_of(g, seed))
         dH = system.energy.gradient(x) + 0.1 * rng.standard_normal(g.dim)
         dL = tuple(L.gradient(x) + 0.1 * rng.standard_normal(g.dim) for L in system.preserved)
-        product, kernel, missed = measured(system, x, dH, rng.standard_normal(g.dim), dL)
+        product, kernel, defect = measured(system, x, dH, rng.standard_normal(g.dim), dL)
         assert product < 1e-13
         assert kernel < 1e-13 * float(jnp.linalg.norm(dH))
-        assert np.abs(missed).max() < 1e-12
+        assert np.abs(defect).max() < 1e-12
 
 
 @pytest.mark.slow
@@ -138,9 +138,9 @@ def test_divergences_of_what_heats(make):
     x = jnp.asarray(rng.standard_normal(system.dim))
     if system.baths is not None:
         x = x.at[system.body_dim :].set(-0.4)  # where the energy of a bath may fall
-    product, _, missed = measured(system, x, system.energy.gradient(x), rng.standard_normal(system.dim), ())
+    product, _, defect = measured(system, x, system.energy.gradient(x), rng.standard_normal(system.dim), ())
     if system.baths is not None:
         assert product < 1e-13
-    assert np.abs(missed).max() < 1e-12
+    assert np.abs(defect).max() < 1e-12
     if system.baths is not None:
         assert np.abs(divergence(system.dissipation, system, x)).max() > 1e-3

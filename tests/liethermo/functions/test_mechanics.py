@@ -43,8 +43,8 @@ TERMS = {
 
 
 @eqx.filter_jit
-def discrete(gradient, term, x, d, low=0.0):
-    return gradient(term, x, d, low), term.value(x + (low + d)) - term.value(x), term.gradient(x)
+def discrete(gradient, term, x, d, compensation=0.0):
+    return gradient(term, x, d, compensation), term.value(x + (compensation + d)) - term.value(x), term.gradient(x)
 
 
 @pytest.mark.sampled(1)
@@ -57,8 +57,8 @@ def test_discrete_gradients(name, gradient, seed):
     """Both defining properties (34), at steps of every size, from a state of which rounding has kept a part."""
     term, (x, d) = TERMS[name], np.random.default_rng(seed).standard_normal((2, DIM))
     for size in (1.0, 1e-3, 1e-7):
-        step, low = size * d, 0.4 * EPS * x
-        found, difference, slope = (np.asarray(a) for a in discrete(GRADIENTS[gradient], term, x, step, low))
+        step, compensation = size * d, 0.4 * EPS * x
+        found, difference, slope = (np.asarray(a) for a in discrete(GRADIENTS[gradient], term, x, step, compensation))
         values = sum(abs(float(t(x))) + abs(float(t(x + step))) for t in term.terms)
         allowed = 40 * EPS * (values + np.linalg.norm(slope) * np.linalg.norm(x))
         assert abs(found @ step - difference) <= allowed

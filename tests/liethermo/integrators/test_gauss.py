@@ -335,8 +335,8 @@ def test_one_stage_is_the_midpoint_scheme():
 class Collocation(lt.MetriplecticGauss):
     """Control: without the correction alpha."""
 
-    def slopes(self, system, x, low, h, k):
-        return jax.vmap(system.vector_field)(x + (low + h * (gauss(self.number).A @ k)))
+    def slopes(self, system, x, compensation, h, k):
+        return jax.vmap(system.vector_field)(x + (compensation + h * (gauss(self.number).A @ k)))
 
 
 class WithoutProjector(lt.MetriplecticGauss):

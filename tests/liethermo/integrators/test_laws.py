@@ -184,7 +184,7 @@ def test_the_reference_method_fails_the_audit():
 class FromTheWrongGradient(lt.MetriplecticMidpoint):
     """Control: K built from grad H(x) in place of the discrete gradient."""
 
-    def slopes(self, system, x, low, h, k):
+    def slopes(self, system, x, compensation, h, k):
         d = h * k[0]
         z = x + 0.5 * d
         dH = self.gradient(system.energy, x, d)
@@ -196,7 +196,7 @@ class FromTheWrongGradient(lt.MetriplecticMidpoint):
 class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
     """Control: the plain implicit midpoint rule."""
 
-    def slopes(self, system, x, low, h, k):
+    def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x + 0.5 * h * k[0])[None]
 
 

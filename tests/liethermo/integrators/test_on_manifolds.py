@@ -273,7 +273,7 @@ def test_membership_after_a_hundred_thousand_steps(build, name):
 class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
     """Control: the midpoint rule with plain gradients."""
 
-    def slopes(self, system, x, low, h, k):
+    def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x + 0.5 * h * k[0])[None]
 
 

@@ -85,7 +85,7 @@ def test_the_estimate_is_right_for_a_linear_oscillation(order):
     for h in {4: (0.2, 0.1, 0.05), 6: (0.2, 0.1, 0.05), 8: (0.4, 0.2, 0.1)}[order]:
         new = take_step(system, method, state, h)
         true = np.linalg.norm(np.asarray(new.x) - [np.cos(h), -np.sin(h)])
-        off.append(float(method.error(system, state.x, state.low, h, new.k)) / true - 1.0)
+        off.append(float(method.error(system, state.x, state.compensation, h, new.k)) / true - 1.0)
     assert 0.0 < off[2] < 0.01
     assert 3.0 < off[1] / off[2] < 5.0
 

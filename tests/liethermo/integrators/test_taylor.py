@@ -152,7 +152,7 @@ def test_bad_input():
 
 def test_without_a_tolerance_the_order_is_that_of_1e_10():
     """By every way to run: what asks the method and what sets it."""
-    assert Taylor().order == Taylor().suited(None).order == Taylor().suited(1e-10).order == 13
+    assert Taylor().order == Taylor().on(BODY).order == Taylor().on(BODY, 1e-10).order == 13
     ours = lt.integrate(BODY, X0, (0.0, 0.4), 0.2, Taylor(13))
     states = [
         lt.integrate(BODY, X0, (0.0, 0.4), 0.2, Taylor()).x[-1],

@@ -296,15 +296,15 @@ def test_a_run_that_stopped_is_no_law_that_fails():
 class Late(lt.MetriplecticMidpoint):
     """Control: consistent, but of first order only."""
 
-    def slopes(self, system, x, low, h, k):
+    def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x + h * k[0])[None]
 
 
 class Slow(lt.MetriplecticMidpoint):
     """Control: a thousandth too slow, which no law sees."""
 
-    def slopes(self, system, x, low, h, k):
-        return 0.999 * super().slopes(system, x, low, h, k)
+    def slopes(self, system, x, compensation, h, k):
+        return 0.999 * super().slopes(system, x, compensation, h, k)
 
 
 @pytest.mark.sampled(1)
@@ -319,8 +319,8 @@ def test_consistency_is_judged_by_short_steps(method, passed):
 class Cold(lt.MetriplecticMidpoint):
     """Control: a thousandth of the heat that friction makes in :func:`with_wheel` is missing."""
 
-    def slopes(self, system, x, low, h, k):
-        return super().slopes(system, x, low, h, k).at[:, 4].multiply(0.999)
+    def slopes(self, system, x, compensation, h, k):
+        return super().slopes(system, x, compensation, h, k).at[:, 4].multiply(0.999)
 
 
 def with_wheel(attitude):

@@ -151,8 +151,8 @@ def test_huge_steps_solve_their_equation(h, x0):
     x, z = solution.x, 0.5 * (solution.x[1:] + solution.x[:-1])
     jacobian = np.abs(jax.vmap(jax.jacfwd(BODY.vector_field))(z)).sum(axis=2).max(axis=1)
     rounding = EPS * np.abs(x).max() * (1.0 + h * jacobian)
-    missed = np.abs(np.diff(x, axis=0) - h * np.asarray(jax.vmap(BODY.vector_field)(z))).max(axis=1)
-    assert (missed <= 20 * rounding).all()
+    defect = np.abs(np.diff(x, axis=0) - h * np.asarray(jax.vmap(BODY.vector_field)(z))).max(axis=1)
+    assert (defect <= 20 * rounding).all()
     assert solution.audit().energy_drift <= 1e-14
     assert len(x) > 5
     if h < 1e3:  # beyond, Newton's method is allowed to fail, and says so

@@ -10,6 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.choice import Chosen
+from liethermo.integrators.fluctuating import driven_by, noise_dimension
 from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry
 from tests.cases import BuiltOnUse
@@ -245,7 +246,7 @@ def test_paths_converge_in_the_mean_square(system, noise):
     """To those of the same Brownian motion with shorter steps, with order 1/2 at least."""
     fine, T, paths = 4096, 1.0, 120
     method, levels, errors = noise.on(system, lt.MetriplecticMidpoint()), (64, 128, 256, 512), []
-    increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, method.increments))
+    increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, noise_dimension(method)))
 
     def end(W, steps):
         engine = Chosen(system, method, "compiled", steps, Summed(W, fine // steps))
@@ -340,14 +341,16 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
 
     @jax.jit
     @jax.vmap
-    def missed(x, new, dW):
-        d, low = new - x, jnp.zeros(3)
-        dH = gradient(system.energy, x, d, low)
+    def defect(x, new, dW):
+        d, compensation = new - x, jnp.zeros(3)
+        dH = gradient(system.energy, x, d, compensation)
         moved = system.poisson.sharp(x + 0.5 * d, dH)
-        heat = jnp.dot(dH, 0.05 * (noisy.driven_by(dW).slopes(system, x, low, 0.05, d[None] / 0.05)[0] - moved))
+        heat = jnp.dot(
+            dH, 0.05 * (driven_by(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - moved)
+        )
         return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, moved)
 
-    heat, motion = missed(*map(jnp.asarray, (solution.x[:100], solution.x[1:101], rows)))
+    heat, motion = defect(*map(jnp.asarray, (solution.x[:100], solution.x[1:101], rows)))
     assert np.abs(heat).max() < 1e-13
     assert np.abs(motion).max() < 1e-14
 

@@ -122,20 +122,22 @@ def test_steps_do_not_chatter():
 @pytest.mark.parametrize("explicit", [False, True])
 def test_control(explicit):
     """On an error that follows h^(order + 1) the step tends to the one with the error aimed at, and stays."""
-    wish, fair, power, sizes = 1e-5, 0.0, 1 / 5, []
+    proposed, optimal, power, sizes = 1e-5, 0.0, 1 / 5, []
     for _ in range(60):
-        h = wish
+        h = proposed
         error = (h / 0.1) ** 5
-        before, fair = fair, h * error**-power
+        before, optimal = optimal, h * error**-power
         good = error <= 1.0
-        wish = float(after_good(fair, before, h, h, power, np.inf, explicit) if good else after_bad(error, h, power))
-        sizes.append(wish)
-    assert 0.05 < wish <= 0.1
-    assert wish == pytest.approx(h, rel=1e-14 if explicit else 0.0)
+        proposed = float(
+            after_good(optimal, before, h, h, power, np.inf, explicit) if good else after_bad(error, h, power)
+        )
+        sizes.append(proposed)
+    assert 0.05 < proposed <= 0.1
+    assert proposed == pytest.approx(h, rel=1e-14 if explicit else 0.0)
     assert sizes[0] == pytest.approx(1e-4 if explicit else 3e-5)
-    cut_short = 0.01 * wish  # which says nothing
-    assert float(after_good(10.0, 0.0, cut_short, wish, power, np.inf, explicit)) == wish
-    assert float(after_bad(np.inf, wish, power)) == 0.25 * wish
+    cut_short = 0.01 * proposed  # which says nothing
+    assert float(after_good(10.0, 0.0, cut_short, proposed, power, np.inf, explicit)) == proposed
+    assert float(after_bad(np.inf, proposed, power)) == 0.25 * proposed
 
 
 def test_attempts_together_are_attempts_one_by_one(monkeypatch):

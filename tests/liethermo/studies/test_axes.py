@@ -17,7 +17,7 @@ def test_a_grid_has_every_combination_and_zipped_parameters_vary_together():
     assert points["a"].tolist() == [1, 1, 1, 2, 2, 2]
     assert points["b"].tolist() == [3, 4, 5] * 2
     assert points["c"].tolist() == ["x", "y", "z"] * 2
-    assert axes.told((1, 2)) == "a = 2, b = 5, c = z"
+    assert axes.describe((1, 2)) == "a = 2, b = 5, c = z"
 
 
 def test_samples_lie_in_their_ranges_as_their_construction_says():

@@ -14,6 +14,7 @@ from liethermo.engines.rules import RULES
 from liethermo.engines.stepping import begin, in_order, take_step
 from liethermo.functions.gradients import GRADIENTS, stage_gradients
 from liethermo.functions.planes import to_planes, to_sites
+from liethermo.integrators.base import pulled
 from liethermo.integrators.tableaus import finer, gauss
 from tests.cases import BuiltOnUse
 
@@ -81,12 +82,12 @@ def state(system, seed=0):
 
 
 @jax.jit
-def looked_at(system, x, d, low, k):
+def looked_at(system, x, d, compensation, k):
     """What a step asks of a system: numbers, and vectors."""
     A, b, _ = gauss(2)
     energy = system.energy
-    gradients = [scheme(energy, x, d, low) for scheme in GRADIENTS.values() if scheme.orderless]
-    stages = stage_gradients(energy, x, low, 0.1, k, A, b, finer(2))
+    gradients = [scheme(energy, x, d, compensation) for scheme in GRADIENTS.values() if scheme.orderless]
+    stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, finer(2))
     vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
     return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounded(x), vectors
 
@@ -96,9 +97,9 @@ def looked_at(system, x, d, low, k):
 def test_functions_are_the_same(name):
     system = SYSTEMS[name]
     found, x = system.arranged(), state(system)
-    d, low, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
-    one = looked_at(system, x, d, low, k)
-    other = looked_at(found.system, *map(found.there, (x, d, low, k)))
+    d, compensation, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
+    one = looked_at(system, x, d, compensation, k)
+    other = looked_at(found.system, *map(found.there, (x, d, compensation, k)))
     assert found.system.energy.is_quadratic == system.energy.is_quadratic
     np.testing.assert_allclose(other[0], one[0], rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(found.back(other[2]), one[2], rtol=1e-12, atol=1e-13)
@@ -114,13 +115,13 @@ def shapes(n):
 @pytest.mark.slow
 def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
-    method = method.suited(None).on(system)
+    method = method.on(system)
     found = system.arranged()
     one = begin(system, method, state(system))
-    other = begin(found.system, method.pulled(found), found.there(state(system)))
+    other = begin(found.system, pulled(method, found), found.there(state(system)))
     step = jax.jit(take_step)
     for _ in range(3):
-        one, other = step(system, method, one, h), step(found.system, method.pulled(found), other, h)
+        one, other = step(system, method, one, h), step(found.system, pulled(method, found), other, h)
     assert int(one.status) == int(other.status) == 0
     for name in ("x", "energy", "entropy", "largest_energy_increment", "energy_sensitivity"):
         ours = getattr(other, name)

@@ -52,7 +52,7 @@ def test_a_dissipation_that_loses_energy():
 class Euler(lt.MetriplecticMidpoint):
     """Control: the field at the start of the step, which is of first order and keeps nothing."""
 
-    def slopes(self, system, x, low, h, k):
+    def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x)[None]
 
 

@@ -806,14 +806,14 @@ def slopes(system, method):
     """The right-hand side of the stage equations; arguments: state and step, then the parameters."""
     parameters, structure = eqx.partition(system, eqx.is_inexact_array)
 
-    def f(x, low, h, k, parameters):
-        return method.slopes(eqx.combine(parameters, structure), x, low, h, k)
+    def f(x, compensation, h, k, parameters):
+        return method.slopes(eqx.combine(parameters, structure), x, compensation, h, k)
 
     x = state_of(system.algebra, 1)
     k = np.tile(np.asarray(system.vector_field(x)), (method.stages, 1))
     leaves, tree = jax.tree_util.tree_flatten(parameters)
     return (
-        lambda x, low, h, k, *leaves: f(x, low, h, k, jax.tree_util.tree_unflatten(tree, leaves)),
+        lambda x, compensation, h, k, *leaves: f(x, compensation, h, k, jax.tree_util.tree_unflatten(tree, leaves)),
         [x, 1e-17 * x, np.array(0.1), k, *map(np.asarray, leaves)],
     )
 
