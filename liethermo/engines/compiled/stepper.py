@@ -126,7 +126,7 @@ class Stepper:
         self._newton: MachineCode | None = None
         self._form, self._own, self._own_start = form, own, form.size
         system = form.build(parameters)
-        n, slopes = system.dim, jax.eval_shape(method.start, system, jnp.zeros(system.dim)).shape
+        n, slopes = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "compensation": (n,), "k": slopes, "p": parameters.shape}
         self._shapes |= {
             "before": (0 if method.explicit else method.stages, slopes[1]),
