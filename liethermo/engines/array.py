@@ -12,6 +12,7 @@ from ..systems import System
 from ..tracing.programs import program
 from .codes import Code
 from .rules import RULES, Rules
+from .stages import Solved
 from .stepping import State, begin, first_state, in_order, take_step
 
 
@@ -25,24 +26,37 @@ def advance(
     capacity: int,
     rules: Rules = RULES,
     noise=None,
+    newton: bool = True,
 ):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
     Returns the new state and, for each of ``capacity`` saves, the state vector, energy and entropy, and whether it was
     reached. ``noise`` has the increments of each step, shape (steps, increments); steps without any where it is None.
+    Without ``newton`` a step fails where fixed-point iteration does not solve its equations.
     """
     h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
-    return _advance(system, method, state, h, saves, every, capacity, rules, noise)
+    return _advance(system, method, state, h, saves, every, capacity, rules, noise, newton)
 
 
 @program
-def _advance(system: System, method: OneStepMethod, state: State, h, saves, every, capacity: int, rules: Rules, noise):
-    first = state.step
+def _advance(
+    system: System,
+    method: OneStepMethod,
+    state: State,
+    h,
+    saves,
+    every,
+    capacity: int,
+    rules: Rules,
+    noise,
+    newton: bool,
+):
+    first, second = state.step, None if newton else _none
     system, method, state, back = in_order(system, method, state, rules)
 
     def step(s: State) -> State:
         own = method if noise is None else driven_by(method, noise[s.step - first])
-        return take_step(system, own, s, h, rules)
+        return take_step(system, own, s, h, rules, second)
 
     def one_save(index, carry: tuple[State, tuple]):
         state, kept = carry
@@ -61,6 +75,11 @@ def _advance(system: System, method: OneStepMethod, state: State, h, saves, ever
     return back(state), kept
 
 
+def _none(first: Solved, *_) -> Solved:
+    """No second attempt at the equations of a step."""
+    return first
+
+
 KEPT_STATES, KEPT_NUMBERS = 1024, 2**16
 """States that one call keeps at most, and their components: enough to hide the cost of a call, few enough to show
 progress."""
@@ -72,19 +91,30 @@ def portion_of(system: System) -> int:
 
 
 class ArrayEngine:
-    """The array engine for one system and method: an :class:`.choice.Engine`."""
+    """The array engine for one system and method: an :class:`.choice.Engine`.
+
+    Newton's method is two thirds of what there is to compile. Its program is made when a step first needs it: the call
+    that step is in begins again with it, and so do those that follow.
+    """
 
     name = "array"
 
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
         self.system, self.method, self.rules = system, method, rules
         self.portion = portion_of(system)
+        self._newton = method.explicit  # where there are no equations, it makes no difference
 
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
-        return advance(self.system, self.method, state, h, saves, every, self.portion, self.rules, rows(noise))
+        given = self.system, self.method, state, h, saves, every, self.portion, self.rules, rows(noise)
+        if not self._newton:
+            found = advance(*given, newton=False)
+            if int(found[0].status) not in (Code.NOT_CONVERGED, Code.NON_FINITE):
+                return found
+            self._newton = True
+        return advance(*given)
 
     def step(self, state: State, h, noise=None) -> State:
         return self.advance(state, h, 1, 1, noise)[0]

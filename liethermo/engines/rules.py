@@ -24,7 +24,7 @@ class Rules:
     ----------
     large : int
         Components of a state above which a system is large. Newton's equations are then solved by products with the
-        Jacobian matrix, which is not formed, and rates of contraction are means over several iterations.
+        Jacobian matrix, which is not formed.
     fixed_point, newton : int
         The most iterations of each kind.
     reuse : int

@@ -59,27 +59,29 @@ class Iteration(NamedTuple):
     update: jax.Array
     best: jax.Array
     stalled: jax.Array  # iterations in a row that did not shrink the update
-    previous: jax.Array  # update that the last one is compared with; over it, it is the rate of contraction
+    previous: jax.Array  # the update before the last
+    earlier: jax.Array  # the one before that; zero where there is none
     iterations: jax.Array  # iterations so far
 
     @classmethod
     def begin(cls, k) -> Iteration:
         infinite, none = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
-        return cls(k, infinite, infinite, none, infinite, none)
+        return cls(k, infinite, infinite, none, infinite, jnp.zeros(()), none)
 
     def after(self, k, rules: Rules) -> Iteration:
         update = rules.size(k.shape[-1])(k - self.k)
-        previous = self.update
-        if k.shape[-1] > rules.large:  # the rate is a geometric mean
-            mean = jnp.sqrt(update) * jnp.sqrt(self.previous)
-            previous = jnp.where(self.iterations > 1, mean, previous)
+        earlier = jnp.where(self.iterations > 1, self.previous, 0.0)
         stalled = jnp.where(update < rules.shrinking * self.best, 0, self.stalled + 1)
         best = jnp.where(update < self.best, update, self.best)
-        return Iteration(k, update, best, stalled, previous, self.iterations + 1)
+        return Iteration(k, update, best, stalled, self.update, earlier, self.iterations + 1)
 
     def slower(self, rate: float) -> jax.Array:
-        """Whether updates shrink by less than a rate of contraction."""
-        return self.update > rate * self.previous
+        """Whether updates shrink by less than a rate of contraction: the last one, and the last two together.
+
+        Two parts of a state that drive each other, such as spins and the bath that they heat, are each corrected in
+        every second iteration. Where their units differ, updates then grow and shrink in turn while both converge.
+        """
+        return (self.update > rate * self.previous) & (self.update > rate * rate * self.earlier)
 
     def settled(self, scale, rules: Rules, misfit=None, noise=None) -> jax.Array:
         """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.

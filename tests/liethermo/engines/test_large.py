@@ -13,7 +13,7 @@ from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array
 from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
-from liethermo.engines.stages import Equations, solve_stages
+from liethermo.engines.stages import Equations, Iteration, solve_stages
 from liethermo.engines.stepping import begin
 
 COUNT = 5_000
@@ -65,6 +65,49 @@ def test_many_damped_spins_take_long_steps():
         assert (stats.newton_iterations > 0) == (h == 1.0)
         s = solution.x[-1, :-1].reshape(-1, 3)
         assert np.abs(np.linalg.norm(s, axis=1) - 1.0).max() < 1e-14
+
+
+def slow_after(updates, rate):
+    """Whether an iteration with these updates is slower than a rate, after each of them."""
+    k = jnp.zeros((1, 1))
+    iteration, found = Iteration.begin(k), []
+    for update in updates:
+        k = k + update
+        iteration = iteration.after(k, RULES)
+        found.append(bool(iteration.slower(rate)))
+    return found
+
+
+def test_an_iteration_is_slow_by_its_last_update_and_by_the_last_two():
+    assert slow_after([1.0, 0.5, 0.4, 0.3, 0.25], 0.6) == [False, False, True, True, True]
+    assert slow_after([1.0, 0.5], 0.3) == [False, True]  # as Newton's method asks, of one step with a matrix
+    assert slow_after([1.0, 100.0, 1e-2, 1.0, 1e-4, 1e-2], 0.6)[2:] == [False] * 4  # two parts that drive each other
+    assert slow_after([1.0, 100.0, 0.9, 90.0, 0.8, 80.0], 0.6)[3::2] == [True, True]  # and do not converge
+    assert slow_after([1.0, 2.0, 4.0, 8.0], 0.6)[1:] == [True] * 3
+
+
+@pytest.mark.parametrize("h", [0.05, 0.6])
+def test_spins_in_line_that_a_bath_shakes(h):
+    """The bath is corrected a hundred times as much as the spins, by turns: that is no reason for Newton's method."""
+    bath = lt.HeatBaths(capacity=27.0)
+    system = lt.models.spin_lattice((3, 3, 3), baths=bath)
+    start = np.tile([0.0, 0.0, 1.0], (3, 3, 3, 1))
+    run = lt.integrate(system, start, (0.0, 3 * h), h, noise=lt.Fluctuations(1.0, 1), engine="array")
+    assert (run.stats.newton_iterations > 0) == (h == 0.6)  # steps so long do need it
+    assert run.audit().energy_drift <= 1e-14
+
+
+def test_newtons_method_is_compiled_when_a_step_needs_it():
+    """From where the iteration fails on, a run is the one that could use Newton's method from its start."""
+    system = lt.models.rigid_body(inertia=(10, 5, 1), rate=200.0)
+    for h, needed in ((1e-3, False), (0.5, True)):
+        engine = array.ArrayEngine(system, lt.MetriplecticMidpoint())
+        start = engine.begin(jnp.array([0.1, 1.0, 0.1]))
+        after, kept = engine.advance(start, h, 4, 2)
+        assert engine._newton is needed
+        whole, of_whole = array.advance(system, engine.method, start, h, 4, 2, engine.portion)
+        assert int(after.step) == int(whole.step) == 8
+        assert np.abs(np.asarray(kept[0]) - np.asarray(of_whole[0])).max() <= 1e-15
 
 
 def stiff(n, rate):
