@@ -26,6 +26,10 @@ class Table:
         kinds = list(self.columns.values())
         cells = [[_text(a, kind) for a, kind in zip(row, kinds, strict=True)] for row in self.rows]
         rule = ["---" if kind == "text" else "---:" for kind in kinds]
+        for row in cells:  # a number and its unit are not torn apart
+            row[:] = [
+                text if kind == "text" else text.replace(" ", "\u00a0") for text, kind in zip(row, kinds, strict=True)
+            ]
         lines = [" | ".join(row) for row in (map(_in_cell, self.columns), rule, *(map(_in_cell, row) for row in cells))]
         return "\n".join([self.caption, "", *(f"| {line} |" for line in lines)])
 

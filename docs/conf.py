@@ -11,6 +11,8 @@ from pathlib import Path
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
+import jax
+
 import liethermo
 import manifolds
 
@@ -23,10 +25,21 @@ for package in (liethermo, manifolds):  # what is imported on demand as an attri
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE / "_ext")]
 
+# What XLA compiles for a page or an example is kept for the next build.
+KEPT = HERE / "_build" / "compiled"
+os.environ.setdefault("LIETHERMO_CACHE", str(KEPT / "liethermo"))
+jax.config.update("jax_compilation_cache_dir", str(KEPT / "xla"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+import beside  # noqa: E402
+from facts import write_facts  # noqa: E402
 from rooms import draw  # noqa: E402
 from spec_keys import write_table  # noqa: E402
 
 draw(HERE / "generated" / "rooms.svg")
+beside.draw_once(HERE / "generated" / "beside.svg")
+write_facts(HERE / "generated" / "facts.md")
 write_table(HERE / "generated" / "spec_keys.md")
 
 project = "liethermo"
@@ -51,7 +64,7 @@ extensions = [
 ]
 
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "_ext", "generated/executed", "generated/spec_keys.md"]
+exclude_patterns = ["_build", "_ext", "generated/executed", "generated/spec_keys.md", "generated/facts.md"]
 nitpicky = False  # types in the docstrings are prose
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]

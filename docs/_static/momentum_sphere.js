@@ -7,7 +7,7 @@ pictures("momentum-sphere", (canvas, scene) => {
 
   function draw(view) {
     const { context, project } = view, scale = 0.46 * Math.min(view.width, view.height) / reach;
-    if (clock === null) clock = view.still ? scene.relaxing.length - 1 : 0;
+    if (clock === null) clock = scene.relaxing.length - 1; // a reader sees the finished curve first, and then how it came
 
     function faces(p) { // does the surface at p look towards the eye?
       return project(p.map((value, i) => value / scene.axes[i] ** 2))[2] < 0;

@@ -1,0 +1,57 @@
+"""The picture of the first page shows runs of one body, and the line above it has what is true of the package."""
+
+import importlib
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+
+
+@pytest.fixture
+def beside(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    return importlib.import_module("beside")
+
+
+def test_the_others_solve_the_equations_of_the_library(beside):
+    """The equations are written out by hand for them: they are those of the model, its attitude too."""
+    body = lt.models.tumbling_body(beside.INERTIA, rate=beside.RATE)
+    y = np.random.default_rng(0).standard_normal(8)
+    written = np.array(beside.field(y, math.exp))
+    ours = np.asarray(jax.jit(body.vector_field)(jnp.asarray(y[:4])))
+    assert np.abs(written[:4] - ours).max() < 1e-14
+    assert np.abs(np.array(beside.field(1.01 * y, math.exp))[:4] - ours).max() > 1e-4
+    # The momentum in space is constant, which the quaternion alone can make true.
+    q, dq, m, dm = y[4:] / np.linalg.norm(y[4:]), written[4:] / np.linalg.norm(y[4:]), y[:3], written[:3]
+    pure = lambda v: np.array([0.0, *v])  # noqa: E731
+    rate = (
+        _times(_times(dq, pure(m)), _bar(q))
+        + _times(_times(q, pure(dm)), _bar(q))
+        + _times(_times(q, pure(m)), _bar(dq))
+    )
+    assert np.abs(rate).max() < 1e-14
+
+
+def _times(p, q):
+    return np.array([p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))])
+
+
+def _bar(q):
+    return np.array([q[0], *-q[1:]])
+
+
+def test_the_line_of_facts_names_the_version_of_the_package(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(DOCS))
+    facts = importlib.import_module("facts")
+    monkeypatch.setenv("GITHUB_REPOSITORY", "some/one")
+    facts.write_facts(tmp_path / "facts.md")
+    line = (tmp_path / "facts.md").read_text()
+    assert f"Version {lt.__version__} · " in line
+    assert "[repository](https://github.com/some/one)" in line or facts.repository() in line
