@@ -102,7 +102,8 @@ class ArrayEngine:
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
         self.system, self.method, self.rules = system, method, rules
         self.portion = portion_of(system)
-        self._newton = method.explicit  # where there are no equations, it makes no difference
+        # Where there are no equations it makes no difference; a reference solver has none of its own.
+        self._newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
