@@ -171,10 +171,17 @@ class Builder:
     Nothing is emitted for a result that is known, equals an earlier one, or is one but for a sign that can be moved on.
     All this is exact, save for the sign of a zero and one licence: a structural zero times anything, or divided by
     anything, is zero. Sums are never reassociated.
+
+    Parameters
+    ----------
+    limit : int
+        Instructions that it may collect.
+    around : (Builder, dict), optional
+        Of a program inside a loop, the builder of what is around it, and the names that scalars of that have inside.
     """
 
-    def __init__(self, limit: int):
-        self.limit = limit
+    def __init__(self, limit: int, around: tuple[Builder, dict[str, str]] | None = None):
+        self.limit, self.around = limit, around
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
@@ -218,6 +225,29 @@ class Builder:
             if all(self._made(a) == (a, "item", (whole, start + i)) for i, a in enumerate(entries)):
                 return self._named("column", whole, start, len(entries))
         return self._named("table", *entries)
+
+    def given(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
+        """The places, of an array and of an entry, that scalars have among the inputs of the outermost program.
+
+        None where one is no input.
+        """
+        if self.around is not None:
+            outer, entered = self.around
+            inverse = {inner: a for a, inner in entered.items()}
+            outside = [inverse.get(a, 0.0) if isinstance(a, str) else a for a in entries]
+            return outer.given(outside)
+        if not all(type(a) is str and a[0] == "x" for a in entries):
+            return None
+        return [(int(place), int(number)) for place, number in (str(a)[1:].split("_") for a in entries)]
+
+    def held(self, entries: Sequence[str]) -> str:
+        """A table of such inputs, of the outermost program, as it is known here."""
+        if self.around is None:
+            return self.table(entries)
+        outer, entered = self.around
+        inverse = {inner: a for a, inner in entered.items()}
+        table = outer.held([inverse[a] for a in entries])
+        return entered.setdefault(table, f"x0_{len(entered)}")
 
     def _made(self, a: Scalar) -> Instruction | None:
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None

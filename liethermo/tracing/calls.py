@@ -79,6 +79,38 @@ class Call(Block):
 
 
 @dataclass(frozen=True, eq=False)
+class Product(Block):
+    """The product of two real matrices, as a loop; its arguments are two tables.
+
+    Attributes
+    ----------
+    sizes : (int, int, int)
+        m, k, n of an (m, k) and a (k, n) matrix.
+    steps : ((int, int), (int, int))
+        For both how far apart in their tables entries are of neighbouring rows, and of neighbouring columns.
+    """
+
+    sizes: tuple[int, int, int]
+    steps: tuple[tuple[int, int], tuple[int, int]]
+    name: str = "product"
+
+    @property
+    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("f",) * (self.sizes[0] * self.sizes[2])
+
+    def __call__(self, *args) -> list:
+        m, k, n = self.sizes
+        x, y = (
+            np.stack(np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in table)))[
+                np.add.outer(rows * np.arange(height), columns * np.arange(width))
+            ]
+            for table, (rows, columns), (height, width) in zip(args, self.steps, ((m, k), (k, n)), strict=True)
+        )
+        found = np.einsum("mk...,kn...->mn...", x, y)
+        return [found[place][()] for place in np.ndindex(m, n)]
+
+
+@dataclass(frozen=True, eq=False)
 class Deferred(Block):
     """What the writer of the code has to fill in, from all arguments: by itself the first of them, as they are.
 
@@ -153,11 +185,8 @@ FUNCTIONS = {
         _qr,
     ),
     "svd": Function(lambda m, n, full: [(m, n)], _parts, _svd),
-    "matmul": Function(
-        lambda m, k, n: [(m, k), (k, n)], lambda m, k, n: [((m, n), False)], lambda sizes, a, b: [a @ b]
-    ),
 }
 """``eigh``: eigenvectors and eigenvalues, from the lower triangle; ``inverse``, NaN of a singular
 matrix; ``lu``: factors in one matrix, and the row that each
 row is exchanged with; ``qr``: with as many columns as are asked for; ``svd``: singular values, left vectors, and right
-ones as rows; ``matmul``: the product of real matrices."""
+ones as rows."""

@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 
 from .builder import Pair, Scalar, array, constant, elementwise, pair
-from .calls import Call
+from .calls import Call, Product
 from .complex_numbers import ComplexBuilder
 
 FEW_ROWS = 4
@@ -43,12 +43,34 @@ def called(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[
 
 def product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The product of two matrices, as a loop; of complex ones those of their parts."""
-    sizes = (*x.shape, y.shape[1])
     if not isinstance(b, ComplexBuilder):
-        return called(b, "matmul", sizes, x, y)[0]
+        (table_x, steps_x), (table_y, steps_y) = _table(b, x), _table(b, y)
+        sizes = (*x.shape, y.shape[1])
+        return array(b.block(Product(sizes, (steps_x, steps_y)), table_x, table_y), (x.shape[0], y.shape[1]))
     (a, c), (d, e) = ([elementwise(lambda v, k=k: getattr(pair(v), k), m) for k in ("re", "im")] for m in (x, y))
-    ad, ce, ae, cd = (called(b.real, "matmul", sizes, *both)[0] for both in ((a, d), (c, e), (a, e), (c, d)))
+    ad, ce, ae, cd = (product(b.real, *both) for both in ((a, d), (c, e), (a, e), (c, d)))
     return elementwise(Pair, elementwise(b.real.sub, ad, ce), elementwise(b.real.add, ae, cd))
+
+
+def held(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
+    """A matrix that lies in memory as it is given, such as parameters, or its transpose: nothing is copied.
+
+    Its table, and how far apart entries are there of neighbouring rows, and of neighbouring columns.
+    """
+    names = x.ravel().tolist()
+    outer = b.given(names)
+    if outer is None or len({place for place, _ in outer}) > 1:
+        return None
+    numbers = np.array([number for _, number in outer]).reshape(x.shape)
+    rows, columns = x.shape
+    for steps in ((columns, 1), (1, rows)):
+        if (numbers - numbers[0, 0] == np.add.outer(steps[0] * np.arange(rows), steps[1] * np.arange(columns))).all():
+            return b.held([names[i] for i in np.argsort(numbers, axis=None)]), steps
+    return None
+
+
+def _table(b, x: np.ndarray) -> tuple[str, tuple[int, int]]:
+    return held(b, x) or (b.table(x.ravel().tolist()), (x.shape[1], 1))
 
 
 def _each(b, eqn, x: np.ndarray, function) -> list[np.ndarray]:

@@ -159,13 +159,22 @@ def _cumulative(combine: Callable[..., Scalar]) -> Rule:
     return rule
 
 
-UNROLLED_PRODUCTS = 900
-"""Products of entries in a product of matrices that is unrolled; where there are more it is a loop."""
+UNROLLED_PRODUCTS, OF_HELD = 900, 100
+"""Products of entries in a product of matrices that is unrolled, at most: more are a loop. Where one of the matrices
+lies in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier."""
 
 
 def _products(rows: np.ndarray, columns: np.ndarray) -> int:
     """How many products of entries a product of two matrices takes, those with a zero left out."""
     return int(np.sum((rows != 0).sum(axis=0) * (columns != 0).sum(axis=0)))
+
+
+def _is_loop(b, rows: np.ndarray, columns: np.ndarray) -> bool:
+    """Whether the product of two matrices, the second by its columns, is better a loop."""
+    count = _products(rows, columns)
+    if count > UNROLLED_PRODUCTS or count <= OF_HELD or b.real is not b:
+        return count > UNROLLED_PRODUCTS
+    return any(min(x.shape) > 1 and algebra.held(b, x) is not None for x in (rows, columns))
 
 
 def _dot_general(b, eqn, x, y):
@@ -179,7 +188,7 @@ def _dot_general(b, eqn, x, y):
     zero, result = constant(0, _dtype(eqn)).item(), []
     for rows, columns in zip(left, right, strict=True):
         sparse = [[(k, a) for k, a in enumerate(row) if a != 0] for row in rows.tolist()]  # as structure constants are
-        if eqn.outvars[0].aval.dtype.kind in "fc" and _products(rows, columns) > UNROLLED_PRODUCTS:
+        if eqn.outvars[0].aval.dtype.kind in "fc" and _is_loop(b, rows, columns):
             result += algebra.product(b, rows, columns.T).ravel().tolist()
             continue
         for entries, column in itertools.product(sparse, columns.tolist()):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .builder import OF_TESTS, TESTS, Block, Instruction, Scalar, meaning
+from .calls import Product
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,10 @@ class Program:
 
     @property
     def size(self) -> int:
-        """How many instructions there are, those inside loops among them."""
+        """How many instructions compute something, those inside loops among them: what is moved alone costs little."""
         inner = (getattr(i.op, name, None) for i in self.instructions for name in ("test", "body"))
-        return len(self.instructions) + sum(program.size for program in inner if isinstance(program, Program))
+        own = sum(i.op not in ("item", "column", "table") for i in self.instructions)
+        return own + sum(program.size for program in inner if isinstance(program, Program))
 
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
         """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
@@ -86,9 +88,9 @@ class Program:
         degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
         for target, op, args in self.instructions:
             found = [degrees.get(a, 0) for a in args]
-            if op in ("add", "sub", "neg"):
+            if op in ("add", "sub", "neg", "table", "item"):
                 degrees[target] = max(found)
-            elif op == "mul":
+            elif op == "mul" or isinstance(op, Product):
                 degrees[target] = sum(found)
             elif op == "div" and not found[1]:
                 degrees[target] = found[0]

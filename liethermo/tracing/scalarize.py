@@ -250,7 +250,8 @@ class _Inside:
         The names that those have inside.
     """
 
-    def __init__(self):
+    def __init__(self, around: Builder):
+        self.around = around
         self.outer: dict[str, str] = {}
 
     def entered(self, arrays: Sequence[np.ndarray], avals: Sequence) -> list[np.ndarray]:
@@ -258,9 +259,8 @@ class _Inside:
         inner = (self.outer.setdefault(a, f"x0_{len(self.outer)}") if type(a) is str else a for a in flat(arrays))
         return arranged(inner, avals)
 
-    @staticmethod
-    def unrolled(limit: int, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> tuple[Builder, list[np.ndarray]]:
-        own = Builder(limit)
+    def unrolled(self, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> tuple[Builder, list[np.ndarray]]:
+        own = Builder(self.around.limit, (self.around, self.outer))
         return own, _unroll(own, closed.jaxpr, closed.consts, arguments)
 
 
@@ -307,13 +307,13 @@ def _while(b, eqn, *arguments):
     """A loop of unknown length."""
     params, avals = eqn.params, [var.aval for var in eqn.invars]
     n, m = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    inside, carried = _Inside(), _Carried(arguments[m:], avals[m:])
+    inside, carried = _Inside(b), _Carried(arguments[m:], avals[m:])
     for_test = inside.entered(arguments[:n], avals[:n])
     for_body = inside.entered(arguments[n:m], avals[n:m])
     test, step = params["cond_jaxpr"], params["body_jaxpr"]
     while True:
-        testing, (going,) = inside.unrolled(b.limit, test, [*for_test, *carried.arrays])
-        making, results = inside.unrolled(b.limit, step, [*for_body, *carried.arrays])
+        testing, (going,) = inside.unrolled(test, [*for_test, *carried.arrays])
+        making, results = inside.unrolled(step, [*for_body, *carried.arrays])
         if going.shape:  # several loops beside each other: those that have ended wait
             (own,) = _unroll(making, test.jaxpr, test.consts, [*for_test, *carried.arrays])
             results = [
@@ -380,13 +380,13 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     """The results of a loop that stays one; None where it is short enough to be unrolled."""
     length, closed, avals = eqn.params["length"], eqn.params["jaxpr"], [var.aval for var in eqn.invars]
     consts, end = len(constants), len(constants) + len(start)
-    inside, carried = _Inside(), _Carried(start, avals[consts:end])
+    inside, carried = _Inside(b), _Carried(start, avals[consts:end])
     given = inside.entered(constants, avals[:consts])
     rows = [aval.update(shape=aval.shape[1:]) for aval in avals[end:]]
     columns = list(zip(*(flat([x[i, ...] for x in slices]) for i in range(length)), strict=True))
     row = arranged((f"x2_{j}" for j in range(len(columns))), rows)
     while True:
-        own, results = inside.unrolled(b.limit, closed, [*given, *carried.arrays, *row])
+        own, results = inside.unrolled(closed, [*given, *carried.arrays, *row])
         if not carried.released(results[: len(start)]):
             break
     if len(own.instructions) * length <= (LONG if length > SHORT else HEAVY):

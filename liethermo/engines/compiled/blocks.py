@@ -10,7 +10,7 @@ from typing import Any
 from llvmlite import ir
 
 from ...tracing.builder import Block
-from ...tracing.calls import Call, Deferred
+from ...tracing.calls import Call, Deferred, Product
 from ...tracing.program import Routine, Scan, While
 from .lapack import kernel
 
@@ -32,6 +32,8 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> Results:
         return Results(writer.deferred(args, len(block.kinds)))
     if isinstance(block, Routine):
         return _routine(writer, block, args)
+    if isinstance(block, Product):
+        return _product(writer, block, args)
     assert isinstance(block, Call)
     return _call(writer, block, args)
 
@@ -228,6 +230,62 @@ def _written(writer: Any, routine: Routine, name: str) -> ir.Function:
 
     for i, value in enumerate(inside.write(routine.program, read)[0]):
         build.store(value, build.gep(found, [inside.whole_number(i)]))
+    build.ret_void()
+    return function
+
+
+BESIDE = 8
+"""Sums of a product of matrices that are made at a time: each waits for its own last term alone."""
+
+
+def _product(writer: Any, block: Product, args: Sequence[Table | Given]) -> Results:
+    """By a function of its own for these sizes; its sums are in the order of their terms."""
+    build, (m, _, n) = writer.builder, block.sizes
+    found = Table(writer, writer.number, length=m * n)
+    kinds = [a.start.type for a in args]
+    said = repr((block.sizes, block.steps, *map(str, kinds)))
+    name = "product_" + hashlib.sha256(said.encode()).hexdigest()[:16]
+    function = build.module.globals.get(name) or _product_function(writer, block, kinds, name)
+    build.call(function, [*(a.start for a in args), found.start])
+    return Results([], [found], m * n)
+
+
+def _product_function(writer: Any, block: Product, kinds: Sequence[ir.Type], name: str) -> ir.Function:
+    m, k, n = block.sizes
+    signature = ir.FunctionType(ir.VoidType(), [*kinds, writer.number.as_pointer()])
+    function = ir.Function(writer.builder.module, signature, name)
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
+    build, number = inside.builder, inside.whole_number
+    *given, out = function.args
+    by_rows = m >= n  # which sums stand beside each other
+
+    def entry(which: int, i: ir.Value, j: ir.Value) -> ir.Value:
+        rows, columns = block.steps[which]
+        place = build.add(build.mul(i, number(rows)), build.mul(j, number(columns)))
+        value = build.load(build.gep(given[which], [place]))
+        return value if value.type == inside.number else inside.splat(value)
+
+    def sums(first: ir.Value, other: ir.Value, width: int) -> None:
+        places = [build.add(first, number(w)) for w in range(width)]
+        places = [(place, other) if by_rows else (other, place) for place in places]
+        totals = _slots(inside, "f" * width, [inside.constant(0.0)] * width)
+        with inside.counted(number(k)) as l:
+            common = entry(1, l, other) if by_rows else entry(0, other, l)
+            for (i, j), total in zip(places, totals, strict=True):
+                own = entry(0, i, l) if by_rows else entry(1, l, j)
+                build.store(inside.intrinsic("llvm.fmuladd", (own, common, build.load(total)), inside.number), total)
+        for (i, j), total in zip(places, totals, strict=True):
+            build.store(build.load(total), build.gep(out, [build.add(build.mul(i, number(n)), j)]))
+
+    count, others = (m, n) if by_rows else (n, m)
+    with inside.counted(number(others)) as other:
+        if count >= BESIDE:
+            with inside.counted(number(count // BESIDE)) as chunk:
+                sums(build.mul(chunk, number(BESIDE)), other, BESIDE)
+        if count % BESIDE:
+            sums(number(count - count % BESIDE), other, count % BESIDE)
     build.ret_void()
     return function
 

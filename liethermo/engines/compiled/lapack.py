@@ -173,22 +173,6 @@ class _Kernel:
 
         self._checked("zgesdd" if z else "dgesdd", arguments, leave)
 
-    def _matmul(self, m: int, k: int, n: int) -> None:
-        build = self.build
-        for i in self._range(m):
-            for j in self._range(n):
-                total = self._alloca(NUMBER, 1)
-                build.store(ir.Constant(NUMBER, 0.0), total)
-                for l in self._range(k):
-                    left = build.add(build.mul(i, ir.Constant(WHOLE, k)), l)
-                    right = build.add(build.mul(l, ir.Constant(WHOLE, n)), j)
-                    right = build.add(right, ir.Constant(WHOLE, m * k))
-                    pair = [build.load(self._at(self.given, place)) for place in (left, right)]
-                    fused = build.call(self._intrinsic("llvm.fmuladd.f64", 3), [*pair, build.load(total)])
-                    build.store(fused, total)
-                place = build.add(build.mul(i, ir.Constant(WHOLE, n)), j)
-                build.store(build.load(total), self._at(self.found, place))
-
     # -- arrays -------------------------------------------------------------------------------------------------------
 
     def _at(self, base: ir.Value, i: ir.Value) -> ir.Value:

@@ -1,0 +1,87 @@
+"""Products with matrices that lie in memory as they are given, such as weights of networks: loops, without copies."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.tracing.calls import Product
+from liethermo.tracing.scalarize import scalarize
+
+RANDOM = np.random.default_rng(0)
+W, X, POINTS = RANDOM.standard_normal((12, 15)), RANDOM.standard_normal(15), RANDOM.standard_normal((3, 15))
+
+
+def _program(f, *arrays):
+    return scalarize(jax.make_jaxpr(f)(*arrays))
+
+
+def _products(program):
+    own = [i.op for i in program.instructions if isinstance(i.op, Product)]
+    inner = [getattr(i.op, name, None) for i in program.instructions for name in ("test", "body")]
+    return own + [found for p in inner if p is not None for found in _products(p)]
+
+
+@pytest.mark.parametrize(
+    ("f", "arrays", "count"),
+    [
+        (lambda W, x: W @ x, (W, X), 1),
+        (lambda W, x: W.T @ jnp.tanh(W @ x), (W, X), 2),
+        (lambda W, x: jax.grad(lambda x: jnp.sum(jnp.tanh(W @ x)))(x), (W, X), 2),
+        (lambda W, points: jax.vmap(lambda x: W @ x)(points), (W, POINTS), 1),
+        (lambda W, x: W[:, :5] @ x[:5], (W, X), 0),  # 60 products are unrolled
+        (lambda W, x: (2.0 * W) @ x, (W, X), 0),  # what is computed has to be copied: 180 are unrolled
+    ],
+)
+def test_products_are_loops(f, arrays, count):
+    program = _program(f, *arrays)
+    assert len(_products(program)) == count
+    np.testing.assert_allclose(program.evaluate(*arrays)[0], f(*arrays), rtol=1e-13, atol=1e-13)
+    if count:
+        assert "mul" not in {str(i.op) for i in program.instructions} or count == 2
+
+
+def test_inside_of_loops_too():
+    """The matrix is the parameter of a program around two loops: it is handed on as a table, not entry by entry."""
+
+    def f(W, x):
+        def step(x, _):
+            return jnp.tanh(W.T @ (W @ x) / 20.0 + x), None
+
+        def whole(carry):
+            return jax.lax.scan(step, carry[0], None, length=200)[0], carry[1] + 1
+
+        return jax.lax.while_loop(lambda carry: carry[1] < 2, whole, (x, 0))[0]
+
+    program = _program(f, W, X)
+    found = _products(program)
+    assert len(found) == 2
+    assert {p.steps[0] for p in found} == {(15, 1), (1, 15)}
+    np.testing.assert_allclose(program.evaluate(W, X)[0], f(W, X), rtol=1e-12)
+
+
+def test_a_quadratic_function_of_a_large_matrix_is_one():
+    A = W.T @ W
+    assert _program(lambda A, x: x @ A @ x, A, X).degree(1) == 2
+    system = lt.MetriplecticSystem(None, lambda x: 0.5 * x @ jnp.asarray(A) @ x, dim=15)
+    assert system.energy.is_quadratic
+
+
+SLOW = pytest.param(lt.MetriplecticRungeKutta(4), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), SLOW], ids=str)
+def test_machine_code_agrees_with_xla(method):
+    """A network of 12 neurons in a layer; single runs and lanes, which are the same to the bit."""
+    system = lt.learn.Metriplectic(3, entropy=lambda x: x[2], poisson=mf.Canonical(1), width=12)
+    starts = RANDOM.standard_normal((5, 3))
+    own, other = (
+        lt.integrate(system, starts[0], (0.0, 1.0), 0.1, method=method, engine=e) for e in ("compiled", "array")
+    )
+    np.testing.assert_allclose(own.x, other.x, atol=1e-13)
+    many = lt.ensemble(system, starts, (0.0, 1.0), 0.1, method, outputs="final", engine="compiled")
+    np.testing.assert_array_equal(many.x[0], own.x[-1])
