@@ -200,6 +200,7 @@ __all__ = [
     "flow",
     "integrate",
     "latin_hypercube",
+    "learn",
     "load",
     "load_study",
     "magnetism",
@@ -222,6 +223,8 @@ _INTEROP = ("diffrax", "scipy", "sympy")
 def __getattr__(name: str):
     if name == "plot":  # matplotlib is imported only when a picture is wanted
         return importlib.import_module(".results.plot", __name__)
+    if name == "learn":  # what most runs do without
+        return importlib.import_module(".learn", __name__)
     if name in _INTEROP:  # each imports the package that it is named after
         return importlib.import_module(f".interop.{name}", __name__)
     if name == "__version__":

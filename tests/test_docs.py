@@ -42,7 +42,7 @@ COSTLY = (
     *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
     *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
     *("asteroid_wobble", "real_bodies", "qubit_and_bath", "events", "derivatives", "ensembles", "audits"),
-    *("geometer", "relaxation", "spins", "fluids", "quantum", "learning", "method_author"),
+    *("geometer", "relaxation", "spins", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
 )
 """Pages that compile much: in the slow tier."""
 

@@ -9,6 +9,7 @@ MOST = 60
 
 BESIDE = {
     "studies": {"dask", "distributed", "zarr"},
+    "learn": {"optax"},
     "test": {"pytest", "hypothesis", "ruff", "mypy"},
     "docs": {"sphinx"},
     "bench": {"diffrax"},

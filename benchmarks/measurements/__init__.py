@@ -10,6 +10,7 @@ NAMES = (
     "manifolds",
     "fluids",
     "quantum",
+    "learning",
     "ensemble",
     "others",
     "tumbling",

@@ -11,6 +11,7 @@ import numpy as np
 import manifolds as mf
 
 from ..errors import InputError
+from ..functions.frames import towards
 from ..systems import System
 from .base import register
 from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Law, Unlawful
@@ -88,6 +89,27 @@ class MetriplecticRungeKutta(ExplicitMethod):
         slopes, rates = jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
         ends = jnp.stack([slopes[0], slopes[-1]])
         return Unlawful(h * (t.b @ slopes), h * (t.b @ rates), jnp.asarray(t.d) @ slopes, ends)
+
+    def plain(self, system: System, x, h) -> jax.Array:
+        """A step with one correction and without care for rounding, for derivatives by the parameters of a system.
+
+        It misses the levels by the square of what the step does before its correction, O(h^{2p+2}): far below what a
+        fit notices. Its program is short, and so are those of its derivatives.
+        """
+        laws, t = self._laws(system), self.tableau
+
+        def stage(slopes, row):
+            i, weights = row
+            found, rates = self.rates(system, laws, x + h * (weights @ slopes))
+            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
+
+        slopes, rates = jax.lax.scan(stage, jnp.zeros((len(t.b), x.shape[0])), (np.arange(len(t.b)), t.A))
+        end = x + h * (t.b @ slopes)
+        if not laws:
+            return end
+        functions = [law.function for law in laws]
+        missed = h * (t.b @ rates) - jnp.stack([f.value(end) - f.value(x) for f in functions])
+        return end + towards([system.raised(end, f.gradient(end)) for f in functions], missed)
 
     def weights(self, theta) -> np.ndarray:
         """Weights of the cubic through both ends with the slopes there; its error between them is O(h^4)."""

@@ -1,0 +1,151 @@
+"""A GFINN and an NMS of our own, written from their papers: both laws hold in continuous time, and they run by RK4.
+
+Inputs, outputs and time are scaled as those of ``lt.learn`` are, and the loss, the optimiser and the number of steps
+are the same: what differs is how energy, entropy and brackets are made, and what runs them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liethermo.learn.data import Scales, Trajectory, smoothed
+
+
+class Perceptron(eqx.Module):
+    """Layers of tanh."""
+
+    layers: list[tuple[jax.Array, jax.Array]]
+
+    def __init__(self, sizes: list[int], random: np.random.Generator):
+        self.layers = [
+            (jnp.asarray(random.standard_normal((m, n)) / np.sqrt(n)), jnp.zeros(m))
+            for n, m in itertools.pairwise(sizes)
+        ]
+
+    def __call__(self, x):
+        for W, b in self.layers[:-1]:
+            x = jnp.tanh(W @ x + b)
+        W, b = self.layers[-1]
+        return W @ x + b
+
+
+class Peer(eqx.Module):
+    """``x' = L(x) grad E + M(x) grad S`` with ``L grad S = 0`` and ``M grad E = 0``, in scaled variables."""
+
+    energy: Perceptron
+    entropy: Perceptron
+
+    def brackets(self, x, dE, dS) -> tuple[jax.Array, jax.Array]:
+        raise NotImplementedError
+
+    def rates(self, x):
+        dE, dS = (jax.grad(lambda y, f=f: f(y)[0])(x) for f in (self.energy, self.entropy))
+        L, M = self.brackets(x, dE, dS)
+        return L @ dE + M @ dS
+
+
+class GFINN(Peer):
+    """``L = B^T (s - s^T) B``, rows ``xi_j grad S``, ``M = C^T t t^T C``, rows ``xi_j grad E`` [Zhang et al. 2022].
+
+    The xi_j are constant skew matrices, s and t networks: the code of the authors for gas containers, without what it
+    is told of energy and entropy.
+    """
+
+    skew: jax.Array  # (2, K, n, n): of L, and of M
+    of_motion: Perceptron
+    of_friction: Perceptron
+    rank: int = eqx.field(static=True)
+
+    def __init__(self, n: int, width: int, depth: int, seed: int):
+        random = np.random.default_rng(seed)
+        sizes = [n, *[width] * depth]
+        self.energy, self.entropy = Perceptron([*sizes, 1], random), Perceptron([n, width, 1], random)
+        self.of_motion, self.of_friction = (Perceptron([*sizes, n * n], random) for _ in range(2))
+        self.skew, self.rank = jnp.asarray(random.standard_normal((2, n, n, n)) / np.sqrt(n)), n
+
+    def brackets(self, x, dE, dS):
+        xi = jnp.triu(self.skew, 1)
+        xi = xi - jnp.swapaxes(xi, -1, -2)
+        B, C = jnp.einsum("kij,j->ki", xi[0], dS), jnp.einsum("kij,j->ki", xi[1], dE)
+        s, t = (f(x).reshape(self.rank, self.rank) for f in (self.of_motion, self.of_friction))
+        return B.T @ (s - s.T) @ B, C.T @ (t @ t.T) @ C
+
+
+class NMS(Peer):
+    """``L = P_S A P_S`` and ``M = P_E B D D^T B^T P_E`` [Gruber et al. 2025].
+
+    P are the orthogonal projectors off the gradients. A skew, B and D are networks of the state.
+    """
+
+    tensor: Perceptron
+    columns: Perceptron
+    weights: Perceptron
+    rank: int = eqx.field(static=True)
+
+    def __init__(self, n: int, width: int, depth: int, seed: int, rank: int):
+        random = np.random.default_rng(seed)
+        sizes = [n, *[width] * depth]
+        self.energy, self.entropy = (Perceptron([*sizes, 1], random) for _ in range(2))
+        self.tensor = Perceptron([*sizes, n * n], random)
+        self.columns, self.weights = Perceptron([*sizes, n * rank], random), Perceptron([*sizes, rank * rank], random)
+        self.rank = rank
+
+    def brackets(self, x, dE, dS):
+        n = x.shape[0]
+        A = jnp.tril(self.tensor(x).reshape(n, n), -1)
+        off_S, off_E = (jnp.eye(n) - jnp.outer(g, g) / jnp.dot(g, g) for g in (dS, dE))
+        D = jnp.tril(self.weights(x).reshape(self.rank, self.rank))
+        C = off_E @ self.columns(x).reshape(n, self.rank) @ D
+        return off_S @ (A - A.T) @ off_S, C @ C.T
+
+
+def trained(peer: Peer, data: list[Trajectory], scales: Scales, steps: int, rate: float, batch: int, seed: int) -> Peer:
+    """The peer after so many steps of Adam on the rates of change of splines through the data."""
+    import optax
+
+    smooth = [smoothed(trajectory, None) for trajectory in data]
+    x = jnp.asarray(np.concatenate([(x[1:-1] - scales.centre) / scales.size for x, _ in smooth]))
+    rates = jnp.asarray(np.concatenate([v[1:-1] / scales.size * scales.time for _, v in smooth]))
+    adam = optax.adam(optax.cosine_decay_schedule(rate, steps, alpha=0.01))
+
+    def loss(peer, chosen):
+        return jnp.mean((jax.vmap(peer.rates)(x[chosen]) - rates[chosen]) ** 2)
+
+    def step(carry, key):
+        peer, state = carry
+        slope = jax.grad(loss)(peer, jax.random.randint(key, (batch,), 0, len(x)))
+        updates, state = adam.update(slope, state, peer)
+        return (eqx.apply_updates(peer, updates), state), None
+
+    keys = jax.random.split(jax.random.key(seed), steps)
+    run = jax.jit(lambda peer, state, keys: jax.lax.scan(step, (peer, state), keys)[0][0])
+    return run(peer, adam.init(peer), keys)
+
+
+def forecast(peer: Peer, x0: np.ndarray, scales: Scales, step: float, steps: int) -> tuple[np.ndarray, Callable]:
+    """States by RK4, shape (trajectories, steps + 1, n), and what gives energy and entropy of such states."""
+    h = step / scales.time
+
+    def rk4(y, _):
+        a = peer.rates(y)
+        b = peer.rates(y + 0.5 * h * a)
+        c = peer.rates(y + 0.5 * h * b)
+        new = y + h / 6.0 * (a + 2.0 * b + 2.0 * c + peer.rates(y + h * c))
+        return new, new
+
+    def whole(y):
+        return jnp.concatenate([y[None], jax.lax.scan(rk4, y, length=steps)[1]])
+
+    y = jax.jit(jax.vmap(whole))(jnp.asarray((x0 - scales.centre) / scales.size))
+
+    def laws(found):
+        z = (found - scales.centre) / scales.size
+        return tuple(np.asarray(jax.vmap(f)(jnp.asarray(z)))[..., 0] for f in (peer.energy, peer.entropy))
+
+    return np.asarray(y) * scales.size + scales.centre, laws

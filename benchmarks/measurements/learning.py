@@ -1,0 +1,164 @@
+"""Learned systems: two problems of the field, beside a GFINN and an NMS of our own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.integrate
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.learn.data import Trajectory, scales
+
+from .. import learned_peers
+from ..report import Report, Table
+
+LONG = 100
+"""How many times as long as the data the laws are followed."""
+
+
+class Problem(NamedTuple):
+    """Data of a motion, made by SciPy at a tolerance of 1e-10, and what a user may know of it."""
+
+    title: str
+    rates: Callable
+    start: Callable[[np.random.Generator], np.ndarray]
+    end: float
+    step: float
+    number: int
+    rank: int
+    poisson: mf.PoissonStructure
+    entropy: Callable
+
+
+def _gas(t, x):
+    q, p, *s = x
+    E1, E2 = (np.exp(s[0]) / q) ** (2 / 3), (np.exp(s[1]) / (2 - q)) ** (2 / 3)
+    heat = 22.5 * (1 / E1 - 1 / E2)
+    return [p, 2 / 3 * (E1 / q - E2 / (2 - q)), heat / E1, -heat / E2]
+
+
+def _pendulum(t, x):
+    """Two springs with the energy ``(ln l)^2 / 2 + ln l + exp(S - ln l) - 1`` of their length l and entropy S.
+
+    Unit masses; heat goes from one spring to the other with a conductance of 1/2.
+    """
+    q1, q2, p1, p2, s = x[:2], x[2:4], x[4:6], x[6:8], x[8:]
+    r1, r2 = q1, q2 - q1
+    l1, l2 = np.linalg.norm(r1), np.linalg.norm(r2)
+    T1, T2 = np.exp(s[0]) / l1, np.exp(s[1]) / l2
+    f1, f2 = ((np.log(l) + 1 - T) / l * r / l for l, T, r in ((l1, T1, r1), (l2, T2, r2)))
+    return [*p1, *p2, *(f2 - f1), *(-f2), 0.5 * (T2 - T1) / T1, 0.5 * (T1 - T2) / T2]
+
+
+PROBLEMS = {
+    "gas": Problem(
+        "Two gas containers",
+        _gas,
+        lambda r: np.array([1.0, 0.0, 2.0, 2.0]) + r.uniform(-1.0, 1.0, 4) * [0.8, 1.0, 1.0, 1.0],
+        8.0,
+        0.02,
+        100,
+        1,
+        lt.learn.Poisson.canonical(1, 4),
+        lambda x: x[2] + x[3],
+    ),
+    "pendulum": Problem(
+        "Thermoelastic double pendulum",
+        _pendulum,
+        lambda r: np.array([1.0, 0.0, 2.1, 0.0, 0.0, 0.5, 0.0, 1.0, 0.2, 0.4]) + r.uniform(-0.2, 0.2, 10),
+        8.0,
+        0.05,
+        100,
+        1,
+        lt.learn.Poisson.canonical(4, 10),
+        lambda x: x[8] + x[9],
+    ),
+}
+
+
+def data_of(problem: Problem, quick: bool, seed: int = 0) -> np.ndarray:
+    """States to twice the time of training, shape (trajectories, times, n)."""
+    random, runs = np.random.default_rng(seed), []
+    times = np.arange(round(2 * problem.end / problem.step) + 1) * problem.step
+    for _ in range(5 if quick else problem.number):
+        x0 = problem.start(random)
+        found = scipy.integrate.solve_ivp(problem.rates, (0, times[-1]), x0, "LSODA", times, rtol=1e-10, atol=1e-10)
+        runs.append(found.y.T)
+    return np.stack(runs)
+
+
+def _errors(found: np.ndarray, true: np.ndarray) -> list[float]:
+    """Mean squares and mean sizes of the errors of states, to the end of the training time and after it."""
+    half = (true.shape[1] + 1) // 2
+    parts = [found[:, :half] - true[:, :half], found[:, half:] - true[:, half:]]
+    return [float(f(part)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for part in parts]
+
+
+def _laws(energy: np.ndarray, entropy: np.ndarray) -> list[float]:
+    drift = np.max(np.abs(energy - energy[0])) / max(abs(energy[0]), np.finfo(float).tiny)
+    return [float(drift), float(np.diff(entropy).min())]
+
+
+def measured(problem: Problem, quick: bool) -> list[list]:
+    """A row for each contestant."""
+    x = data_of(problem, quick)
+    count = max(1, len(x) // 5)
+    half = round(problem.end / problem.step) + 1
+    test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
+    found_scales = scales(train, x.shape[2], None)
+    steps, width = (50, 8) if quick else (6000, 32)
+    settings = {"matching": steps, "shooting": 50 if quick else 300, "rate": 5e-3, "validation": 0.1}
+    long = round((2 if quick else LONG) * problem.end / problem.step)
+    rows = []
+
+    def ours(system: lt.System, name: str) -> None:
+        start = time.process_time()
+        fitted = lt.learn.fit(system, [tuple(own) for own in train], **settings)
+        spent = time.process_time() - start
+        method = lt.MetriplecticRungeKutta(4)
+        runs = lt.ensemble(fitted, test[:, 0], (0.0, 2 * problem.end), problem.step, method, outputs="trajectory")
+        assert runs.x is not None
+        run = lt.integrate(fitted, test[0, 0], (0.0, long * problem.step), problem.step, method)
+        assert run.entropy is not None
+        rows.append([name, *_errors(runs.x, test), *_laws(run.energy, run.entropy), spent])
+
+    def theirs(peer: learned_peers.Peer, name: str) -> None:
+        start = time.process_time()
+        peer = learned_peers.trained(peer, train, found_scales, steps, 5e-3, 256, 0)
+        spent = time.process_time() - start
+        states, _ = learned_peers.forecast(peer, test[:, 0], found_scales, problem.step, x.shape[1] - 1)
+        run, laws = learned_peers.forecast(peer, test[:1, 0], found_scales, problem.step, long)
+        rows.append([name, *_errors(states, test), *_laws(*laws(run[0])), spent])
+
+    n, known = x.shape[2], {"poisson": problem.poisson, "entropy": problem.entropy}
+    for construction in ("skew", "projected"):
+        friction = lt.learn.Friction(n, problem.rank, construction, width=width)
+        name = f"`lt.learn`, Π and S known, {construction}"
+        ours(lt.learn.Metriplectic(n, **known, friction=friction, width=width), name)
+    ours(lt.learn.Metriplectic(n, rank=problem.rank, width=width), "`lt.learn`, nothing known")
+    theirs(learned_peers.GFINN(n, width, 2, 0), "GFINN, nothing known")
+    theirs(learned_peers.NMS(n, width, 2, 0, problem.rank), "NMS, nothing known")
+    return rows
+
+
+def run(quick: bool) -> Report:
+    columns = {"Model": "text", "MSE to T": "error", "T to 2 T": "error", "MAE to T": "error", "MAE, T to 2 T": "error"}
+    columns |= {"Energy drift": "error", "Least entropy increment": "error", "Training": "seconds"}
+    tables = [
+        Table(
+            f"{p.title}: {p.number} trajectories to T = {p.end:g}, a fifth for the test.", columns, measured(p, quick)
+        )
+        for p in PROBLEMS.values()
+    ]
+    text = (
+        "Errors of forecasts from the first states of trajectories that were not learned from, means over all "
+        f"components and times. The laws are those of one forecast over {LONG} times the time of the data, of the "
+        "energy and entropy that were learned. The gas containers are as in the code of the authors of GFINN; the "
+        "pendulum has parameters of our own. Both peers are written here from their papers, and trained with the "
+        "same data, loss and steps."
+    )
+    return Report("Learned systems", text, tables, [])

@@ -1,0 +1,26 @@
+"""Systems with networks in them, fitted to data: both laws hold by construction, before, during and after training."""
+
+from .files import load, save
+from .fitting import fit
+from .known import Determined, Fits, determined, several
+from .model import Metriplectic
+from .networks import Learned
+from .parts import Energy, Entropy, Friction, Poisson
+from .training import Training
+
+__all__ = [
+    "Determined",
+    "Energy",
+    "Entropy",
+    "Fits",
+    "Friction",
+    "Learned",
+    "Metriplectic",
+    "Poisson",
+    "Training",
+    "determined",
+    "fit",
+    "load",
+    "save",
+    "several",
+]

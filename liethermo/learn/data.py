@@ -1,0 +1,166 @@
+"""Trajectories as they are given, checked; and what networks and losses are scaled by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.interpolate
+
+from ..errors import InputError
+from ..systems import System
+
+SMOOTHNESS = 5
+"""Degree of the splines through the data: their derivatives are of order 5."""
+
+
+class Trajectory(NamedTuple):
+    """Times, shape (m,), and what is observed of the states then, shape (m, k)."""
+
+    t: np.ndarray
+    x: np.ndarray
+
+
+def trajectories(data: Any, system: System, observed: Sequence[int] | None) -> list[Trajectory]:
+    """What a user gives as data: a pair of times and states, several of them, or solutions.
+
+    Raises
+    ------
+    InputError
+        If something is missing, is not finite, or does not fit.
+    """
+    count = system.dim if observed is None else len(observed)
+    found = [_checked(i, t, x, system, count, observed is None) for i, (t, x) in enumerate(_pairs(data))]
+    if not found:
+        raise InputError("there are no trajectories in the data")
+    return found
+
+
+def _pairs(data: Any) -> list[tuple[Any, Any]]:
+    if hasattr(data, "t") and hasattr(data, "x"):
+        return [(data.t, data.x)]
+    if isinstance(data, tuple) and len(data) == 2 and np.ndim(data[0]) == 1:
+        t, x = data
+        return [(t, x) for x in np.asarray(x)] if np.ndim(x) == 3 else [(t, x)]
+    if not isinstance(data, Sequence):
+        raise InputError(
+            f"data is a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such pairs, "
+            f"or solutions, not {type(data).__name__}"
+        )
+    return [pair for part in data for pair in _pairs(part)]
+
+
+def _checked(number: int, t, x, system: System, count: int, whole: bool) -> Trajectory:
+    what = f"trajectory {number}"
+    try:
+        t, x = np.asarray(t, dtype=np.float64), np.asarray(x, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} is not made of real numbers: {error}") from None
+    if t.ndim != 1 or len(t) < 2:
+        raise InputError(f"{what} has {t.size} point{'s' if t.size != 1 else ''}: at least 2 tell of a motion")
+    if len(x) != len(t):
+        raise InputError(f"{what} has {len(t)} times and {len(x)} states")
+    for name, values in (("time", t), ("state", x)):
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            at = f"component {', '.join(map(str, bad[0][1:]))} of " if values.ndim > 1 else ""
+            row = int(bad[0][0])
+            raise InputError(f"{what}: {at}{name} {row} is {values[tuple(bad[0])]}; leave that row out")
+    falls = np.flatnonzero(np.diff(t) <= 0.0)
+    if len(falls):
+        i = int(falls[0])
+        raise InputError(f"{what}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
+    if whole:
+        x = np.asarray(system.numbers(x, batch=True))
+    elif x.shape != (len(t), count):
+        raise InputError(f"{what} has states of shape {x.shape}, but {count} components are observed at {len(t)} times")
+    return Trajectory(t, x)
+
+
+class Scales(NamedTuple):
+    """What data are of the size of.
+
+    Attributes
+    ----------
+    centre, size : array, shape (n,)
+        Mean and spread of each component; 0 and 1 of one that is not observed.
+    time : float
+        In which components change by their spread.
+    """
+
+    centre: np.ndarray
+    size: np.ndarray
+    time: float
+
+
+def scales(data: list[Trajectory], dim: int, observed: Sequence[int] | None) -> Scales:
+    """The mean and the spread of all trajectories together, and the time in which they change."""
+    x = np.concatenate([trajectory.x for trajectory in data])
+    rates = np.concatenate([np.diff(x, axis=0) / np.diff(t)[:, None] for t, x in data])
+    middle, spread = x.mean(axis=0), x.std(axis=0)
+    spread = np.where(spread > 1e-12 * np.abs(middle), spread, np.where(middle != 0.0, np.abs(middle), 1.0))
+    speed = np.sqrt(np.mean((rates / spread) ** 2, axis=0))
+    moving = speed[speed > 0.0]
+    if not len(moving):
+        raise InputError("nothing moves in the data: all states of a trajectory are the same")
+    centre, size = np.zeros(dim), np.ones(dim)
+    places = np.arange(dim) if observed is None else np.asarray(observed)
+    centre[places], size[places] = middle, spread
+    return Scales(centre, size, 1.0 / float(np.median(moving)))
+
+
+def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """States and their rates of change at the times of a trajectory, by a spline, shape (m, k) each.
+
+    Through the points, or as near to them as the noise allows, standard deviations of shape (k,).
+    """
+    t, x = trajectory
+    start, length = t[0], t[-1] - t[0]
+    u, degree = (t - start) / length, min(SMOOTHNESS, len(t) - 1)
+    if noise is None or degree < SMOOTHNESS:
+        spline = scipy.interpolate.make_interp_spline(u, x, k=degree)
+        return x, spline.derivative()(u) / length
+    columns = [
+        scipy.interpolate.UnivariateSpline(u, y, w=np.full(len(u), 1.0 / sigma), k=degree, s=len(u))
+        for y, sigma in zip(x.T, noise, strict=True)
+    ]
+    return np.stack([f(u) for f in columns], axis=1), np.stack([f.derivative()(u) for f in columns], axis=1) / length
+
+
+class Windows(NamedTuple):
+    """Short pieces of trajectories, all of the same number m of intervals.
+
+    Attributes
+    ----------
+    starts : array, shape (windows, k)
+    sizes : array, shape (windows, m)
+        Of the intervals.
+    ends : array, shape (windows, m, k)
+    following : array of int, shape (windows,)
+        The window that begins where one ends; -1 where none does.
+    """
+
+    starts: np.ndarray
+    sizes: np.ndarray
+    ends: np.ndarray
+    following: np.ndarray
+
+
+def windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart: bool) -> Windows:
+    """The pieces of trajectories; with ``apart`` one begins where another ends, else at every point."""
+    length = min(length, *(len(t) - 1 for t, _ in data))
+    starts, sizes, ends = [], [], []
+    following: list[int] = []
+    for (t, x), smooth in zip(data, states, strict=True):
+        last = len(t) - 1 - length
+        firsts = list(range(0, last + 1, length if apart else 1))
+        if firsts[-1] != last:
+            firsts.append(last)
+        for i in firsts:
+            follows = apart and i + length in firsts
+            starts.append(smooth[i])
+            sizes.append(np.diff(t[i : i + length + 1]))
+            ends.append(x[i + 1 : i + length + 1])
+            following.append(len(following) + 1 if follows else -1)
+    return Windows(np.stack(starts), np.stack(sizes), np.stack(ends), np.array(following))

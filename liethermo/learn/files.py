@@ -1,0 +1,88 @@
+"""Fitted systems in files of arrays and JSON: no code is kept, and none is run when one is read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import by_own_settings
+
+from ..errors import FileError
+from ..systems import System
+from .training import Training, read, write
+
+T = TypeVar("T", bound=System)
+
+FORMAT = "liethermo-learned-1"
+
+CURVES = ("step", "phase", "loss", "validation")
+
+
+def _arrays(system: Any) -> tuple[list[Any], Any, Any]:
+    dynamic, static = eqx.partition(system, eqx.is_array)
+    leaves, structure = jax.tree_util.tree_flatten(dynamic)
+    return leaves, structure, static
+
+
+@by_own_settings
+def save(system: System, path: str | os.PathLike) -> Path:
+    """Write the numbers of a system, and the record of its fit, to a file that :func:`load` reads.
+
+    The file has arrays and JSON: it appears whole or not at all, and holds no code.
+
+    Parameters
+    ----------
+    system : System
+    path : path
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    path, training = Path(path), getattr(system, "training", None)
+    arrays = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(_arrays(system)[0])}
+    said: dict[str, Any] = {"format": FORMAT, "kind": system.kind}
+    if training is not None:
+        arrays |= {name: getattr(training, name) for name in CURVES}
+        said["training"] = {name: getattr(training, name) for name in ("parameters", "seconds", "ended")}
+    write(path, said, arrays)
+    return path
+
+
+@by_own_settings
+def load(path: str | os.PathLike, system: T) -> T:
+    """A system that :func:`save` has written, with its numbers in one that is built as it was.
+
+    Parameters
+    ----------
+    path : path
+    system : System
+        Made as the one that was fitted, such as by the same function: what it computes is not in the file. Its own
+        numbers do not matter.
+
+    Raises
+    ------
+    FileError
+        If there is no such file, it is damaged, or it is of a system that is built otherwise.
+    """
+    said, arrays = read(Path(path), FORMAT)
+    leaves, structure, static = _arrays(system)
+    kept = [arrays[f"leaf_{i}"] for i in range(sum(name.startswith("leaf_") for name in arrays))]
+    shapes = [[x.shape for x in these] for these in (kept, map(np.asarray, leaves))]
+    if said.get("kind") != system.kind or shapes[0] != shapes[1]:
+        raise FileError(
+            f"{path!s:.200} holds a {said.get('kind')} with {len(kept)} arrays, and this {system.kind} with "
+            f"{len(leaves)} is built otherwise: give load a system made as the one that was saved"
+        )
+    found = eqx.combine(jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, kept))), static)
+    if "training" in said:
+        curves: dict[str, Any] = {name: arrays[name] for name in CURVES}
+        object.__setattr__(found, "training", Training(**curves, **said["training"]))
+    return found

@@ -1,0 +1,232 @@
+"""``fit``: a system that is learned from trajectories."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from manifolds._precision import by_own_settings
+
+from ..errors import InputError
+from ..integrators import MetriplecticRungeKutta, OneStepMethod
+from ..systems import System
+from . import losses
+from .data import Trajectory, scales, smoothed, trajectories, windows
+from .losses import Task
+from .model import in_units
+from .training import Course, Phase, fingerprint
+
+T = TypeVar("T", bound=System)
+
+BATCH = {"matching": 256, "shooting": 32}
+"""Points, and short runs, of one step."""
+
+SLOWER = 0.3
+"""The rate of the shooting, relative to that of the matching before it."""
+
+
+@by_own_settings
+def fit(
+    system: T,
+    data: Any,
+    *,
+    matching: int = 2000,
+    shooting: int = 500,
+    rate: float = 1e-2,
+    batch: int | None = None,
+    window: int = 4,
+    substeps: int = 1,
+    method: OneStepMethod | None = None,
+    noise: float | Sequence[float] | None = None,
+    observed: Sequence[int] | None = None,
+    validation: float | None = None,
+    patience: int | None = None,
+    seed: int = 0,
+    also: Callable[[T], Any] | None = None,
+    positive: Callable[[T], Any] | None = None,
+    checkpoint: str | os.PathLike | None = None,
+    progress: bool | None = None,
+) -> T:
+    """A system like the given one, with what is learned of it fitted to trajectories.
+
+    First ``x'`` is matched to the rates of change of splines through the data. Then the states are matched at the ends
+    of short runs from the data (multiple shooting), whose steps obey both discrete laws. Each is a descent by Adam,
+    with a rate that falls along a cosine. The same arguments give the same result.
+
+    Parameters
+    ----------
+    system : System
+        Any, such as :class:`Metriplectic`. Its parts are learned as far as they are marked: those of this module are.
+        No energy that depends on time, and no torque.
+    data : pair (t, x), list of them, or solutions
+        Times of shape (m,), in any distances, and states of shape (m, n); or (trajectories, m, n) at the same times.
+    matching, shooting : int
+        Steps of both parts. Where not all components are observed nothing can be matched.
+    rate : float
+        Of Adam in the matching; 0.3 of it in the shooting.
+    batch : int, optional
+        Points, or short runs, of one step: 256 and 32 by default.
+    window : int
+        Intervals of a short run.
+    substeps : int
+        Steps of a run between two times of the data.
+    method : OneStepMethod
+        Of the runs: ``MetriplecticRungeKutta(4)`` by default, with one correction a step.
+    noise : float, or array, shape (n,), optional
+        Standard deviation of the errors of the data. Splines then go past the points, losses are in units of it, and
+        the states in which runs begin are found too.
+    observed : sequence of int, optional
+        Which components the data are of, shape (m, len(observed)). The others begin at zero and are found with the
+        states in which runs begin: they are known through the laws alone.
+    validation : float, optional
+        What share of the trajectories, of one trajectory the share of its end, is held out. The weights that do best
+        there are taken. A fifth by default, and 0 where not all components are observed.
+    patience : int, optional
+        Looks, each after 50 steps, without anything better, after which a part of the fit ends.
+    seed : int
+        Of the choice of batches and of what is held out.
+    also, positive : function from a system to its arrays, optional
+        Known parameters that are to be found too: ``also=lambda s: s.energy.A``. Those of ``positive``, such as
+        ``lambda s: s.dissipation.rate``, stay positive.
+    checkpoint : path, optional
+        A file that keeps the course after each look. Where it is there, the fit goes on from it, to the same result.
+    progress : bool, optional
+        A progress bar; by default where someone is there to see it.
+
+    Returns
+    -------
+    System
+        With the record in ``.training``: see :class:`Training`.
+
+    Raises
+    ------
+    InputError
+        If an argument or the data cannot be used, or nothing is learned, or the loss is not finite.
+    FileError
+        If the checkpoint is of another fit, or cannot be written.
+    """
+    began = time.perf_counter()
+    counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
+    for name, value in {**counts, "patience": patience, "seed": seed}.items():
+        _check_count(name, value, 0 if name in BATCH or name == "seed" else 1, name in ("batch", "patience"))
+    if system.is_driven:
+        raise InputError("a fit is for systems without an energy that depends on time, and without torques")
+    places = _places(observed, system.dim)
+    whole = trajectories(data, system, observed)
+    found = scales(whole, system.dim, observed)
+    sigma = _noise(noise, len(places))
+    if observed is None:
+        system = in_units(system, found, np.concatenate([x for _, x in whole]))
+    elif validation:
+        raise InputError("validation is for data of all components: what is not observed has no start that is known")
+    own = losses.weights(system, also, positive)
+    if not own.start.size:
+        raise InputError(
+            "nothing is learned of this system: give it parts of lt.learn, or name parameters with also= or positive="
+        )
+    share = (0.2 if observed is None else 0.0) if validation is None else validation
+    train, held = _split(whole, share, seed)
+    method = MetriplecticRungeKutta(4) if method is None else method
+    unit = found.size.copy()
+    if sigma is not None:
+        unit[places] = sigma
+
+    def matched(part: list[Trajectory]) -> Task:
+        smooth = [smoothed(trajectory, sigma) for trajectory in part]
+        inner = [slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smooth]  # a spline is worst at its ends
+        x = np.concatenate([x[i] for (x, _), i in zip(smooth, inner, strict=True)])
+        rates = np.concatenate([v[i] for (_, v), i in zip(smooth, inner, strict=True)])
+        return losses.matching(own, x, rates, found.size / found.time)
+
+    def shot(part: list[Trajectory], free: bool) -> Task:
+        starts = [_whole(smoothed(trajectory, sigma)[0], places, system.dim) for trajectory in part]
+        pieces = windows(part, starts, window, free)
+        return losses.shooting(own, method, pieces, unit, places, substeps, free)
+
+    phases = []
+    if matching and observed is None:
+        task = matched(train)
+        phases.append(
+            Phase("matching", task, matched(held) if held else None, matching, rate, batch or BATCH["matching"])
+        )
+    if shooting:
+        free, slower = sigma is not None or observed is not None, SLOWER if phases else 1.0
+        task = shot(train, free)
+        phases.append(
+            Phase(
+                "shooting",
+                task,
+                shot(held, False) if held else None,
+                shooting,
+                slower * rate,
+                batch or BATCH["shooting"],
+            )
+        )
+    settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
+    numbers = [values for trajectory in whole for values in trajectory]
+    course = Course(phases, own.start, fingerprint(*numbers, own.start, sigma, places, repr(settings)))
+    path = None if checkpoint is None else Path(checkpoint)
+    if path is not None and path.exists():
+        course.resume(path)
+    course.run(seed, patience, path, progress)
+    fitted = cast(T, own.system(course.weights))
+    object.__setattr__(fitted, "training", course.record(time.perf_counter() - began))
+    return fitted
+
+
+def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
+    if optional and value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} is an integer >= {least}, not {value!r}")
+
+
+def _places(observed: Sequence[int] | None, dim: int) -> np.ndarray:
+    if observed is None:
+        return np.arange(dim)
+    places = np.asarray(observed)
+    if places.dtype.kind not in "iu" or places.ndim != 1 or not len(places) or len(set(places.tolist())) < len(places):
+        raise InputError(f"observed is a sequence of different component numbers, not {observed!r}")
+    if places.min() < 0 or places.max() >= dim:
+        raise InputError(f"observed has component {places.max()}, but a state has the components 0 to {dim - 1}")
+    return places
+
+
+def _noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
+    if noise is None:
+        return None
+    sigma = np.asarray(noise, dtype=np.float64)
+    if sigma.shape not in ((), (count,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+        raise InputError(
+            f"noise is a positive standard deviation, or one for each of {count} components, not {noise!r}"
+        )
+    return np.broadcast_to(sigma, (count,)).copy()
+
+
+def _whole(x: np.ndarray, places: np.ndarray, dim: int) -> np.ndarray:
+    """States with zeros in place of what is not observed."""
+    states = np.zeros((len(x), dim))
+    states[:, places] = x
+    return states
+
+
+def _split(data: list[Trajectory], share: float, seed: int) -> tuple[list[Trajectory], list[Trajectory]]:
+    """What is learned from, and what is held out: whole trajectories, or the end of the only one."""
+    if not 0.0 <= share < 1.0:
+        raise InputError(f"validation is a share from 0 to below 1, not {share!r}")
+    if share == 0.0:
+        return data, []
+    if len(data) == 1:
+        t, x = data[0]
+        cut = round((1.0 - share) * (len(t) - 1))
+        if min(cut, len(t) - 1 - cut) < 1:
+            return data, []
+        return [Trajectory(t[: cut + 1], x[: cut + 1])], [Trajectory(t[cut:], x[cut:])]
+    order = np.random.default_rng(seed).permutation(len(data))
+    count = min(max(1, round(share * len(data))), len(data) - 1)
+    return [data[i] for i in sorted(order[count:])], [data[i] for i in sorted(order[:count])]

@@ -1,0 +1,182 @@
+"""What data determine of a system: the rank of the sensitivity, and fits of several first weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import by_own_settings
+
+from ..errors import InputError
+from ..integrators import OneStepMethod
+from ..runs.integrate import integrate
+from ..systems import System
+from . import losses
+from .data import trajectories
+from .fitting import fit
+
+T = TypeVar("T", bound=System)
+
+DEPENDENT = 1e-8
+"""Singular values, relative to the largest, below which a combination of parameters changes nothing."""
+
+
+@dataclass(frozen=True)
+class Determined:
+    """Which combinations of the parameters something depends on, to first order.
+
+    Attributes
+    ----------
+    values : ndarray, shape (p,)
+        Singular values of the sensitivity, relative to the largest.
+    rank : int
+        How many combinations are determined.
+    directions : ndarray, shape (p, p)
+        Combinations, a row each, by what they are determined: the last ``p - rank`` change nothing. Those of
+        parameters that are ``positive`` are of their logarithms.
+    """
+
+    values: np.ndarray
+    rank: int
+    directions: np.ndarray
+    own: losses.Weights
+
+    @by_own_settings
+    def share(self, quantity: Callable[[Any], Any]) -> np.ndarray:
+        """How far quantities are determined: 1 where fully, 0 where not at all.
+
+        The share of the length of each gradient by the parameters that lies in the combinations that are determined.
+
+        Parameters
+        ----------
+        quantity : function from a system to an array
+            Such as an energy at some state, or the difference of two.
+        """
+        rows = _jacobian(self.own, quantity)
+        along = rows @ self.directions[: self.rank].T
+        sizes = np.linalg.norm(rows, axis=1)
+        found = np.linalg.norm(along, axis=1) / np.where(sizes > 0.0, sizes, 1.0)
+        return np.where(sizes > 0.0, found, 1.0)
+
+
+@by_own_settings
+def determined(
+    system: T,
+    observed: Callable[[T], Any],
+    *,
+    also: Callable[[T], Any] | None = None,
+    positive: Callable[[T], Any] | None = None,
+    tolerance: float = DEPENDENT,
+) -> Determined:
+    """Which combinations of the learned parameters are determined by what is observed.
+
+    A learned energy is known up to what the data cannot tell: a constant, a function of what is conserved. No fit shows
+    that; the rank of the derivative of what is observed by the parameters does.
+
+    Parameters
+    ----------
+    system : System
+    observed : function from such a system to an array
+        What the data are of, in units in which all are known about equally well: ``lambda s: s.vector_field(x)`` at the
+        states x of the data, or the states of a run by ``lt.flow``.
+    also, positive
+        As of :func:`fit`.
+    tolerance : float
+        Singular value, relative to the largest, below which a combination counts as not determined: what the data are
+        known to.
+
+    Raises
+    ------
+    InputError
+        If nothing is learned.
+    """
+    own = losses.weights(system, also, positive)
+    if not own.start.size:
+        raise InputError("nothing is learned of this system, so there is nothing to determine")
+    jacobian = _jacobian(own, observed)
+    _, values, directions = np.linalg.svd(jacobian, full_matrices=jacobian.shape[0] < jacobian.shape[1])
+    relative = np.zeros(own.start.size)
+    relative[: len(values)] = values / (values[0] if values[0] > 0.0 else 1.0)
+    return Determined(relative, int(np.sum(relative > tolerance)), directions, own)
+
+
+def _jacobian(own: losses.Weights, quantity: Callable) -> np.ndarray:
+    def values(vector):
+        return jnp.ravel(jnp.asarray(quantity(own.system(vector))))
+
+    start = jnp.asarray(own.start)
+    size = jax.eval_shape(values, start).shape[0]
+    by = jax.jacfwd if own.start.size <= size else jax.jacrev
+    found = np.asarray(jax.jit(by(values))(start))
+    if not np.isfinite(found).all():
+        raise InputError("the derivative of what is observed by the parameters is not finite")
+    return found
+
+
+@dataclass(frozen=True)
+class Fits:
+    """Systems fitted to the same data from different first weights.
+
+    Attributes
+    ----------
+    systems : tuple of System
+    """
+
+    systems: tuple[System, ...]
+
+    def spread(self, quantity: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:
+        """The mean and the standard deviation of a quantity over the systems.
+
+        Parameters
+        ----------
+        quantity : function from a system to an array
+        """
+        found = np.stack([np.asarray(quantity(system)) for system in self.systems])
+        return found.mean(axis=0), found.std(axis=0, ddof=1)
+
+    def forecast(
+        self, x0, t_span: tuple[float, float], step: float, method: OneStepMethod | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times, mean states and their standard deviations, shapes (times,) and (times, n); arguments of integrate."""
+        runs = [integrate(system, x0, t_span, step, method=method) for system in self.systems]
+        states = np.stack([run.x for run in runs])
+        return runs[0].t, states.mean(axis=0), states.std(axis=0, ddof=1)
+
+
+def several(
+    build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **how
+) -> Fits:
+    """Fits from different first weights to trajectories drawn again from those given: how far they agree.
+
+    Parameters
+    ----------
+    build : function from a seed to a system
+        Such as ``lambda seed: lt.learn.Metriplectic(4, seed=seed)``.
+    data, how
+        As of :func:`fit`.
+    number : int
+        Of fits.
+    seed : int
+        Of the first.
+    resample : bool
+        Draw as many trajectories as there are, with replacement, for each (bootstrap), where there is more than one.
+
+    Raises
+    ------
+    InputError
+        As of :func:`fit`.
+    """
+    if isinstance(number, bool) or not isinstance(number, int) or number < 2:
+        raise InputError(f"number of fits is an integer >= 2, not {number!r}")
+    systems = []
+    for own in range(seed, seed + number):
+        system = build(own)
+        whole = trajectories(data, system, how.get("observed"))
+        drawn = np.random.default_rng(own).integers(len(whole), size=len(whole)) if resample else range(len(whole))
+        systems.append(fit(system, [whole[i] for i in drawn], seed=own, **how))
+    return Fits(tuple(systems))

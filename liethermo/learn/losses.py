@@ -1,0 +1,159 @@
+"""What a fit makes small: what the motion misses of the rates of change, or of the states after short runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..integrators import MetriplecticRungeKutta, OneStepMethod
+from ..runs.flow import first_carry, one_step
+from ..runs.preparation import of_steps
+from ..systems import System
+from .data import Windows
+from .model import tied
+from .networks import learned
+
+
+class Weights(NamedTuple):
+    """The numbers of a system that are learned, as one vector.
+
+    Attributes
+    ----------
+    start : array, shape (p,)
+        As they are; the logarithms of those that have to be positive.
+    system : function from such a vector to the system
+    """
+
+    start: np.ndarray
+    system: Callable[[Any], System]
+
+
+def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:
+    """What is learned of a system: the arrays inside of marks, and those that two functions choose."""
+    mask = learned(system)
+    if getattr(system.poisson, "entropy", None) is not None:
+        mask = eqx.tree_at(lambda m: m.poisson.entropy, mask, False)  # the same weights as in the entropy
+    for choose in (also, positive):
+        if choose is not None:
+            mask = eqx.tree_at(choose, mask, replace_fn=lambda part: jax.tree_util.tree_map(lambda _: True, part))
+    none = jax.tree_util.tree_map(lambda _: False, mask)
+    signs = none if positive is None else eqx.tree_at(positive, none, replace_fn=lambda _: True)
+    varied, fixed = eqx.partition(system, mask)
+    logs, plain = eqx.partition(varied, signs)
+    first, back = ravel_pytree((jax.tree_util.tree_map(jnp.log, logs), plain))
+
+    def rebuilt(vector) -> System:
+        logs, plain = back(vector)
+        return tied(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
+
+    return Weights(np.asarray(first), rebuilt)
+
+
+class Task(NamedTuple):
+    """What is to be made small.
+
+    Attributes
+    ----------
+    loss : function from a vector, the arrays and indices of items, to a number
+        The vector is that of the weights, with the free numbers behind it.
+    arrays : tuple of arrays
+    items : int
+    free : array, shape (f,)
+        Numbers that are found beside the weights, as they are at first.
+    """
+
+    loss: Callable[[jax.Array, tuple, jax.Array], jax.Array]
+    arrays: tuple
+    items: int
+    free: np.ndarray
+
+
+def matching(own: Weights, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -> Task:
+    """The mean square of what ``x'`` misses of rates of change, in units of ``size``, shape (n,)."""
+
+    def loss(vector, arrays, chosen):
+        points, wanted = (values[chosen] for values in arrays)
+        found = jax.vmap(own.system(vector)._vector_field)(points)
+        return jnp.mean(((found - wanted) / size) ** 2)
+
+    return Task(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
+
+
+def shooting(
+    own: Weights,
+    method: OneStepMethod,
+    pieces: Windows,
+    size: np.ndarray,
+    places: np.ndarray,
+    substeps: int,
+    free: bool,
+) -> Task:
+    """The mean square of what runs miss of the data at the ends of all intervals.
+
+    With ``free`` the states where the runs begin are found too, and what they miss of the data counts, and what a run
+    misses of where the next one begins.
+
+    Parameters
+    ----------
+    size : array, shape (n,)
+    places : array of int
+        The components that are observed.
+    """
+    p, n, unit = len(own.start), len(size), jnp.asarray(size)
+    seen = unit[places]
+    count, length, _ = pieces.ends.shape
+
+    def runs(system: System, starts, sizes):
+        begin, advance, shown = stepper(system, method, substeps)
+
+        def one(x, h):
+            def interval(carry, h):
+                carry = advance(carry, h)
+                return carry, shown(carry)
+
+            return jax.lax.scan(interval, begin(x), h)[1]
+
+        return jax.vmap(one)(starts, sizes)
+
+    def loss(vector, arrays, chosen):
+        starts, sizes, ends, following = arrays
+        if free:
+            own_starts = vector[p:].reshape(count, n) * unit
+            at = own_starts[chosen]
+        else:
+            at = starts[chosen]
+        found = runs(own.system(vector[:p]), at, sizes[chosen])
+        missed = jnp.mean(((found[..., places] - ends[chosen]) / seen) ** 2)
+        if not free:
+            return missed
+        begun = jnp.mean(((at[:, places] - starts[chosen][:, places]) / seen) ** 2) / length
+        next_ = following[chosen]
+        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - own_starts[next_]) / unit, 0.0)
+        return missed + begun + jnp.mean(gaps**2)
+
+    arrays = tuple(map(jnp.asarray, (pieces.starts, pieces.sizes, pieces.ends, pieces.following)))
+    return Task(loss, arrays, count, (pieces.starts / size).ravel() if free else np.zeros(0))
+
+
+def stepper(system: System, method: OneStepMethod, substeps: int) -> tuple[Callable, Callable, Callable]:
+    """What begins a run at a state, takes it over an interval, and shows its state, for derivatives."""
+    run, method = of_steps(system, method)
+    plain = isinstance(method, MetriplecticRungeKutta) and run.surface is None
+
+    def step(carry, h):
+        return method.plain(run, carry, h) if plain else one_step(run, method, carry, h)  # type: ignore[attr-defined]
+
+    def advance(carry, h):
+        if substeps == 1:
+            return step(carry, h)
+        return jax.lax.scan(lambda carry, _: (step(carry, h / substeps), None), carry, length=substeps)[0]
+
+    if plain:
+        return lambda x: x, advance, lambda x: x
+    return lambda x: first_carry(run, method, x), advance, lambda carry: carry[0][: system.dim]

@@ -1,0 +1,168 @@
+"""Metriplectic systems of which any part is learned, and the units in which their networks work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+
+from ..dissipation.base import Dissipation
+from ..errors import InputError
+from ..functions.energy import Energy as AnyEnergy
+from ..functions.energy import Pullback, as_energy
+from ..systems import MetriplecticSystem, System
+from .data import Scales
+from .networks import Network, learned
+from .parts import Energy, Entropy, Friction, Poisson, behind
+
+T = TypeVar("T", bound=System)
+
+
+class Metriplectic(MetriplecticSystem):
+    """``x' = Pi(x) grad H + K(x) grad S`` of which any part is learned: both laws hold before, during and after that.
+
+    What is not given is learned by a network of its own. A system like any other: every method runs it, with its laws
+    exact in every step.
+
+    Parameters
+    ----------
+    dim : int
+        Number of state components.
+    energy, entropy : Energy, or function from x, shape (dim,), to a scalar; optional
+        Known, learned [:class:`Energy`, :class:`Entropy`], or the sum of both.
+    poisson : manifolds.PoissonStructure, skew matrix or function from x to one; optional
+        Known, or :class:`Poisson`. One of fewer coordinates is that of the first components: the others, such as
+        entropies, are at rest without friction.
+    friction : Dissipation, list of them, or None; optional
+        Known, or :class:`Friction`; None of a system without.
+    width, depth, rank : int
+        Of the networks, and of the friction.
+    seed : int
+        Of the first weights.
+
+    Raises
+    ------
+    InputError, FunctionError
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        energy: AnyEnergy | Callable | None = None,
+        entropy: AnyEnergy | Callable | None = None,
+        poisson: mf.PoissonStructure | Callable | Any | None = None,
+        friction: Dissipation | Sequence[Dissipation] | str | None = "learned",
+        width: int = 32,
+        depth: int = 2,
+        rank: int = 1,
+        seed: int = 0,
+    ):
+        energy = Energy(dim, width, depth, 4 * seed) if energy is None else as_energy(energy, "the energy")
+        entropy = Entropy(dim, width, depth, 4 * seed + 1) if entropy is None else as_energy(entropy, "the entropy")
+        if poisson is None:
+            poisson = Poisson(dim, width, depth, 4 * seed + 2)
+        elif isinstance(poisson, mf.PoissonStructure) and poisson.dim is not None:
+            poisson = behind(poisson, dim)
+        if isinstance(poisson, Poisson):
+            poisson = eqx.tree_at(lambda p: p.entropy, poisson, entropy, is_leaf=lambda part: part is None)
+        if isinstance(friction, str):
+            if friction != "learned":
+                raise InputError(f"friction is a Dissipation, a list of them, 'learned' or None, not {friction!r}")
+            friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
+        super().__init__(poisson, energy, entropy, friction, dim=dim, validate=False)
+        self.poisson = tied_to(self.poisson, self.entropy)
+
+
+def tied_to(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
+    """The structure with the entropy of its system in it, where it is one that has to know it."""
+    if not isinstance(poisson, Poisson) or poisson.entropy is None:
+        return poisson
+    return eqx.tree_at(lambda p: p.entropy, poisson, entropy)
+
+
+def tied(system: T) -> T:
+    """The system with the weights of its entropy wherever that occurs."""
+    return eqx.tree_at(lambda s: s.poisson, system, tied_to(system.poisson, system.entropy))
+
+
+def in_units(system: T, found: Scales, points: np.ndarray) -> T:
+    """The system with networks that work on numbers of the size of one; those that do already are left alone.
+
+    Parameters
+    ----------
+    found : Scales
+        Of the data.
+    points : array, shape (m, n)
+        Some states.
+    """
+    x, s, tau = jnp.asarray(points), jnp.asarray(found.size), found.time
+
+    def varies(function: AnyEnergy) -> float:
+        """What a known function varies by over the data."""
+        return float(jnp.mean(jnp.abs(jax.vmap(function.gradient)(x) * s)))
+
+    energy = entropy = 1.0
+    poisson = system.poisson
+    if not has_networks(system.energy):
+        energy = varies(system.energy)
+    elif not has_networks(poisson):
+        tensor = jnp.mean(jnp.abs(jax.vmap(poisson.tensor)(x)), axis=0)
+        largest = float(jnp.max(tensor / jnp.outer(s, s)))
+        energy = 1.0 / (tau * largest) if largest > 0.0 else 1.0
+    if system.entropy is not None and not has_networks(system.entropy):
+        entropy = varies(system.entropy)
+    entropy = entropy if entropy > 0.0 else 1.0
+    energy = energy if energy > 0.0 else 1.0
+    pairs = jnp.outer(s, s)[np.triu_indices(system.dim, 1)]
+
+    def part_in_units(part):
+        if isinstance(part, Friction):
+            root = jnp.sqrt(entropy * tau)
+            unit = pairs / (energy * root) if part.construction == "skew" else s / root
+            inner = _filled(part.function, x, jnp.tile(unit, part.rank))
+            return eqx.tree_at(lambda p: (p.function, p.metric), part, (inner, s**2))
+        return part
+
+    def of_kind(kind, tree, change):
+        return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, kind))
+
+    parts: dict[str, Any] = {
+        "energy": _filled(system.energy, x, energy),
+        "entropy": _filled(system.entropy, x, entropy),
+        "dissipation": of_kind(Friction, system.dissipation, part_in_units),
+    }
+    if isinstance(poisson, Poisson):
+        inner = _filled(poisson.function, x, pairs / (energy * tau))
+        poisson = eqx.tree_at(lambda p: (p.function, p.metric), poisson, (inner, s**2))
+    parts["poisson"] = poisson
+    names = list(parts)
+    there = [name for name in names if parts[name] is not None]
+    changed = eqx.tree_at(lambda m: [getattr(m, name) for name in there], system, [parts[name] for name in there])
+    return tied(changed)
+
+
+def has_networks(tree: Any) -> bool:
+    """Whether anything in a pytree is learned."""
+    return any(jax.tree_util.tree_leaves(learned(tree)))
+
+
+def _filled(tree: Any, x: jax.Array, unit) -> Any:
+    """The networks in a pytree with the scales of their inputs, and outputs in a unit, unless they have scales."""
+
+    def change(part):
+        if isinstance(part, Pullback):
+            inner = _filled(part.term, jax.vmap(part.of)(x), unit)
+            return eqx.tree_at(lambda p: p.term, part, inner)
+        if not isinstance(part, Network) or not part.is_new:
+            return part
+        spread = jnp.std(x, axis=0)
+        spread = jnp.where(spread > 0.0, spread, 1.0)
+        return Network(jnp.mean(x, axis=0), spread, unit * part.unit, part.function)
+
+    return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, Pullback | Network))

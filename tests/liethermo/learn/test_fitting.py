@@ -1,0 +1,191 @@
+"""Fits: known numbers are found again, the same twice, on from a checkpoint; what cannot be used is refused."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+from liethermo.learn import training
+
+from . import cases
+
+pytest.importorskip("optax")
+
+
+def _numbers(system):
+    friction = system.dissipation.function.function.log_gamma
+    return np.exp([float(system.energy.function.function.log_stiffness), float(friction)])
+
+
+def test_numbers_are_found_by_matching_and_shooting():
+    """The splines are off by 1e-6 here; the runs, whose steps are of order 4, by 1e-5."""
+    t, x = cases.record()
+    matched = lt.learn.fit(cases.oscillator(), (t, x), matching=300, shooting=0, rate=0.1)
+    shot = lt.learn.fit(cases.oscillator(), (t, x), matching=0, shooting=200, rate=0.1)
+    for found in (matched, shot):
+        np.testing.assert_allclose(_numbers(found), [cases.STIFFNESS, cases.GAMMA], rtol=1e-3)
+        assert found.check().passed
+    assert matched.training.parameters == 2
+    assert matched.training.loss[-1] < 1e-6 < matched.training.loss[0]
+    assert "matching" in str(matched.training)
+
+
+def test_other_parameters_of_any_system_are_found():
+    """Inertias and a rate of the relaxed rigid body. The sum of the 1/I moves nothing but through the friction."""
+    body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    runs = [lt.integrate(body, x0, (0.0, 6.0), 0.1, method=lt.MetriplecticRungeKutta(6)) for x0 in np.eye(3) + 0.3]
+    start = lt.models.rigid_body((2.5, 2.2, 1.3), rate=0.5)
+    found = lt.learn.fit(
+        start,
+        runs,
+        matching=1500,
+        shooting=0,
+        rate=0.05,
+        validation=0,
+        positive=lambda s: (s.energy.A, s.dissipation.rate),
+    )
+    np.testing.assert_allclose(1.0 / found.energy.A, [3.0, 2.0, 1.0], rtol=1e-2)
+    assert float(found.dissipation.rate) == pytest.approx(float(body.dissipation.rate), rel=1e-2)
+
+
+def test_a_network_learns_the_force_and_the_laws_hold_in_the_forecast():
+    t, x = cases.record(8)
+    energy = lt.Quadratic(np.ones(1)).on([1]) + lt.learn.Energy(1, width=8, depth=1).on([0]) + _Heat().on([2])
+    system = cases.oscillator(energy=energy, gamma=0.5)
+    found = lt.learn.fit(system, (t, x), matching=600, shooting=50, rate=0.02)
+    run = lt.integrate(found, x[0, 0], (0.0, 4.0), 0.1, method=lt.MetriplecticRungeKutta(4))
+    assert np.abs(run.x - x[0]).max() < 0.05  # 0.012
+    assert np.ptp(run.energy) < 1e-14 * np.abs(run.energy).max() + 1e-14
+    assert (np.diff(run.entropy) > 0.0).all()
+
+
+def _Heat():
+    return lt.Each(lambda y: jnp.exp(y[0]), [[0]])
+
+
+def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
+    t, x = cases.record()
+    how = {"matching": 150, "shooting": 100, "rate": 0.05, "window": 2}
+    system = cases.oscillator()
+    whole = lt.learn.fit(system, (t, x), **how)
+
+    class Interrupted(training.Progress):
+        stop = np.inf
+
+        def update(self, t):
+            if t >= self.stop:
+                raise KeyboardInterrupt
+
+    path = tmp_path / "course.npz"
+    monkeypatch.setattr(training, "Progress", Interrupted)
+    for stop in (100, 200, np.inf):  # in the matching, in the shooting, not at all
+        Interrupted.stop = stop
+        found = lt.learn.fit(system, (t, x), checkpoint=path, **how)
+    assert "interrupted" not in found.training.ended.values()
+    for a, b in zip(jax.tree_util.tree_leaves(whole), jax.tree_util.tree_leaves(found), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(whole.training.loss, found.training.loss)
+    other = lt.learn.fit(system, (t, x), **{**how, "shooting": 0}, seed=1)
+    assert not np.array_equal(whole.training.loss[:3], other.training.loss)
+    with pytest.raises(lt.FileError, match="the checkpoint of a fit of another model"):
+        lt.learn.fit(system, (t, x), checkpoint=path, **{**how, "rate": 0.06})
+
+
+def test_units_make_no_difference():
+    """Seconds or 1e-12 of them, metres or 1e12 of them: the losses are the same but for rounding."""
+    t, x = cases.record(3, 21)
+    seen = []
+    for time, size in ((1.0, 1.0), (1e-12, 1e12), (1e20, 1e-20)):
+        system = lt.learn.Metriplectic(3, width=4, depth=1)
+        found = lt.learn.fit(system, (time * t, size * x), matching=50, shooting=0)
+        seen.append(np.r_[found.training.loss, found.training.validation])
+    np.testing.assert_allclose(seen[1:], [seen[0]] * 2, rtol=1e-6)
+
+
+def test_what_is_not_observed_is_known_through_the_laws():
+    """The heat is not seen: the stiffness and the friction on the motion are found all the same."""
+    t, x = cases.record(3, 31, 3.0)
+    energy = lt.learn.Energy(_Bath(jnp.zeros(())))
+    system = cases.oscillator(energy=energy, friction=lt.learn.Friction(3, function=_Drag(jnp.zeros(()))))
+    found = lt.learn.fit(system, (t, x[..., :2]), observed=[0, 1], shooting=400, rate=0.1, window=5)
+    stiffness = np.exp(float(found.energy.function.function.log_stiffness))
+    drag = np.exp(float(found.dissipation.function.function.log_gamma))
+    np.testing.assert_allclose([stiffness, drag], [cases.STIFFNESS, cases.GAMMA], rtol=0.02)
+
+
+class _Bath(cases.Spring):
+    """A bath of temperature 1."""
+
+    def __call__(self, x):
+        return 0.5 * x[1] ** 2 + 0.5 * jnp.exp(self.log_stiffness) * x[0] ** 2 + x[2]
+
+
+class _Drag(cases.Rubbing):
+    def __call__(self, x):
+        return jnp.stack([0.0, 0.0, -jnp.exp(0.5 * self.log_gamma)])
+
+
+def test_noise_and_times_at_any_distances():
+    t, x = cases.record(4, 81)
+    random = np.random.default_rng(1)
+    data = []
+    for states in x:
+        kept = np.sort(random.choice(len(t), 60, replace=False))
+        data.append((t[kept], states[kept] + 0.01 * random.standard_normal((60, 3))))
+    found = lt.learn.fit(cases.oscillator(), data, noise=0.01, matching=150, shooting=200, rate=0.1, window=8)
+    np.testing.assert_allclose(_numbers(found), [cases.STIFFNESS, cases.GAMMA], rtol=0.03)
+    last = found.training.loss[-1]
+    assert 0.3 < last < 3.0  # of the size of the noise
+
+
+def test_early_stopping_keeps_the_best():
+    t, x = cases.record()
+    found = lt.learn.fit(cases.oscillator(2.0, 0.3), (t, x), matching=2000, shooting=0, rate=1e-9, patience=2)
+    assert found.training.step[-1] < 2000
+    assert "no better for 2 looks" in found.training.ended["matching"]
+
+
+T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
+
+
+@pytest.mark.parametrize(
+    ("data", "how", "words"),
+    [
+        ((T, np.where(np.arange(15).reshape(5, 3) == 7, np.nan, X)), {}, "component 1 of state 2 is nan"),
+        ((T[:1], X[:1]), {}, "1 point: at least 2"),
+        ((T[[0, 2, 1, 3, 4]], X), {}, "times must grow, but time 2 is 0.25 after 0.5"),
+        ((T, X[:4]), {}, "5 times and 4 states"),
+        ((T, X[:, :2]), {}, "shape"),
+        ((T, X), {"observed": [0, 3]}, "component 3"),
+        ((T, X), {"observed": [0, 1]}, "2 components are observed"),
+        ((T, np.ones((5, 3))), {}, "nothing moves"),
+        ((T, X), {"noise": -1.0}, "positive standard deviation"),
+        ((T, X), {"matching": -1}, "matching is an integer >= 0"),
+        ((T, X), {"validation": 1.0}, "share from 0 to below 1"),
+        ({"t": T}, {}, "pair"),
+        ([], {}, "no trajectories"),
+    ],
+)
+def test_bad_data_has_an_error_of_one_line(data, how, words):
+    with pytest.raises((lt.InputError, lt.FunctionError), match=words) as raised:
+        lt.learn.fit(cases.oscillator(), data, **how)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_system_of_which_nothing_is_learned_is_refused():
+    body = lt.models.rigid_body()
+    with pytest.raises(lt.InputError, match="nothing is learned"):
+        lt.learn.fit(body, (T, X))
+
+
+def test_a_loss_that_is_not_finite_is_an_error():
+    def undefined(x):
+        return jnp.sqrt(x[0])
+
+    system = cases.oscillator(energy=lt.learn.Energy(cases.Spring(jnp.zeros(()))) + undefined)
+    t, x = cases.record()
+    with pytest.raises(lt.InputError, match="the loss is nan after 50 steps, in the matching"):
+        lt.learn.fit(system, (t, x), matching=50, shooting=0)
