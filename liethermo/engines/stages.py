@@ -115,7 +115,7 @@ def fixed_point(equations: Equations, rules: Rules = RULES) -> Solved:
     )
 
 
-def noise_of(system: System, method: OneStepMethod, x, rules: Rules = RULES) -> jax.Array:
+def noise_of(system: System, x, rules: Rules = RULES) -> jax.Array:
     """The size at which the motion from a state is rounded, as a whole."""
     system, x = system.solved_for(x)
     return rules.size(x.size)(with_rounding(system.vector_field, x)[1])

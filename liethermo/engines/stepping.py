@@ -145,7 +145,7 @@ def equations(
         guess=method.predict(k, before),
         scale=lambda k: whole + measure(k) + rules.vanished,
         inverted=newton_steps(system, method, x, compensation, h, rules, columns),
-        noise=lambda: noise_of(system, method, x, rules),
+        noise=lambda: noise_of(system, x, rules),
     )
 
 

@@ -133,7 +133,7 @@ def _stages(system: System, method: OneStepMethod, x, compensation, h, guess) ->
             guess=guess,
             scale=lambda k: scale_of(system.solved_for(x)[1], h, k),
             inverted=newton_steps(system, method, x, compensation, h),
-            noise=lambda: noise_of(system, method, x),
+            noise=lambda: noise_of(system, x),
         )
         solved = solve_stages(own)
         return jnp.where(solved.converged, solved.k, jnp.nan)
