@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator
@@ -60,11 +61,12 @@ class Timetable:
         """The times after so many steps."""
         return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
 
-    @property
+    @functools.cached_property
     def counts(self) -> np.ndarray:
         """Steps after which states are kept, 0 (the start) and the last among them."""
-        kept = np.array([0]) if self.every is None else np.arange(0, self.full + 1, self.every)
-        return np.unique([*kept, *([] if self.every is None else [self.full]), self.steps])
+        kept = np.arange(0, self.full + 1, self.every or self.steps)
+        ends = {self.steps} if self.every is None else {self.full, self.steps}
+        return np.append(kept, np.array(sorted(n for n in ends if n > kept[-1]), dtype=kept.dtype))
 
     @property
     def times(self) -> np.ndarray:
@@ -150,13 +152,15 @@ class Course:
     @property
     def counts(self) -> np.ndarray:
         """Steps after which states are kept, 0 (the start) and the last among them."""
-        before = np.cumsum([0, *(part.steps for part in self.parts)])
-        return np.unique(np.concatenate([n + part.counts for n, part in zip(before, self.parts, strict=False)]))
+        first, *others = self.parts
+        before = np.cumsum([part.steps for part in self.parts])
+        return np.concatenate([first.counts, *(n + part.counts[1:] for n, part in zip(before, others, strict=False))])
 
     @property
     def times(self) -> np.ndarray:
         """The times at :attr:`counts`."""
-        return np.unique(np.concatenate([part.times for part in self.parts]))
+        first, *others = self.parts
+        return np.concatenate([first.times, *(part.times[1:] for part in others)])
 
     def reached(self, steps: np.ndarray) -> np.ndarray:
         """The times after so many steps."""
