@@ -65,10 +65,12 @@ def looked_at(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, repla
     kept = alike & (counts == 1)
     costs, left = np.where(kept, 1, REPLAY * counts), max(FEWEST * REPLAY, LOOKED_NUMBERS // x.shape[1])
     order = np.arange(len(h)) if costs.sum() <= left else _fastest(system, x, h, max(FEWEST, left // 4))
+    spent = np.cumsum(costs[order])
+    order = order[spent - costs[order] < left]
+    if kept[order].all():
+        return Steps(t[order], h[order], x[order], x[order + 1])
     found: list[Steps] = []
     for i in order:
-        if left <= 0:
-            break
         path = x[i : i + 2]
         if not kept[i]:
             path = np.vstack([x[i], replay(x[i], h[i], min(counts[i], -(-left // REPLAY)))])

@@ -234,7 +234,7 @@ class AttitudeSystem(System):
 
     @property
     def _parts(self) -> int:
-        return 2 if jnp.iscomplexobj(self.group.identity) else 1
+        return 2 if self.group.is_complex else 1
 
 
 def _bounded(body: System) -> list[slice]:

@@ -19,6 +19,7 @@ from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
+from ..tracing.remembered import remembered
 from .base import TIMES, System
 from .baths import EntropyOfBaths, HeatBaths
 from .torque import checked_torque, name_of, torque_at
@@ -125,13 +126,7 @@ class LiePoissonSystem(System):
         if not _of_a_body(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
         energy = self.without_baths().energy
-        if not energy.is_quadratic:
-            return None
-        still = jnp.zeros(self.algebra.dim)
-        squares = np.asarray(jax.jacfwd(energy.gradient)(still))  # its inverse is that of the parts moving freely
-        if np.linalg.eigvalsh(squares)[0] <= 0.0 or np.asarray(energy.gradient(still)).any():
-            return None
-        return np.linalg.inv(squares)[:3, :3]
+        return _inertia(energy, self.algebra.dim) if energy.is_quadratic else None
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
@@ -246,6 +241,18 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
     if group.cayley_is_adjoint():
         return "cayley"
     return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._stays(map_))
+
+
+@remembered
+def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
+    """The moments of inertia of a body with a quadratic energy of its momenta; None where it is no kinetic one."""
+    still = jnp.zeros(dim)
+    squares = np.asarray(jax.jacfwd(energy.gradient)(still))  # its inverse is that of the parts moving freely
+    if np.linalg.eigvalsh(squares)[0] <= 0.0 or np.asarray(energy.gradient(still)).any():
+        return None
+    found = np.linalg.inv(squares)[:3, :3]
+    found.flags.writeable = False  # it is remembered
+    return found
 
 
 @functools.lru_cache(maxsize=64)

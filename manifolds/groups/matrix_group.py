@@ -120,6 +120,11 @@ class MatrixGroup:
         return self.algebra._known_basis().shape[-1]
 
     @property
+    def is_complex(self) -> bool:
+        """Whether its matrices have complex entries."""
+        return jnp.iscomplexobj(self.algebra._known_basis())
+
+    @property
     def identity(self) -> jax.Array:
         """The identity matrix, shape (m, m)."""
         return jnp.eye(self.matrix_size, dtype=self.algebra._known_basis().dtype)

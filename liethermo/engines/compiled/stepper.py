@@ -9,6 +9,7 @@ finds it.
 from __future__ import annotations
 
 import ctypes
+import functools
 import itertools
 import math
 import threading
@@ -56,7 +57,7 @@ class CompiledEngine:
         self._parameters, self.portion = numbers_of(system, method), portion_of(system)
         self._form, self._method, self._rules = Form.of(system), method, rules
 
-    @property
+    @functools.cached_property
     def _stepper(self) -> Stepper:
         """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
         return stepper_of(self._form, self._parameters, self._method, rules=self._rules)
@@ -195,7 +196,7 @@ class Stepper:
     kept: tuple[str, ...] = ("x", "energy", "entropy")
     """The fields that are written down at each save."""
 
-    @property
+    @functools.cached_property
     def operations(self) -> int:
         """Scalar operations of a step with one iteration."""
         return self._pieces["step"].program.size
