@@ -1,8 +1,9 @@
 """Walks the built site in a headless Chromium without a network: ``make docs-check``.
 
-It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas that stay raw, pages
-wider than their screen, and words that the search does not find. Pictures of pages, at two widths, light and dark, go
-to ``docs/_build/screenshots``.
+It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas and tables that stay
+raw, pages wider than their screen, tables and outputs that are clipped, and words that the search does not find; and in
+the sources for code in passing that is not true, and for numbers that differ from page to page. Pictures of pages, at
+two widths, light and dark, go to ``docs/_build/screenshots``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-HTML = Path(__file__).resolve().parent / "_build" / "html"
+import check_text
+
+HERE = Path(__file__).resolve().parent
+HTML = HERE / "_build" / "html"
 PICTURES = HTML.parent / "screenshots"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -38,11 +42,20 @@ WORDS = {
     "Stiefel": "Stiefel",
     "adaptive": "adaptive",
     "misprint": "misprint",
+    "GPU": "engine",
+    "GENERIC": "metriplectic",
+    "symplectic": "symplectic",
+    "torque": "torque",
+    "quaternion": "quaternion",
+    "density matrix": "density",
+    "nutation": "nutation",
+    "thermostat": "bath",
 }
 """What a reader looks for, and what a title or an excerpt of the answer holds."""
 
 SHOWN = (
     "index",
+    "start/index",
     "tutorials/index",
     "tutorials/first_run",
     "howto/index",
@@ -51,6 +64,7 @@ SHOWN = (
     "explanation/large_systems",
     "reference/api",
     "reference/benchmarks",
+    "reference/generated/liethermo.integrate",
     "reference/generated/manifolds.LieAlgebra",
     "gallery/index",
 )
@@ -71,6 +85,10 @@ PROBE = """(() => {
     images: all("img").map((i) => [
       i.src, i.complete && i.naturalWidth > 0, (i.getAttribute("alt") || "").trim() !== ""]),
     raw: all(".math").filter((e) => !e.querySelector("mjx-container")).map((e) => e.textContent.slice(0, 80)),
+    clipped: all(".bd-article table, .bd-article div.output pre").filter((e) => {
+      const box = e.closest(".pst-scrollable-table-container") || e;
+      return Math.max(box.scrollWidth - box.clientWidth, e.scrollWidth - e.clientWidth) > 1;
+    }).map((e) => e.tagName + ": " + e.textContent.trim().slice(0, 60)),
     broken: all("mjx-merror").map((e) => e.textContent.slice(0, 80)),
     wide: document.documentElement.scrollWidth - window.innerWidth,
     culprits: all("body *").filter((e) => e.getBoundingClientRect().right > window.innerWidth + 1 && e.offsetParent
@@ -188,9 +206,10 @@ def _trouble(event: dict[str, Any]) -> str | None:
 
 @contextmanager
 def browser() -> Iterator[Browser]:
-    program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    names = (os.environ["CHROMIUM"],) if "CHROMIUM" in os.environ else BROWSERS
+    program = next((found for name in names if (found := shutil.which(name))), None)
     if program is None:
-        sys.exit(f"none of {', '.join(BROWSERS)} was found: install Chromium (on Debian: apt-get install chromium)")
+        sys.exit("no Chromium was found: apt-get install chromium, or set CHROMIUM to the program of one")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         chromium = Browser(program, profile)
         try:
@@ -217,6 +236,8 @@ def check_pages(chromium: Browser, html: Path, match: str = "*") -> list[str]:
         wrong += [f"{name}: image without words {source}" for source, _, told in seen["images"] if not told]
         wrong += [f"{name}: formula not typeset: {text}" for text in seen["raw"]]
         wrong += [f"{name}: formula in error: {text}" for text in seen["broken"]]
+        wrong += [f"{name}: clipped at 1280 pixels: {text}" for text in seen["clipped"]]
+        wrong += [f"{name}: {text}" for text in check_text.raw_tables(page.read_text())]
         if seen["headerLines"] > 1:
             wrong.append(f"{name}: the header takes {seen['headerLines']} lines")
         chromium.resize(390)
@@ -253,6 +274,12 @@ def check_search(chromium: Browser, html: Path) -> list[str]:
     return wrong
 
 
+def check_sources(docs: Path) -> list[str]:
+    """What the pages say in passing, and the numbers that they share."""
+    pages = check_text.sources(docs)
+    return [*check_text.untrue_spans(pages), *check_text.differing_numbers(pages)]
+
+
 def take_pictures(chromium: Browser, html: Path) -> None:
     for name, width in itertools.product(SHOWN, WIDTHS):
         chromium.resize(width)
@@ -274,6 +301,7 @@ def main() -> None:
     with browser() as chromium:
         take_pictures(chromium, html)
         wrong = check_pages(chromium, html, arguments.match) + check_search(chromium, html)
+        wrong += check_sources(HERE)
     print("\n".join(wrong))
     print(f"{len(wrong)} findings; screenshots in {PICTURES}")
     sys.exit(bool(wrong))

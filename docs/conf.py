@@ -97,6 +97,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "reset_modules": ("matplotlib",),
     "show_signature": False,
+    "thumbnail_size": (520, 364),
     "nested_sections": False,
     "write_computation_times": False,
 }
@@ -122,6 +123,25 @@ html_theme_options = {
 }
 html_sidebars = {"index": []}
 html_context = {"default_mode": "auto"}  # else the theme complains to a first visitor
+
+
+INTERNALS = frozenset(
+    """
+    arranged at_midpoint at_sites at_some_times balance begin blocks body_at body_dim by_constants check_places
+    constants couplings decided decided_near displaced entries evaluated explain general heating_sites
+    held_functions here hidden impulses in_chart isotropic isotropic_size kind leaves ledger left_alone
+    linearised local lowered needs_attitude noiseless noisy numbers on on_density on_sites on_states orderless
+    outside over_sites own_energy own_residuals own_size place predict prepared presented preserved_as
+    preserved_by_name preserved_names production_name pulled push pushed pushed_by quotient raised receives
+    rounded samples seen sizes smooth solved_for sparsity spectral surface surrounded tangent time_of
+    torque_free transport transports turned turned_parts uncorrected undecided unrollable
+    """.split()
+)
+"""Members that the rooms of the library ask of each other: no user calls them, so the reference leaves them out."""
+
+
+def _is_internal(app, what, name, value, skip, options):
+    return True if what == "class" and name in INTERNALS else None
 
 
 def _is_bare_value(app, what, name, value, skip, options):
@@ -150,5 +170,6 @@ def _read_as_meant(app, what, name, value, options, lines):
 
 def setup(app):
     app.connect("autodoc-process-docstring", _read_as_meant)
+    app.connect("autodoc-skip-member", _is_internal)
     app.connect("autodoc-skip-member", _is_bare_value)
     app.connect("html-page-context", _say_what_thumbnails_show)

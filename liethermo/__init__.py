@@ -220,6 +220,11 @@ __all__ = [
 _INTEROP = ("diffrax", "scipy", "sympy")
 
 
+def __dir__() -> list[str]:
+    """What is public: not the modules that are imported here."""
+    return sorted([*__all__, "__doc__", "__name__", "__version__"])
+
+
 def __getattr__(name: str):
     if name == "plot":  # matplotlib is imported only when a picture is wanted
         return importlib.import_module(".results.plot", __name__)

@@ -183,6 +183,11 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    """What is public: not the modules that are imported here."""
+    return sorted([*__all__, "__doc__", "__name__"])
+
+
 def __getattr__(name: str):
     if name == "sympy":  # an optional package
         return importlib.import_module(".sympy", __name__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
@@ -20,15 +21,39 @@ class Row:
     note: str = ""
 
 
+WIDTH = 80
+"""Columns of a terminal, and of a page."""
+
+NUMBERS = 30
+"""Columns of what stands behind the name of a row."""
+
+
 def table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str:
-    """The rows under their headings, and a last line."""
+    """The rows under their headings, and a last line; names and notes that are too long go on in lines of their own."""
     rows = list(rows)
-    width = max([len(headings[0]), *(len(row.name) for row in rows)])
+    width = min(max([len(headings[0]), *(len(row.name) for row in rows)]), WIDTH - NUMBERS)
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
+        *above, name = wrapped(row.name, width, "  ")
         allowed = " " * 9 if row.allowed is None else f"{row.allowed:9.1e}"
-        lines.append(f"{row.name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT[row.passed]:<5} {row.note}".rstrip())
-    return "\n".join([*lines, last])
+        line = f"{name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT[row.passed]:<5}"
+        short = f"{line} {row.note}".rstrip()
+        fits = len(short) <= WIDTH
+        lines += [
+            *above,
+            short if fits else line.rstrip(),
+            *([] if fits else wrapped(f"    {row.note}", WIDTH, "    ")),
+        ]
+    return "\n".join([*lines, *wrapped(last, WIDTH)])
+
+
+def wrapped(text: str, width: int = WIDTH, hang: str = "") -> list[str]:
+    """Lines of at most so many columns, broken between words; a word that is longer stays whole."""
+    found = [
+        textwrap.wrap(line, width, subsequent_indent=hang, break_long_words=False, break_on_hyphens=False) or [""]
+        for line in text.split("\n")
+    ]
+    return [line for lines in found for line in lines]
 
 
 def html_table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str:

@@ -51,8 +51,7 @@ def run(quick: bool) -> Report:
         "batches over threads, whose equations are the scalar program of the library's vector field. The error is the "
         f"worst of {SAMPLE} states, against heyoka at a tolerance of {EXACT:g}; heyoka has the loosest tolerance with "
         "which it is at least as accurate. The library takes the spin through charts of its sphere, one for each "
-        "step, and differentiates them; heyoka's spin leaves the sphere by its error. No target but to state what is "
-        "found."
+        "step, and differentiates them; heyoka's spin leaves the sphere by its error. There is no target."
     )
     return Report("Other systems", text, tables, skipped=skipped)
 

@@ -55,7 +55,9 @@ def run(quick: bool) -> Report:
         Target(f"midpoint scheme, one relaxed rigid body, against C ({name})", 1.3, ratio(times[name], times.get(C)))
         for name in (PLAIN, QUADRATIC)
     ]
-    targets.append(Target(f"a call of {few} steps beside them, every state kept", 1.5e-4, beside, "seconds"))
+    targets.append(
+        Target(f"a call of {few} steps that keeps every state, without the steps", 1.5e-4, beside, "seconds")
+    )
     return Report("One body", text, [table, calls], targets, skipped)
 
 

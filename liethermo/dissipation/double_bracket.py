@@ -29,6 +29,14 @@ class DoubleBracket(Dissipation):
         of an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
+
+    Examples
+    --------
+    >>> body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.1))
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 50.0), 0.1)
+    >>> size = np.linalg.norm(run.x, axis=1)
+    >>> bool(run.energy[-1] < run.energy[0]), bool(np.ptp(size) < 1e-14)
+    (True, True)
     """
 
     rate: jax.Array

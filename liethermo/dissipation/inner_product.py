@@ -47,6 +47,14 @@ class InnerProductDissipation(OfBracket):
     ------
     IndefiniteError, InputError
         If it is not.
+
+    Examples
+    --------
+    >>> g = mf.so(3)
+    >>> form = lt.InnerProductDissipation(np.diag([1.0, 1.0, 2.0]))
+    >>> system = lt.LiePoissonSystem(g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], form)
+    >>> bool(system.check().passed)
+    True
     """
 
     K: Any
@@ -87,6 +95,13 @@ class KillingDissipation(OfBracket):
     ------
     IndefiniteError
         When used on an algebra that is not semisimple and whose ``-kappa`` is indefinite.
+
+    Examples
+    --------
+    >>> g = mf.so(3)
+    >>> system = lt.LiePoissonSystem(g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], lt.KillingDissipation(0.1))
+    >>> bool(system.check().passed)
+    True
     """
 
     rate: jax.Array

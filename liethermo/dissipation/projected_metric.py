@@ -45,6 +45,14 @@ class ProjectedMetric(Dissipation):
     normalized : bool
     rate : float, >= 0
         Factor on the whole.
+
+    Examples
+    --------
+    >>> g = mf.se(3)
+    >>> energy = lt.Quadratic([1.0, 2.0, 3.0, 1.0, 1.5, 2.0])
+    >>> system = lt.LiePoissonSystem(g, energy, g.casimirs(2)[0], lt.ProjectedMetric(rate=0.1))
+    >>> bool(system.check().passed)
+    True
     """
 
     cometric: jax.Array | Callable | None

@@ -164,6 +164,14 @@ class Quadratic(Energy):
     A : array, shape (n, n) symmetric, or (n,) for a diagonal matrix
     b : array, shape (n,), optional
     c : float, optional
+
+    Examples
+    --------
+    >>> energy = lt.Quadratic([1.0, 2.0, 3.0])
+    >>> float(energy.value(jnp.array([1.0, 1.0, 0.0])))
+    1.5
+    >>> energy.gradient(jnp.array([1.0, 1.0, 0.0])).tolist()
+    [1.0, 2.0, 0.0]
     """
 
     A: jax.Array

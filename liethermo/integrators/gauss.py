@@ -77,6 +77,13 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         and of what its dissipation is told to preserve.
     moving : tuple of int, optional
         Which of ``preserve`` are momentum maps, that move the state, and not Casimirs; a run finds out.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> method = lt.MetriplecticGauss(stages=3)
+    >>> method.order, lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.5, method).audit().passed
+    (6, True)
     """
 
     functions: tuple[Energy, ...]

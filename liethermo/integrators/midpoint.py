@@ -36,6 +36,12 @@ class MetriplecticMidpoint(TransportingMethod):
         On a manifold, in whose charts to run: ``"midpoint"`` is the paper's ``exp~_h`` (4.8), others as
         :func:`manifolds.retraction` names them. Where z is at the start of the step, the chart's own midpoint is taken,
         so the order is 2 too.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, lt.MetriplecticMidpoint()).audit().passed
+    True
     """
 
     gradient: DiscreteGradient

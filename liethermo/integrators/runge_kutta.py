@@ -52,6 +52,13 @@ class MetriplecticRungeKutta(ExplicitMethod):
         On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> method = lt.MetriplecticRungeKutta(order=4)
+    >>> method.explicit, lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, method).audit().passed
+    (True, True)
     """
 
     def __init__(

@@ -62,6 +62,13 @@ class MetriplecticTaylor(ExplicitMethod):
         On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 100.0), lt.Adaptive(1e-12), lt.MetriplecticTaylor())
+    >>> run.audit().passed, run.stats.steps < 300
+    (True, True)
     """
 
     def __init__(

@@ -51,6 +51,12 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     -----
     InertiaWarning
         Where no body has the inertias, other than the paper's.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> body.dim, lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1).audit().passed
+    (3, True)
     """
     return LiePoissonSystem(
         mf.so(3),

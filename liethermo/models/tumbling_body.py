@@ -63,6 +63,13 @@ def tumbling_body(
     -----
     InertiaWarning
         Where no body has the inertias.
+
+    Examples
+    --------
+    >>> body = lt.models.tumbling_body(inertia=(3.0, 2.0, 1.0), rate=0.08)
+    >>> run = lt.integrate(body, [0.06, 0.1, 1.0], (0.0, 100.0), 0.1)
+    >>> run.audit().passed, run.attitude.shape
+    (True, (1001, 3, 3))
     """
     moments = checked_inertia(inertia)
     if (rate is None) == (relaxation_time is None) or (momentum is None) != (relaxation_time is None):

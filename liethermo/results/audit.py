@@ -139,6 +139,15 @@ class Audit:
     rows : tuple of AuditRow
     coverage : str
         How many of the steps were looked at for that, where it was not all; the verdict says it too.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> audit = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 5.0), 0.1).audit()
+    >>> audit.passed, audit.resolved, audit.energy_drift < 1e-14
+    (True, True, True)
+    >>> audit.verdict
+    'the laws hold, and the steps resolve the motion'
     """
 
     energy_drift: float

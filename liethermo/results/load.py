@@ -22,6 +22,14 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
     -----
     UserWarning
         If an earlier version wrote the file, without a checksum: damage may show in nothing.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> solution = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 5.0), 0.1)
+    >>> path = solution.save("run.nc")
+    >>> bool((lt.load("run.nc").x == solution.x).all())
+    True
     """
     series, attributes = read(path)
     try:

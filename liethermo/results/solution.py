@@ -52,6 +52,15 @@ class Solution(Saved):
         Elements of the group of the system, where it has one.
     evidence : Evidence
         What an audit needs besides the series: found when first asked for, and written to files.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> solution = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 5.0), 0.1)
+    >>> solution.t.shape, solution.x.shape, solution.status.code
+    ((51,), (51, 3), 'completed')
+    >>> solution.to_xarray()["x"].dims
+    ('time', 'component')
     """
 
     t: np.ndarray

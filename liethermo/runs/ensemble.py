@@ -95,6 +95,13 @@ def ensemble(
     InputError
         If an argument cannot be used, or no trajectory can be started. The parameters with the smallest and largest
         values are tried one by one, and the next where these are inadmissible.
+
+    Examples
+    --------
+    >>> starts = np.random.default_rng(0).standard_normal((100, 3))
+    >>> many = lt.ensemble(lt.models.rigid_body(rate=0.2), starts, (0.0, 5.0), 0.05, outputs="summary")
+    >>> many.energy.shape, bool(many.ok.all())
+    ((100,), True)
     """
     started = time.perf_counter()
     method = (DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE) if method is None else method

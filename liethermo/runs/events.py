@@ -26,6 +26,13 @@ class Relaxed:
 
     A state whose rate is below ``tol`` from the start, such as one near an unstable equilibrium, has to rise above it
     first.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 1e4), lt.Adaptive(1e-8), until=lt.Relaxed(1e-6))
+    >>> run.status.code
+    'event'
     """
 
     tol: float

@@ -63,6 +63,13 @@ def flow(
     ------
     InputError
         If an argument cannot be used.
+
+    Examples
+    --------
+    >>> def end(rate):
+    ...     return lt.flow(lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1)
+    >>> jax.jacfwd(end)(0.5).shape
+    (3,)
     """
     x, table = system.state(x0), Timetable(t_span, step, save_every)
     n, shown = system.dim, system

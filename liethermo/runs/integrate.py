@@ -49,16 +49,20 @@ def integrate(
     Parameters
     ----------
     system : System
+        What moves: a :class:`LiePoissonSystem`, :class:`MetriplecticSystem` or any other, or a model of
+        :mod:`liethermo.models`. Its functions fix the units; the library has none of its own.
     x0 : array, shape (n,)
+        The state at the start, in the units of the system: for a body in SI units kg m**2 / s. ``system.state`` makes
+        it of other arrays, such as density matrices and spins; an entropy of baths that is left out is zero.
     t_span : (float, float)
-        Start and end, the end later. The last step is shortened to arrive there. An energy that depends on time, and a
-        torque, are taken at these times.
+        Start and end (in the unit of time of the system; s in SI), the end later. The last step is shortened to arrive
+        there. An energy that depends on time, and a torque, are taken at these times.
     step : float or Adaptive
-        Step size, > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
+        Step size (as time), > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
     method : OneStepMethod or Reference
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int
-        Keep every n-th state, n this number, and the last; the laws are followed at every step all the same.
+        Keep the states of every ``save_every``-th step, and the last. The laws are measured at every step.
     save_at : array of times, optional
         Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
@@ -103,6 +107,21 @@ def integrate(
         If a step fails and ``on_failure`` is "raise".
     FileError
         If ``save_to`` cannot be written at the end, with the run as ``.solution``; before that it is a warning.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> solution = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 20.0), 0.1)
+    >>> solution.x.shape, solution.audit().passed
+    ((201, 3), True)
+
+    Adaptive steps of order 8, until the body has come to rest:
+
+    >>> solution = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 1e4), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8), until=lt.Relaxed(1e-8)
+    ... )
+    >>> solution.status.code, solution.event_time < 1e3
+    ('event', True)
     """
     check_noise(noise)
     default = DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE

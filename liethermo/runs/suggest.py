@@ -44,6 +44,13 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     ------
     InputError
         Where nothing moves at x0, so that any step will do.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> step = lt.suggest_step(body, [0.1, 0.2, 1.0], 1e-8, lt.MetriplecticGauss(3))
+    >>> bool(0.01 < step < 2.0)
+    True
     """
     return _tried(system, x0, rtol, DEFAULT_METHOD if method is None else method, t0).step
 
@@ -115,6 +122,14 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     ------
     InputError
         Where nothing moves at x0, or no method reaches the accuracy.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> found = lt.suggest_method(body, [0.1, 0.2, 1.0], rtol=1e-8)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), found.step, found.method)
+    >>> run.audit().passed
+    True
     """
     trials, refusals = [], []
     for method in (*CANDIDATES, MetriplecticTaylor(order_for(rtol))):

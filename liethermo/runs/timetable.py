@@ -24,7 +24,7 @@ class Timetable:
     span : (float, float)
     step : float
     every : int or None
-        Keep every n-th state, n this number, and the last; None keeps the last alone.
+        Keep the states of every ``save_every``-th step, and the last; None keeps the last alone.
 
     Attributes
     ----------

@@ -97,6 +97,19 @@ class Study:
     ------
     InputError
         If an argument cannot be used.
+
+    Examples
+    --------
+    >>> study = lt.Study(
+    ...     lambda p: lt.models.rigid_body((1.0, p["ratio"], 0.5), p["rate"]),
+    ...     {"ratio": [0.6, 0.8], "rate": [0.5, 1.0, 2.0]},
+    ...     x0=[0.1, 0.2, 1.0],
+    ...     t_span=(0.0, 20.0),
+    ...     step=0.2,
+    ...     measure={"tau": "relaxation_time"},
+    ... )
+    >>> study.run(progress=False).ok, dict(study.results["tau"].sizes)
+    (True, {'ratio': 2, 'rate': 3})
     """
 
     @by_own_settings

@@ -176,7 +176,7 @@ class Kind(Module):
 
     @property
     def balance(self) -> tuple[str, ...]:
-        """Which entries of the ledger a solution has in its energy, and its laws are stated without."""
+        """Entries of the ledger that the energy of a solution contains; its laws are stated without them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------

@@ -75,6 +75,18 @@ class LiePoissonSystem(System):
         If the dissipation, a function or the group does not fit.
     manifolds.LieAlgebraError
         If the reconstruction asked for leaves the group.
+
+    Examples
+    --------
+    >>> system = lt.LiePoissonSystem(
+    ...     mf.so(3),
+    ...     energy=lambda mu: 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0])),
+    ...     dissipation=lt.DoubleBracket(rate=0.08),
+    ...     baths=lt.HeatBaths(capacity=2.0),
+    ...     group=mf.SO(3),
+    ... )
+    >>> system.dim, bool(system.check().passed)
+    (4, True)
     """
 
     algebra: mf.LieAlgebra = eqx.field(static=True)

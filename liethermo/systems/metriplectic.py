@@ -47,6 +47,19 @@ class MetriplecticSystem(System):
     Raises
     ------
     CasimirError, AxiomError, FunctionError, InputError
+
+    Examples
+    --------
+    A particle in a potential, whose friction heats a bath of entropy ``x[2]``:
+
+    >>> system = lt.MetriplecticSystem(
+    ...     poisson=np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]),
+    ...     energy=lambda x: 0.5 * x[1] ** 2 + 1.0 - jnp.cos(x[0]) + jnp.exp(x[2]),
+    ...     entropy=lambda x: x[2],
+    ...     dissipation=lt.ProjectedMetric(np.diag([0.0, 1.0, 1.0])),
+    ... )
+    >>> lt.integrate(system, [1.0, 0.0, 0.0], (0.0, 10.0), 0.05).audit().passed
+    True
     """
 
     def __init__(

@@ -67,6 +67,14 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
 
     so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
     ``E_ij g - E_ji g`` for i < j in lexicographic order, g the form.
+
+    Examples
+    --------
+    >>> g = mf.so(3)
+    >>> g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]).tolist()
+    [0.0, 0.0, 1.0]
+    >>> print(*g.casimirs(degree=2))
+    mu1**2 + mu2**2 + mu3**2
     """
     p, q = checked_size(p, 0, "so(p, q)"), checked_size(q, 0, "so(p, q)")
     n = checked_size(p + q, 2, "so(p, q)", "p + q")

@@ -61,6 +61,14 @@ class LieAlgebra:
     dissipations ask of an algebra is ``dim``, ``shape``, :meth:`bracket`, :meth:`ad_star`, :meth:`action`,
     :meth:`killing_inner_product`, :meth:`killing_signature`, :meth:`is_semisimple`, :meth:`is_solvable`,
     :meth:`casimir_count` and :meth:`leading_casimirs`; none of it takes a dim by dim matrix from these.
+
+    Examples
+    --------
+    >>> C = np.zeros((3, 3, 3))
+    >>> C[0, 1, 2], C[0, 2, 1] = 1, -1  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
+    >>> g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="plane")
+    >>> print(*g.casimirs(degree=2))
+    mu2**2 + mu3**2
     """
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):

@@ -24,6 +24,12 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
 
     Up to dimension 40 it is given by its structure constants; a larger one acts block by block, without them, and
     copies of one algebra in a row as one batch. See :func:`manifolds.power`.
+
+    Examples
+    --------
+    >>> g = mf.direct_sum(mf.so(3), mf.abelian(1))
+    >>> g.dim, g.casimir_count()
+    (4, 2)
     """
     if not algebras:
         raise ShapeError("direct_sum needs at least one algebra")

@@ -16,7 +16,15 @@ from .rotations import rotation_log
 
 @register((2,), (3,), (4,))
 def SO(n: int) -> MatrixGroup:
-    """Rotations of R^n: ``g^T g = I``, ``det g = 1``."""
+    """Rotations of R^n: ``g^T g = I``, ``det g = 1``.
+
+    Examples
+    --------
+    >>> group = mf.SO(3)
+    >>> g = group.exp([0.1, 0.2, 0.3])
+    >>> bool(group.belongs(g)), np.allclose(group.log(g), [0.1, 0.2, 0.3])
+    (True, True)
+    """
     group = MatrixGroup(
         f"SO({n})",
         catalogue.so(n),

@@ -252,6 +252,14 @@ def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction
     LieAlgebraError
         If Cayley's map leaves the group.
     ParameterError
+
+    Examples
+    --------
+    >>> sphere = mf.Sphere(2)
+    >>> chart = mf.retraction(sphere, "projection")
+    >>> z = sphere.point([0.0, 0.0, 1.0])
+    >>> bool(sphere.belongs(chart.point(z, jnp.array([0.3, 0.1, 0.0]))))
+    True
     """
     space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
     if kind not in _BY_NAME:

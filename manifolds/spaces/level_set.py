@@ -52,6 +52,13 @@ class LevelSet(Space):
         If the constraints are no such functions, depend on each other, or no random array leads to a point.
     ParameterError
         If the shape or the metric cannot be used.
+
+    Examples
+    --------
+    >>> ellipsoid = mf.LevelSet(lambda x: x[0] ** 2 + x[1] ** 2 / 4 + x[2] ** 2 / 9 - 1, (3,))
+    >>> x = ellipsoid.point([1.0, 1.0, 1.0], project=True)
+    >>> ellipsoid.dim, bool(ellipsoid.belongs(x))
+    (2, True)
     """
 
     constraints: tuple[Callable, ...]

@@ -23,6 +23,14 @@ class Sphere(Space):
 
     Distances are angles. Closed forms throughout, accurate to rounding up to the antipode; there the direction of the
     logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
+
+    Examples
+    --------
+    >>> sphere = mf.Sphere(2)
+    >>> x = sphere.point([1.0, 2.0, 2.0], project=True)
+    >>> v = sphere.project_tangent(x, jnp.array([0.0, 0.0, 1.0]))
+    >>> bool(sphere.belongs(sphere.exp(x, v)))
+    True
     """
 
     n: int

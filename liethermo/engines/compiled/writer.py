@@ -40,9 +40,9 @@ class Writer:
     """Writes programs where a builder stands, on numbers, or on vectors with a number for each lane.
 
     Truth values are bits, integers have 64. Sums are never reassociated. A product that is only added to something is
-    fused with the sum, and rounded once, on processors that can; which ones are does not depend on the lanes. What one
-    side of a branch alone needs is jumped over where no lane takes that side. Each lane chooses for itself, so that its
-    numbers do not depend on the others.
+    fused with the sum, and rounded once, on processors that can. The choice of these products does not depend on the
+    number of lanes. Instructions for one side of a branch are skipped where no lane takes that side. Each lane chooses
+    for itself, so that its numbers do not depend on the others.
 
     Attributes
     ----------

@@ -1,0 +1,59 @@
+"""What the check of the site finds: each fault is planted here, in a page that is right without it."""
+
+import importlib
+import shutil
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+
+
+@pytest.fixture
+def check_text(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    return importlib.import_module("check_text")
+
+
+def test_a_table_that_stays_raw_is_found(check_text):
+    right = "<p>The size | x | of x.</p><table><tr><td>a</td></tr></table><pre>| a |\n| --- |</pre>"
+    assert list(check_text.raw_tables(right)) == []
+    (found,) = check_text.raw_tables(right + "<p>| a | |s| |\n| --- | ---: |\n| 1 | 2 |</p>")
+    assert found.startswith("a table is shown as raw text: | a |")
+
+
+def test_a_code_span_that_is_not_true_is_found(check_text):
+    right = "`lt.Adaptive(1e-8)` and `make docs`."
+    assert list(check_text.untrue_spans({"page.md": right})) == []
+    (found,) = check_text.untrue_spans({"page.md": right + " `lt.Adaptive(colour=3)`"})
+    assert "colour" in found
+
+
+def test_a_number_with_two_values_is_found(check_text):
+    first, second = "Steps of a given size have order 13, which suits this.", "The runs have order 13, which suits all."
+    pages = {"a.md": first, "b.md": second}
+    assert list(check_text.differing_numbers(pages)) == []
+    (found,) = check_text.differing_numbers(pages | {"b.md": second.replace("13", "12")})
+    assert "a.md: 13; b.md: 12" in found
+
+
+def test_the_pages_share_their_numbers(check_text):
+    pages = check_text.sources(DOCS)
+    assert sum(len(list(check_text.statements(text))) for text in pages.values()) > 150
+    assert list(check_text.differing_numbers(pages)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
+def test_what_is_clipped_is_found(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(DOCS))
+    check_site = importlib.import_module("check_site")
+    cell = "<td>" + "w" * 40 + "</td>"
+    page = "<div class='bd-article'><table style='display: block; overflow: auto; width: 900px'><tr>{}</tr></table>"
+    (tmp_path / "right.html").write_text(page.format(cell))
+    (tmp_path / "wrong.html").write_text(page.format(12 * cell))
+    with check_site.browser() as chromium:
+        found = check_site.check_pages(chromium, tmp_path)
+    clipped = [line for line in found if "clipped" in line]
+    assert len(clipped) == 1
+    assert clipped[0].startswith("wrong.html: ")
