@@ -28,7 +28,7 @@ def paragraphs_of_module(text: str) -> Iterator[str]:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             blocks = re.split(r"\n\s*\n|\n\s*-{3,}\s*\n|\n(?=\s*\S+(?:, \S+)* : )", node.value.value)
-            yield from (block for block in blocks if "====" not in block)  # no tables
+            yield from (block for block in blocks if "====" not in block and ">>> " not in block)  # no tables, no code
 
 
 def messages_of_module(text: str) -> Iterator[str]:
