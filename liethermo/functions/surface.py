@@ -55,8 +55,8 @@ class Surface(Protocol):
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class LevelSet:
-    """The first components of a state are a point of a space.
+class OnLevels:
+    """The first components of a state are a point of a space, on the levels of its constraints.
 
     Attributes
     ----------
@@ -82,10 +82,15 @@ class LevelSet:
         """By Newton's method, from what the constraints change by along d: as exact as d is small."""
         if _count(self.space) == 0:
             return d, jnp.zeros(())
-        end, changes = x + (compensation + d), []
-        for _ in range(2):
-            changes.append(self._change(x, compensation, d))
-            d = d - self._moved(end, changes[-1])
+        end = x + (compensation + d)
+
+        def nearer(d, _):
+            change = self._change(x, compensation, d)
+            return d - self._moved(end, change), change
+
+        if _degree(self.space) <= 1:
+            return nearer(d, None)[0], jnp.zeros(())
+        d, changes = jax.lax.scan(nearer, d, length=2)
         left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY))
         return d, jnp.where(left <= REACHED, 0.0, left) * jnp.linalg.norm(x)
 
@@ -115,7 +120,7 @@ class LevelSet:
 
     def _moved(self, x, c) -> jax.Array:
         """The displacement, shape (n,), that changes the constraints by c."""
-        v = self.space.to_vector(self.space._normal(self._point(x), c))
+        v = self.space.to_vector(self.space._correction(self._point(x), c))
         return v if v.shape == x.shape else jnp.pad(v, (0, x.shape[0] - v.shape[0]))
 
     def _point(self, x) -> jax.Array:

@@ -109,10 +109,8 @@ def corrected(
 
     d, left = landed(d)
     ends = gradients(d)
-    found = directions(d, ends)
-    s = measured(d, left, ends, found)
-    if corrections > 0:
-        s, _ = jax.lax.scan(again, nearer(s, found), length=corrections - 1)  # of a short step one is enough
+    s = measured(d, left, ends, directions(d, ends))
+    s, _ = jax.lax.scan(again, s, length=corrections)  # of a short step one is enough
     rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.defect), hidden)
     vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))

@@ -7,6 +7,8 @@ has no more to do than to end each step on the level that it began on [:doc:`/ex
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,7 @@ from manifolds._arrays import is_traced
 from ..dissipation.base import Carried
 from ..functions.checks import recognised
 from ..functions.energy import Energy
-from ..functions.surface import LevelSet
+from ..functions.surface import OnLevels
 from ..tracing.interpret import at_points
 from .base import System
 
@@ -65,8 +67,8 @@ class EmbeddedSystem(System):
         return f"a point of {_space(self.manifold).name}"
 
     @property
-    def surface(self) -> LevelSet:
-        return LevelSet(_space(self.manifold), self.conforming)
+    def surface(self) -> OnLevels:
+        return OnLevels(_space(self.manifold), self.conforming)
 
     def outside(self, x) -> str:
         space, x = _space(self.manifold), np.asarray(x)
@@ -165,27 +167,46 @@ def embedded(system: System) -> System:
         return system
     if is_traced(system):
         return EmbeddedSystem(system)
-    points = system.samples(3)
+    points = _some_points(system)
     points = points * (1.0 + AWAY * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
     across = np.nan_to_num(at_points(_across, system, points), nan=np.inf)
     return EmbeddedSystem(system, bool(across.max() <= TANGENT))
 
 
-def _inside(surface: LevelSet, x):
+def _some_points(system: System) -> np.ndarray:
+    """A few states: of a space whose random points are made of normal numbers, without a compiler."""
+    space = _space(system)
+    if space._normals is None:
+        return system.samples(3)
+    return at_points(_from_normals, space, np.random.default_rng(2).standard_normal((3, space._normals)))
+
+
+def _from_normals(space: mf.Space, w):
+    return space.to_vector(space._from_normals(w))
+
+
+def _inside(surface: OnLevels, x):
     """1 where the point of the surface next to a state is in the space, else 0."""
     return jnp.where(surface.inside(surface.returned(x)), 1.0, 0.0)
 
 
 def _across(system: System, x):
     """What of a field is across the level sets, and what covectors across them do, relative to the field."""
-    covectors = np.random.default_rng(1).standard_normal((3 + len(system.preserved), x.shape[0]))
-    off = [alpha - _along(system, x, alpha) for alpha in np.roll(covectors, 1, axis=0)]
+    constraints, pull = jax.vjp(functools.partial(_constraints, _space(system)), x)
+    random, number = np.random.default_rng(1), 3 + len(system.preserved)
+    covectors = random.standard_normal((number, x.shape[0]))
+    off = [pull(jnp.asarray(w))[0] for w in random.standard_normal((number, *constraints.shape))]
     fields = []
     for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, off, strict=True)]):
         fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
     size = jnp.max(jnp.abs(fields[0]))
-    defect = jnp.maximum(jnp.abs(fields[1] - fields[0]), jnp.abs(fields[0] - _along(system, x, fields[0])))
-    return jnp.max(defect) / jnp.where(size > 0.0, size, 1.0)
+    change = jax.jvp(functools.partial(_constraints, _space(system)), (x,), (fields[0],))[1]
+    defect = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(change), initial=0.0))
+    return defect / jnp.where(size > 0.0, size, 1.0)
+
+
+def _constraints(space: mf.Space, x):
+    return space._constraints(space.from_vector(x))
 
 
 def _along(system: System, x, w):

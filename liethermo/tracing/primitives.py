@@ -267,15 +267,15 @@ def _split(x, params):
 # run on the numbers of the entries.
 
 
-SHORT_GATHER = 256
-"""Entries of a result that are found one by one; for more it is worth to compile what JAX does."""
+SHORT = 256
+"""Entries gathered or scattered that are placed one by one; for more it is worth to compile what JAX does."""
 
 
 def _gather(b, eqn, x, indices):
     fill_value = eqn.params["fill_value"]
     if fill_value is None:
         fill_value = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
-    if not indexing.known(indices) or math.prod(eqn.outvars[0].aval.shape) <= SHORT_GATHER:
+    if not indexing.known(indices) or math.prod(eqn.outvars[0].aval.shape) <= SHORT:
         return indexing.gathered(b, eqn, x, indices, fill_value)
     numbers = jnp.arange(x.size).reshape(x.shape)
     where = integers(indices).astype(_dtype(eqn, 1))
@@ -285,7 +285,7 @@ def _gather(b, eqn, x, indices):
 
 
 def _scatter(b, eqn, x, indices, updates):
-    if not indexing.known(indices):
+    if not indexing.known(indices) or updates.size <= SHORT:
         return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: new)
     numbers = jnp.arange(x.size + updates.size)
     old, new = numbers[: x.size].reshape(x.shape), numbers[x.size :].reshape(updates.shape)
@@ -297,7 +297,7 @@ def _scatter(b, eqn, x, indices, updates):
 
 def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
     def rule(b, eqn, x, indices, updates):
-        if not indexing.known(indices):
+        if not indexing.known(indices) or updates.size <= SHORT:
             return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: combine(b, old, new))
         where = integers(indices).astype(_dtype(eqn, 1))
         options = {key: eqn.params[key] for key in ("dimension_numbers", "mode")}

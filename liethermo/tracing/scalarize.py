@@ -349,7 +349,8 @@ def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
 
 LONG, SHORT, HEAVY = 500, 32, 20_000
 """Instructions of an unrolled loop from which it stays a loop; passes up to which it is short, and instructions from
-which a short one stays a loop: what is known of single passes, such as zeros, makes unrolled code the faster one."""
+which a short one stays a loop if its passes differ: what is known of single ones, such as zeros, makes unrolled code
+the faster one. Passes that count nothing and read no table are alike, and unrolling them gains nothing."""
 
 
 def _scan(b, eqn, *arguments):
@@ -385,11 +386,13 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     rows = [aval.update(shape=aval.shape[1:]) for aval in avals[end:]]
     columns = list(zip(*(flat([x[i, ...] for x in slices]) for i in range(length)), strict=True))
     row = arranged((f"x2_{j}" for j in range(len(columns))), rows)
+    alike = not columns
     while True:
         own, results = inside.unrolled(closed, [*given, *carried.arrays, *row])
         if not carried.released(results[: len(start)]):
             break
-    if len(own.instructions) * length <= (LONG if length > SHORT else HEAVY):
+        alike = False
+    if len(own.instructions) * length <= (LONG if alike or length > SHORT else HEAVY):
         return None
     moving, new, rows = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
     inputs = [

@@ -76,9 +76,10 @@ def SU(n: int) -> MatrixGroup:
         closed.unitary_defect,
         closed.unitary_inverse,
         restore_map=closed.unitary_restored,
+        equations=closed.unitary_equations,
     )
     if n == 2:
-        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log, equations=closed.su2_equations)
+        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
         return replace(
             group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
         )

@@ -21,7 +21,7 @@ from ..matrices.stumpff import HALF_TURN_MARGIN, _root, _square, arc, leading_si
 def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``cos(t) I + sin(t)/t X``."""
     z = _square(x)[..., None]
-    return stumpff(0, z) * jnp.eye(2) + stumpff(1, z) * algebra.hat(x)
+    return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -35,7 +35,7 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rodrigues' formula ``I + c1 X + c2 X^2``."""
     z, X = _square(x)[..., None], algebra.hat(x)
-    return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
+    return np.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -48,7 +48,7 @@ def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
     X = algebra.hat(x)[..., :3, :3]
-    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
+    return np.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -61,7 +61,7 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rotation by Rodrigues' formula, translation ``(I + c2 W + c3 W^2) u``."""
     z, u = _square(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
-    rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
+    rotation = np.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
     return affine(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
 
 
@@ -95,7 +95,7 @@ def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
     z = _square(x)[..., None] / 4
-    return stumpff(0, z) * jnp.eye(2) + stumpff(1, z) * algebra.hat(x)
+    return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -118,7 +118,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
     det(I + X) <= 0.
     """
-    X, identity = algebra.hat(x), jnp.eye(2)
+    X, identity = algebra.hat(x), np.eye(2)
     half = jnp.trace(X, axis1=-2, axis2=-1)[..., None, None] / 2
     X = X - half * identity
     square = -jnp.trace(X @ X, axis1=-2, axis2=-1).real[..., None, None] / 2
@@ -127,7 +127,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
-    X, identity = algebra.hat(x), jnp.eye(4)
+    X, identity = algebra.hat(x), np.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
     dual = jnp.zeros_like(X)
     for i, j, k, m in [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (3, 1, 0, 2), (2, 3, 0, 1)]:
@@ -147,12 +147,12 @@ def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
     X = algebra.hat(x)
-    return jnp.eye(X.shape[-1]) + X + X @ X / 2
+    return np.eye(X.shape[-1]) + X + X @ X / 2
 
 
 def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """``N - N^2/2`` with N = g - I."""
-    N = g - jnp.eye(g.shape[-1])
+    N = g - np.eye(g.shape[-1])
     return algebra.vee(N - N @ N / 2)
 
 
@@ -161,12 +161,12 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 def unitary_defect(g) -> jax.Array:
     """Distance of ``g^H g`` from I, or of ``det g`` from 1."""
-    return jnp.maximum(largest(unitary_inverse(g) @ g - jnp.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
+    return jnp.maximum(largest(unitary_inverse(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
 
 def rigid_defect(g) -> jax.Array:
     """Distance of the linear part from the rotations, or of the last row from (0, …, 0, 1)."""
-    last = jnp.abs(g[..., -1, :] - jnp.eye(g.shape[-1])[-1]).max(axis=-1)
+    last = jnp.abs(g[..., -1, :] - np.eye(g.shape[-1])[-1]).max(axis=-1)
     return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last)
 
 
@@ -179,7 +179,7 @@ def unimodular_defect(g) -> jax.Array:
 def symplectic_defect(g) -> jax.Array:
     """Distance of ``-J g^T J g`` from I."""
     size = jnp.maximum(largest(g) ** 2, 1.0)
-    return largest(symplectic_inverse(g) @ g - jnp.eye(g.shape[-1])) / size
+    return largest(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / size
 
 
 def invertible_defect(g) -> jax.Array:
@@ -190,7 +190,7 @@ def invertible_defect(g) -> jax.Array:
 
 def heisenberg_defect(g) -> jax.Array:
     """Distance of the entries outside the first row and the last column from those of I."""
-    return largest(jnp.where(_free(g), 0.0, g - jnp.eye(g.shape[-1])))
+    return largest(jnp.where(_free(g), 0.0, g - np.eye(g.shape[-1])))
 
 
 # -- equations: they vanish on the group, and products from the right with its elements do not change them ----------
@@ -199,12 +199,12 @@ def heisenberg_defect(g) -> jax.Array:
 def orthogonal_equations(g) -> jax.Array:
     """The entries of ``g g^T - I`` above and on the diagonal."""
     n = g.shape[-1]
-    return (g @ g.swapaxes(-1, -2) - jnp.eye(n))[..., *np.triu_indices(n)]
+    return (g @ g.swapaxes(-1, -2) - np.eye(n))[..., *np.triu_indices(n)]
 
 
 def rigid_equations(g) -> jax.Array:
     """Those of the linear part, and the last row less (0, …, 0, 1)."""
-    last = g[..., -1, :] - jnp.eye(g.shape[-1])[-1]
+    last = g[..., -1, :] - np.eye(g.shape[-1])[-1]
     return jnp.concatenate([orthogonal_equations(g[..., :-1, :-1]), last], axis=-1)
 
 
@@ -222,12 +222,12 @@ def unimodular_equations(g) -> jax.Array:
     return determinant(g)[..., None] - 1.0
 
 
-def su2_equations(g) -> jax.Array:
-    """Those of ``[[a, b], [-conj b, conj a]]`` with ``|a|^2 + |b|^2 = 1``."""
-    a, b = g[..., 0, 0], g[..., 0, 1]
-    rest = jnp.stack([a - g[..., 1, 1].conj(), b + g[..., 1, 0].conj()], axis=-1)
-    square = a.real**2 + a.imag**2 + b.real**2 + b.imag**2
-    return jnp.concatenate([rest.real, rest.imag, square[..., None] - 1.0], axis=-1)
+def unitary_equations(g) -> jax.Array:
+    """Those entries of ``g g^H - I``, real parts and imaginary ones, and the imaginary part of ``det g``."""
+    n = g.shape[-1]
+    rest = g @ g.conj().swapaxes(-1, -2) - np.eye(n)
+    parts = rest.real[..., *np.triu_indices(n)], rest.imag[..., *np.triu_indices(n, 1)]
+    return jnp.concatenate([*parts, determinant(g).imag[..., None]], axis=-1)
 
 
 # -- inverses -----------------------------------------------------------------------------------------------------
@@ -253,8 +253,8 @@ def symplectic_inverse(g) -> jax.Array:
 
 def heisenberg_inverse(g) -> jax.Array:
     """``I - N + N^2`` with N = g - I."""
-    N = g - jnp.eye(g.shape[-1])
-    return jnp.eye(g.shape[-1]) - N + N @ N
+    N = g - np.eye(g.shape[-1])
+    return np.eye(g.shape[-1]) - N + N @ N
 
 
 # -- one Newton step to the group ---------------------------------------------------------------------------------
@@ -287,13 +287,13 @@ def symplectic_restored(g) -> jax.Array:
 
 def heisenberg_restored(g) -> jax.Array:
     """The entries outside the first row and the last column are those of I."""
-    return jnp.where(_free(g), g, jnp.eye(g.shape[-1]))
+    return jnp.where(_free(g), g, np.eye(g.shape[-1]))
 
 
 def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
     """Homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
     top = jnp.concatenate([linear, translation], axis=-1)
-    last = jnp.broadcast_to(jnp.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
+    last = jnp.broadcast_to(np.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
     return jnp.concatenate([top, last], axis=-2)
 
 
@@ -314,12 +314,12 @@ def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     [Shepperd 1978].
     """
     trace = jnp.trace(g, axis1=-2, axis2=-1)[..., None, None]
-    outer = g + g.swapaxes(-1, -2) + (1.0 - trace) * jnp.eye(3)
+    outer = g + g.swapaxes(-1, -2) + (1.0 - trace) * np.eye(3)
     skew = (g - g.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
     outer = jnp.concatenate([skew[..., None, :], outer], axis=-2)
     outer = jnp.concatenate([jnp.concatenate([1.0 + trace, skew[..., None]], axis=-2), outer], axis=-1)
     best = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)[..., None]
-    q = jnp.where((jnp.arange(4) == best)[..., None], outer, 0.0).sum(axis=-2)  # no index that varies
+    q = jnp.where((np.arange(4) == best)[..., None], outer, 0.0).sum(axis=-2)  # no index that varies
     q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
     return q[..., :1], q[..., 1:]
 

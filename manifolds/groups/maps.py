@@ -27,7 +27,7 @@ def dexp(algebra: LieAlgebra, x) -> jax.Array:
 
     ``d exp(x) = exp(x) hat(dexp(x) dx)``; shape (..., dim, dim).
     """
-    ad, one = algebra.ad(x), jnp.broadcast_to(jnp.eye(algebra.dim), (*x.shape, algebra.dim))
+    ad, one = algebra.ad(x), jnp.broadcast_to(np.eye(algebra.dim), (*x.shape, algebra.dim))
     top = jnp.concatenate([-ad, one], axis=-1)
     return expm(jnp.concatenate([top, jnp.zeros_like(top)], axis=-2))[..., : algebra.dim, algebra.dim :]
 
@@ -63,7 +63,7 @@ def cayley(algebra: LieAlgebra, x) -> jax.Array:
 
 def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
     """``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
-    identity = jnp.eye(g.shape[-1])
+    identity = np.eye(g.shape[-1])
     x = algebra.vee(2 * solve(g + identity, g - identity))
     condition = largest(g + identity) * largest(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None], x, jnp.nan)
@@ -75,7 +75,7 @@ def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
     ``ad y = 2 artanh(A/2) = int_0^1 A (I - t^2 A^2/4)^-1 dt`` with A = ad(x), by Gauss quadrature: right to rounding
     where the eigenvalues of A are imaginary and below 3, or real and below 1.5; to 1e-13 at 4, and to 1e-11 at 1.8.
     """
-    adjoint, identity = _adjoint(algebra), jnp.eye(algebra.dim)
+    adjoint, identity = _adjoint(algebra), np.eye(algebra.dim)
     A = adjoint.hat(x)[..., None, :, :]
     parts = solve_near_identity(identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1)))
     return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * parts).sum(axis=-3)) + central(algebra, x))
@@ -83,7 +83,7 @@ def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
 
 def from_adjoint_cayley(algebra: LieAlgebra, g) -> jax.Array:
     """The components x, none in the centre, with ``cay(ad x) = g``, for g of the size of the algebra, near I."""
-    identity = jnp.eye(algebra.dim)
+    identity = np.eye(algebra.dim)
     return _adjoint(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
 
 
@@ -107,7 +107,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes the rounding that the
     roots amplify.
     """
-    identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
+    identity, batch = np.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 
     def far(state):
         s, _, converged = state

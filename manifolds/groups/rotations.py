@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
 from ..matrices.stumpff import HALF_TURN_MARGIN, leading_sign
@@ -28,7 +29,7 @@ def rotation_log(algebra: LieAlgebra, g) -> jax.Array:
     sign = jnp.where(jnp.abs(sine) > HALF_TURN_MARGIN, jnp.sign(sine), leading_sign(algebra.vee(J)))
     is_turned = (jnp.where(second, values, 0.0).min(axis=-1, keepdims=True) < _TURNED) & (third > _TURNED)
     J = jnp.where(is_turned[..., None], sign[..., None] * J, 0.0)
-    return log(algebra, g @ (jnp.eye(g.shape[-1]) + 2 * J @ J)) + jnp.pi * algebra.vee(J)
+    return log(algebra, g @ (np.eye(g.shape[-1]) + 2 * J @ J)) + jnp.pi * algebra.vee(J)
 
 
 _TURNED = -1.0 + 2e-15

@@ -13,7 +13,7 @@ def polar(a) -> jax.Array:
     u = a @ inverse_root
     for _ in range(2):  # the root squares the condition number of a
         u = orthonormalized(u)
-    success &= largest(u.conj().swapaxes(-1, -2) @ u - jnp.eye(a.shape[-1])) < 1e-12
+    success &= largest(u.conj().swapaxes(-1, -2) @ u - np.eye(a.shape[-1])) < 1e-12
     return jnp.where(success[..., None, None], u, jnp.nan)
 
 
@@ -28,7 +28,7 @@ def complement(u) -> jax.Array:
     By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
     """
     n, p = u.shape[-2:]
-    axes, normals = jnp.eye(n), []
+    axes, normals = np.eye(n), []
 
     def reflect(a, normal):
         normal = normal[..., :, None]
@@ -36,7 +36,7 @@ def complement(u) -> jax.Array:
         return a - normal * weights
 
     for k in range(p):
-        column = jnp.where(jnp.arange(n) < k, 0.0, u[..., :, k])
+        column = jnp.where(np.arange(n) < k, 0.0, u[..., :, k])
         size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
         normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
         u = reflect(u, normals[-1])
@@ -62,7 +62,7 @@ def _square_root(a):
         new = (roots + inverse(roots[::-1])) / 2
         return new, largest(new[0] - roots[0]) / largest(new[0]), steps + 1
 
-    roots = jnp.stack([a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape)])
+    roots = jnp.stack([a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape)])
     roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
     return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
@@ -88,8 +88,12 @@ def solve(a, b) -> jax.Array:
 def solve_near_identity(a, b) -> jax.Array:
     """Solution x of ``a x = b`` without a search for pivots, for matrices whose symmetric part is positive definite.
 
-    In a program of scalars that search is most of the work.
+    In a program of scalars that search is most of the work. Batches broadcast.
     """
+    if a.shape[-1] == 1:
+        return b / a
+    batch = jnp.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = (jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in (a, b))
 
     def step(_, table):
         pivot_row = table[..., :1, :] / table[..., :1, :1]
@@ -100,9 +104,18 @@ def solve_near_identity(a, b) -> jax.Array:
     return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
 
 
+def lyapunov(g, c) -> jax.Array:
+    """Symmetric s with ``g s + s g = c``, symmetric, of one or two rows, by Cayley and Hamilton's theorem."""
+    if g.shape[-1] == 1:
+        return c / (2.0 * g)
+    (a, b), (_, d) = (tuple(g[..., i, j][..., None, None] for j in range(2)) for i in range(2))
+    det, adjugate = a * d - b * b, jnp.block([[d, -b], [-b, a]])
+    return (det * c + adjugate @ c @ adjugate) / (2.0 * (a + d) * det)
+
+
 def inverse(a) -> jax.Array:
     """Inverse matrix, with entries that are not finite where a is singular."""
-    return solve(a, jnp.broadcast_to(jnp.eye(a.shape[-1], dtype=a.dtype), a.shape))
+    return solve(a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape))
 
 
 def spectral_radius(X) -> jax.Array:
@@ -117,16 +130,36 @@ def spectral_radius(X) -> jax.Array:
 
 
 def determinant(a) -> jax.Array:
-    """Determinant, the signed product of the pivots."""
+    """Determinant: the sum of products of at most three rows, or the signed product of the pivots."""
+    if a.shape[-1] <= 3:
+        first, *rest = jnp.moveaxis(a, (-2, -1), (0, 1))
+        return _volume(first, *rest)
     det = _eliminate(a, a[..., :0])[1]
     # a matrix of numbers leads to NaN only by way of a pivot of zero
     return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
+
+
+def _volume(first, *rest):
+    """The determinant of a few rows, by minors."""
+    if not rest:
+        return first[0]
+    if len(rest) == 1:
+        return first[0] * rest[0][1] - first[1] * rest[0][0]
+    (a, b, c), (d, e, f) = rest
+    return first[0] * (b * f - c * e) + first[1] * (c * d - a * f) + first[2] * (a * e - b * d)
 
 
 def skew(w, n: int) -> jax.Array:
     """The skew matrices with the entries w above the diagonal, row by row, shape (..., n, n)."""
     upper = jnp.zeros((*w.shape[:-1], n, n)).at[..., *np.triu_indices(n, 1)].add(w)
     return upper - upper.swapaxes(-1, -2)
+
+
+def symmetric(w, n: int) -> jax.Array:
+    """The symmetric matrices with the entries w on and above the diagonal, row by row, shape (..., n, n)."""
+    places = np.zeros((n, n), int)
+    places[np.triu_indices(n)] = np.arange(w.shape[-1])
+    return w[..., np.maximum(places, places.T)]
 
 
 def largest(matrix) -> jax.Array:
@@ -145,7 +178,7 @@ def _eliminate(a, b):
     program needs no indices that vary.
     """
     m = a.shape[-1]
-    row = jnp.arange(m)
+    row = np.arange(m)
 
     def step(k, state):
         table, det = state

@@ -32,7 +32,7 @@ def cholesky(a) -> jax.Array:
     """Lower triangular L with ``L L^H = a``, NaN where a is not positive definite."""
     n, columns = a.shape[-1], []
     for k in range(n):
-        column = jnp.where(jnp.arange(n) < k, 0.0, a[..., :, k] / jnp.sqrt(a[..., k, k])[..., None])
+        column = jnp.where(np.arange(n) < k, 0.0, a[..., :, k] / jnp.sqrt(a[..., k, k])[..., None])
         a = a - column[..., :, None] * column.conj()[..., None, :]
         columns.append(column)
     return jnp.stack(columns, axis=-1)
@@ -137,7 +137,7 @@ def semidefinite_factor(a) -> jax.Array:
     for _ in range(n):
         diagonal = jnp.diagonal(a)
         pivot = jnp.argmax(diagonal)
-        chosen = jnp.arange(n) == pivot
+        chosen = np.arange(n) == pivot
         largest_left = jnp.max(diagonal)
         good = largest_left > least
         column = jnp.where(good, a @ jnp.where(chosen, 1.0, 0.0) / jnp.sqrt(jnp.where(good, largest_left, 1.0)), 0.0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._sizes import checked_size
 from .base import Space, register
@@ -56,15 +57,12 @@ class Euclidean(Space):
     def _rounded(self, x):
         return self._constraints(x)
 
-    def _random(self, key, size):
-        return jax.random.normal(key, (*size, *self.shape))
-
     def _project_tangent(self, x, w):
         return w + jnp.zeros_like(x)
 
     def _frame(self, x):
         batch = x.shape[: x.ndim - len(self.shape)]
-        return jnp.broadcast_to(jnp.eye(self.dim).reshape(self.dim, *self.shape), (*batch, self.dim, *self.shape))
+        return jnp.broadcast_to(np.eye(self.dim).reshape(self.dim, *self.shape), (*batch, self.dim, *self.shape))
 
     def _inner(self, x, u, v):
         return self._pair(u, v)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._sizes import checked_size
 from ..errors import ParameterError
@@ -68,9 +69,25 @@ class Grassmann(Space):
         rank = jnp.abs(jnp.trace(x, axis1=-2, axis2=-1) - self.p)
         return jnp.maximum(jnp.maximum(square, largest(x - x.swapaxes(-1, -2))), rank)
 
-    def _returned(self, x):
-        x = symmetrized(x)
-        return symmetrized(x @ x @ (3.0 * jnp.eye(self.n) - 2.0 * x))  # eigenvalues go to 0 and 1
+    def _constraints(self, x):
+        """``x^2 - x``, symmetric, and what of x is skew: of their n^2 derivatives those off the tangents are left."""
+        y = symmetrized(x)
+        return self.to_vector(y @ y - y + (x - y))
+
+    def _correction(self, x, c):
+        """A symmetric matrix that commutes with x changes ``x^2 - x`` by ``(2 x - 1)`` times itself."""
+        c = self.from_vector(c)
+        own = symmetrized(c)
+        turned = x @ own
+        return turned + turned.swapaxes(-1, -2) - own + (c - own)
+
+    _normal = _correction
+
+    def _along(self, x, w):
+        return self._project_tangent(symmetrized(x), w)
+
+    def _rounded(self, x):
+        return self.to_vector(jnp.abs(x) @ jnp.abs(x) + jnp.abs(x))
 
     def _inside(self, x):
         return jnp.abs(jnp.trace(x, axis1=-2, axis2=-1) - self.p) < 0.5
@@ -81,19 +98,22 @@ class Grassmann(Space):
         values = jnp.sort(eigh(jax.lax.stop_gradient(x))[0], axis=-1)
         upper, under = values[..., self.n - self.p], values[..., self.n - self.p - 1]
         middle, size = 0.5 * (upper + under), jnp.maximum(values[..., -1] - under, upper - values[..., 0])
-        sign = (x - middle[..., None, None] * jnp.eye(self.n)) / size[..., None, None]
+        sign = (x - middle[..., None, None] * np.eye(self.n)) / size[..., None, None]
         sign = jax.lax.fori_loop(0, _SETTLED, lambda _, y: 1.5 * y - 0.5 * y @ y @ y, sign)
         return jnp.where(
-            (upper - under > _GAP * size)[..., None, None], symmetrized(0.5 * (jnp.eye(self.n) + sign)), jnp.nan
+            (upper - under > _GAP * size)[..., None, None], symmetrized(0.5 * (np.eye(self.n) + sign)), jnp.nan
         )
 
-    def _random(self, key, size):
-        q = orthonormal_columns(jax.random.normal(key, (*size, self.n, self.p)))
-        return q @ q.swapaxes(-1, -2)
+    @property
+    def _normals(self):
+        return self.n * self.p
+
+    def _from_normals(self, w):
+        return self.subspace(w.reshape(*w.shape[:-1], self.n, self.p))
 
     def _project_tangent(self, x, w):
         w = symmetrized(w)
-        along = x @ w @ (jnp.eye(self.n) - x)
+        along = x @ w @ (np.eye(self.n) - x)
         return along + along.swapaxes(-1, -2)
 
     def _frame(self, x):
@@ -142,7 +162,7 @@ class Grassmann(Space):
         """From ``sin^2`` of the principal angles and the directions of the turn, which x and y give."""
         gap = y - x
         along = self._project_tangent(x, gap)  # its singular values are sin(t) cos(t)
-        values, vectors = eigh(symmetrized(x @ (jnp.eye(self.n) - y) @ x))  # sin(t)^2 in the subspace, 0 outside
+        values, vectors = eigh(symmetrized(x @ (np.eye(self.n) - y) @ x))  # sin(t)^2 in the subspace, 0 outside
         sine = jnp.clip(values, 0.0, 1.0)
         angle = jnp.arctan2(
             jnp.sqrt(jnp.where(sine > 0.0, sine, 1.0)), jnp.sqrt(1.0 - jnp.where(sine > 0.0, sine, 0.0))

@@ -16,7 +16,7 @@ from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
 from ..groups.closed_forms import affine, unchanged
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
-from ..matrices.linear import determinant, polar, solve, spectral_radius
+from ..matrices.linear import determinant, polar, skew, solve, spectral_radius, symmetric
 from ..matrices.symmetric import orthonormal_columns
 from .base import Space, register
 
@@ -176,8 +176,12 @@ class GroupSpace(Space):
             x = self._restored(x)
         return jnp.where((self.group.defect(x) <= MEMBERSHIP_TOLERANCE)[..., None, None], x, jnp.nan)
 
-    def _random(self, key, size):
-        return self.group.exp_map(self.group.algebra, 0.5 * jax.random.normal(key, (*size, self.dim)))
+    @property
+    def _normals(self):
+        return self.dim
+
+    def _from_normals(self, w):
+        return self.group.exp_map(self.group.algebra, 0.5 * w)
 
     def _project_tangent(self, x, w):
         xi = self._velocity(x, w)
@@ -252,6 +256,9 @@ class BiInvariantSpace(GroupSpace):
     def _project_tangent(self, x, w):
         return self._from_velocity(x, self._velocity(x, w))  # vee is the orthogonal projection
 
+    def _along(self, x, w):
+        return self._project_tangent(x, w)
+
     def _frame(self, x):
         return x[..., None, :, :] @ self.group.algebra._known_basis()
 
@@ -301,8 +308,18 @@ class SpecialOrthogonal(BiInvariantSpace):
     def _project(self, x):
         return _rotation(x)
 
-    def _random(self, key, size):
-        return _random_rotation(key, (*size, *self.shape))
+    @property
+    def _normals(self):
+        return self.size
+
+    def _from_normals(self, w):
+        return _random_rotation(self.from_vector(w))
+
+    def _correction(self, x, c):
+        return 0.5 * symmetric(c, self.n) @ x
+
+    def _rounded(self, x):
+        return 2.0 * (jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2))[..., *np.triu_indices(self.n)]
 
 
 @register((2,), (3,))
@@ -334,9 +351,22 @@ class SpecialUnitary(BiInvariantSpace):
     def _of_unit_determinant(self, x):
         return x * jnp.exp(-1j * jnp.angle(determinant(x)) / self.n)[..., None, None]
 
-    def _random(self, key, size):
-        real, imaginary = jax.random.normal(key, (2, *size, *self.shape))
-        return self._of_unit_determinant(orthonormal_columns(real + 1j * imaginary))
+    @property
+    def _normals(self):
+        return self.size
+
+    def _from_normals(self, w):
+        return self._of_unit_determinant(orthonormal_columns(self.from_vector(w)))
+
+    def _correction(self, x, c):
+        of_real, of_imaginary, of_phase = jnp.split(c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1)
+        hermitian = symmetric(of_real, self.n) + 1j * skew(of_imaginary, self.n)
+        return 0.5 * hermitian @ x + (1j / self.n) * of_phase[..., None] * x
+
+    def _rounded(self, x):
+        sizes = 2.0 * jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2)
+        upper = [sizes[..., *np.triu_indices(self.n, k)] for k in (0, 1)]
+        return jnp.concatenate([*upper, jnp.full((*x.shape[:-2], 1), float(self.n))], axis=-1)
 
 
 @register((2,), (3, 0.5))
@@ -380,13 +410,28 @@ class SpecialEuclidean(GroupSpace):
     def _project(self, x):
         return affine(_rotation(x[..., :-1, :-1]), x[..., :-1, -1:])
 
-    def _random(self, key, size):
-        of_rotation, of_translation = jax.random.split(key)
-        translation = self.length * jax.random.normal(of_translation, (*size, self.n, 1))
-        return affine(_random_rotation(of_rotation, (*size, self.n, self.n)), translation)
+    @property
+    def _normals(self):
+        return self.n * (self.n + 1)
+
+    def _from_normals(self, w):
+        of_rotation, of_translation = jnp.split(w, [self.n**2], axis=-1)
+        rotation = _random_rotation(of_rotation.reshape(*w.shape[:-1], self.n, self.n))
+        return affine(rotation, self.length * of_translation[..., None])
 
     def _project_tangent(self, x, w):
         return self._map(self.rotations._project_tangent, lambda x, w: w, x, w)
+
+    def _along(self, x, w):
+        return self._project_tangent(x, w)
+
+    def _correction(self, x, c):
+        of_rotation, of_last = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
+        top = self.rotations._correction(x[..., :-1, :-1], of_rotation)
+        return jnp.concatenate([jnp.pad(top, [(0, 0)] * (top.ndim - 1) + [(0, 1)]), of_last[..., None, :]], axis=-2)
+
+    def _rounded(self, x):
+        return jnp.concatenate([self.rotations._rounded(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1)
 
     def _frame(self, x):
         scale = np.where(np.arange(self.dim) < self.rotations.dim, 1.0, self.length)
@@ -435,8 +480,7 @@ def _rotation(x):
     return jnp.where((determinant(x) > 0.0)[..., None, None], x, jnp.nan)
 
 
-def _random_rotation(key, shape):
-    x = orthonormal_columns(
-        jax.random.normal(key, shape)
-    )  # Haar measure, as those of the columns are rotation invariant
-    return x * jnp.where(jnp.arange(shape[-1]) == 0, determinant(x)[..., None, None], 1.0)
+def _random_rotation(w):
+    """Of normal numbers, so that Haar's measure is theirs: those of the columns are rotation invariant."""
+    x = orthonormal_columns(w)
+    return x * jnp.where(np.arange(w.shape[-1]) == 0, determinant(x)[..., None, None], 1.0)

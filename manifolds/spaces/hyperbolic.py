@@ -58,8 +58,14 @@ class Hyperbolic(Space):
     def _inside(self, x):
         return x[..., 0] > 0.0
 
-    def _random(self, key, size):
-        return self._project(jax.random.normal(key, (*size, *self.shape)))
+    def _normal(self, x, c):
+        return c * _lowered(x) / (x**2).sum(axis=-1, keepdims=True)
+
+    def _along(self, x, w):
+        return self._project_tangent(x, w)
+
+    def _rounded(self, x):
+        return (x**2).sum(axis=-1, keepdims=True)
 
     def _project_tangent(self, x, w):
         normal = _lowered(x)

@@ -64,8 +64,17 @@ class Maps(ABC):
         y = self._project(x)
         return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
 
+    @property
+    def _normals(self) -> int | None:
+        """How many normal numbers a random point is made of, None where it is drawn otherwise."""
+        return self.size if type(self)._random is Maps._random else None
+
+    def _from_normals(self, w):
+        """A random point from normal numbers, shape (..., normals)."""
+        return self._project(self.from_vector(w))
+
     def _random(self, key, size):
-        return self._project(self.from_vector(jax.random.normal(key, (*size, self.size))))
+        return self._from_normals(jax.random.normal(key, (*size, self._normals or 0)))
 
     def _tangents(self, x):
         """A basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size): of what _project lets by.
@@ -212,7 +221,7 @@ class Maps(ABC):
     def _rows(self, x):
         """The derivatives of the constraints, shape (..., m, size)."""
         found, pull = jax.vjp(lambda y: self._constraints(self.from_vector(y)), self.to_vector(x))
-        axes = jnp.eye(found.shape[-1])
+        axes = np.eye(found.shape[-1])
         return jax.vmap(lambda e: pull(jnp.broadcast_to(e, found.shape))[0], out_axes=-2)(axes)
 
     def _normal(self, x, c):
@@ -220,9 +229,12 @@ class Maps(ABC):
         if not self._has_equations:
             return self.from_vector(c)
         rows = self._rows(x)
-        gram = rows @ rows.swapaxes(-1, -2)
-        inverse = solve_near_identity(gram, jnp.broadcast_to(jnp.eye(gram.shape[-1]), gram.shape))
-        return self.from_vector(((inverse @ c[..., None]) * rows).sum(axis=-2))
+        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), c[..., None])
+        return self.from_vector((weights * rows).sum(axis=-2))
+
+    def _correction(self, x, c):
+        """A displacement that changes the constraints by c, shape (..., m), at a point x; near it, by about as much."""
+        return self._normal(x, c)
 
     def _along(self, x, w):
         """The array w less what would change the constraints at x."""

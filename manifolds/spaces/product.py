@@ -98,6 +98,16 @@ class Product(Space):
     def _random(self, key, size):
         return self.random(key, size)
 
+    @property
+    def _normals(self):
+        numbers = [factor._normals for factor in self.factors]
+        return None if None in numbers else sum(n for n in numbers if n is not None)
+
+    def _from_normals(self, w):
+        ends = np.cumsum([factor._normals or 0 for factor in self.factors])[:-1]
+        pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
+        return self.join(*(factor._from_normals(own) for factor, own in pairs))
+
     def _project_tangent(self, x, w):
         return self._joined("_project_tangent", x, w)
 
@@ -122,10 +132,16 @@ class Product(Space):
         return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
 
     def _normal(self, x, c):
+        return self._of_constraints("_normal", x, c)
+
+    def _correction(self, x, c):
+        return self._of_constraints("_correction", x, c)
+
+    def _of_constraints(self, kernel: str, x, c):
         parts = self.split(x)
         sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._each("_constraints", x), x)]
         triples = zip(self.factors, parts, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
-        return self.join(*(factor._normal(part, own) for factor, part, own in triples))
+        return self.join(*(getattr(factor, kernel)(part, own) for factor, part, own in triples))
 
     def _along(self, x, w):
         return self._joined("_along", x, w)
@@ -276,6 +292,13 @@ class Power(Space):
     def _random(self, key, size):
         return self.random(key, size)
 
+    @property
+    def _normals(self):
+        return None if self.base._normals is None else self.count * self.base._normals
+
+    def _from_normals(self, w):
+        return self.base._from_normals(w.reshape(*w.shape[:-1], self.count, -1))
+
     def _project_tangent(self, x, w):
         return self.base._project_tangent(x, w)
 
@@ -298,7 +321,13 @@ class Power(Space):
         return c.reshape(*c.shape[:-2], -1)
 
     def _normal(self, x, c):
-        return self.base._normal(x, c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count))
+        return self.base._normal(x, self._of_each(c))
+
+    def _correction(self, x, c):
+        return self.base._correction(x, self._of_each(c))
+
+    def _of_each(self, c):
+        return c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count)
 
     def _along(self, x, w):
         return self.base._along(x, w)

@@ -60,9 +60,12 @@ class SPD(Space):
     def _inside(self, x):
         return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
 
-    def _random(self, key, size):
-        components = 0.5 * jax.random.normal(key, (*size, self.dim))
-        return symmetrized(expm(jnp.einsum("...a,aij->...ij", components, self._basis)))
+    @property
+    def _normals(self):
+        return self.dim
+
+    def _from_normals(self, w):
+        return symmetrized(expm(jnp.einsum("...a,aij->...ij", 0.5 * w, self._basis)))
 
     def _project_tangent(self, x, w):
         return symmetrized(w)
@@ -103,7 +106,7 @@ class SPD(Space):
         return super()._why_off(x, residual)
 
     def _inverse_factor(self, x):
-        return solve_lower(cholesky(x), jnp.broadcast_to(jnp.eye(self.n), x.shape))
+        return solve_lower(cholesky(x), jnp.broadcast_to(np.eye(self.n), x.shape))
 
     @property
     def _basis(self) -> np.ndarray:

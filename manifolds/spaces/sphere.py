@@ -63,8 +63,14 @@ class Sphere(Space):
     def _constraints(self, x):
         return 0.5 * (_dot(x, x) - 1.0)
 
-    def _random(self, key, size):
-        return self._project(jax.random.normal(key, (*size, *self.shape)))
+    def _normal(self, x, c):
+        return c * x / _dot(x, x)
+
+    def _along(self, x, w):
+        return w - _dot(x, w) / _dot(x, x) * x
+
+    def _rounded(self, x):
+        return _dot(x, x)
 
     def _project_tangent(self, x, w):
         return w - _dot(x, w) * x

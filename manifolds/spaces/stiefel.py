@@ -12,7 +12,7 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
-from ..matrices.linear import complement, largest, orthonormalized, polar, skew, solve
+from ..matrices.linear import complement, largest, lyapunov, orthonormalized, polar, skew, solve, symmetric
 from ..matrices.symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
 
@@ -62,17 +62,34 @@ class Stiefel(Space):
         return math.pi if self.p in (1, self.n - 1) else 2.0 * math.pi / math.sqrt(5.0)
 
     def _residual(self, x):
-        return largest(_transposed(x) @ x - jnp.eye(self.p))
+        return largest(_transposed(x) @ x - np.eye(self.p))
 
     def _project(self, x):
         return polar(x)
 
     def _constraints(self, x):
-        rest = _transposed(x) @ x - jnp.eye(self.p)
+        rest = _transposed(x) @ x - np.eye(self.p)
         return rest[..., *np.triu_indices(self.p)]
 
-    def _random(self, key, size):
-        return orthonormal_columns(jax.random.normal(key, (*size, *self.shape)))
+    def _normal(self, x, c):
+        if self.p > 2:
+            return super()._normal(x, c)
+        return x @ lyapunov(_transposed(x) @ x, symmetric(c, self.p))
+
+    def _correction(self, x, c):
+        return 0.5 * x @ symmetric(c, self.p)
+
+    def _along(self, x, w):
+        if self.p > 2:
+            return super()._along(x, w)
+        product = _transposed(x) @ w
+        return w - x @ lyapunov(_transposed(x) @ x, product + _transposed(product))
+
+    def _rounded(self, x):
+        return 2.0 * (_transposed(jnp.abs(x)) @ jnp.abs(x))[..., *np.triu_indices(self.p)]
+
+    def _from_normals(self, w):
+        return orthonormal_columns(self.from_vector(w))
 
     def _project_tangent(self, x, w):
         product = _transposed(x) @ w
