@@ -151,8 +151,13 @@ def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
 
 def heyoka(tolerance: float, x0, t_end: float, rate: float) -> Run:
     """Taylor series of the order that the tolerance asks for."""
+    return heyoka_of(_heyoka_system(rate), tolerance, x0, t_end)
+
+
+def heyoka_of(equations: list, tolerance: float, x0, t_end: float) -> Run:
+    """The same for other equations: pairs of a variable and its derivative."""
     hy, x0 = module("heyoka"), np.asarray(x0, dtype=float)
-    integrator = hy.taylor_adaptive(_heyoka_system(rate), x0, tol=tolerance)
+    integrator = hy.taylor_adaptive(equations, x0, tol=tolerance)
 
     def reset():
         integrator.time = 0.0

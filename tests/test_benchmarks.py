@@ -135,11 +135,11 @@ def test_c_runs_the_same_variational_scheme(number):
 
 
 @needs_compiler
-@pytest.mark.slow
-def test_c_moves_the_same_spin():
-    assert spin.difference() <= 1e-12
+@pytest.mark.parametrize("way", ["without charts", pytest.param("in charts", marks=pytest.mark.slow)])
+def test_c_moves_the_same_spin(way):
+    assert spin.difference(way) <= 1e-12
     with pytest.raises(RuntimeError, match="differ by"):
-        spin.difference(0.0301)
+        spin.difference(way, 0.0301)
 
 
 @needs_compiler

@@ -50,8 +50,7 @@ def run(quick: bool) -> Report:
         f"10,000 states of norm one to t = {T_END:g}, on {cores()} cores: explicit steps of order 8 and heyoka in "
         "batches over threads, whose equations are the scalar program of the library's vector field. The error is the "
         f"worst of {SAMPLE} states, against heyoka at a tolerance of {EXACT:g}; heyoka has the loosest tolerance with "
-        "which it is at least as accurate. The library takes the spin through charts of its sphere, one for each "
-        "step, and differentiates them; heyoka's spin leaves the sphere by its error. There is no target."
+        "which it is at least as accurate. heyoka's spin leaves its sphere by its error. There is no target."
     )
     return Report("Other systems", text, tables, skipped=skipped)
 

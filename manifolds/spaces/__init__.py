@@ -1,23 +1,29 @@
 """State spaces: Riemannian manifolds with their geodesics in JAX, one abstraction and its native instances."""
 
 from .base import Space, registered_spaces
+from .correlation import Correlation
 from .euclidean import Euclidean
 from .grassmann import Grassmann
 from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
+from .homogeneous import Flag, Homogeneous
 from .hyperbolic import Hyperbolic
 from .level_set import LevelSet
-from .product import Power, Product
+from .product import Oblique, Power, Product
 from .spd import SPD
 from .sphere import Sphere
 from .stiefel import Stiefel
 
 __all__ = [
     "SPD",
+    "Correlation",
     "Euclidean",
+    "Flag",
     "Grassmann",
     "GroupSpace",
+    "Homogeneous",
     "Hyperbolic",
     "LevelSet",
+    "Oblique",
     "Power",
     "Product",
     "Space",

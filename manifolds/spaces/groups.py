@@ -359,7 +359,9 @@ class SpecialUnitary(BiInvariantSpace):
         return self._of_unit_determinant(orthonormal_columns(self.from_vector(w)))
 
     def _correction(self, x, c):
-        of_real, of_imaginary, of_phase = jnp.split(c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1)
+        of_real, of_imaginary, of_phase = jnp.split(
+            c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1
+        )
         hermitian = symmetric(of_real, self.n) + 1j * skew(of_imaginary, self.n)
         return 0.5 * hermitian @ x + (1j / self.n) * of_phase[..., None] * x
 

@@ -423,3 +423,21 @@ class Power(Space):
 
 register((Sphere(2), Euclidean(3)), (SpecialOrthogonal(3), Euclidean(3)))(Product)
 register((Sphere(2), 4))(Power)
+
+
+@register((3, 2))
+@jax.tree_util.register_static
+class Oblique(Power):
+    """The oblique manifold: p unit vectors of R^n, the rows of a matrix, shape (p, n). A power of a sphere.
+
+    Parameters
+    ----------
+    n, p : int
+    """
+
+    def __init__(self, n: int, p: int):
+        super().__init__(Sphere(checked_size(n, 2, "Oblique(n, p)") - 1), checked_size(p, 1, "Oblique(n, p)", "p"))
+
+    @property
+    def name(self):
+        return f"Oblique({self.base.dim + 1}, {self.count})"

@@ -73,6 +73,10 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
 
         defect = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
         suite.small("divergences are those of the volume", defect, size, DIFFERENCES)
+    if M.surrounded:
+        change, corrected, tangent = _in_the_arrays_around(M, x, noise)
+        suite.small("corrections change the equations by what is asked", corrected - change, size, allowed)
+        suite.small("what is along the space changes no equation", tangent, size, allowed)
     if not M.geodesics:
         suite.without("geodesics", "the space has none of its own: its charts project")
         return suite.report()
@@ -99,6 +103,17 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
     half = np.asarray(M.exp(x, 0.5 * across))
     suite.small("midpoints", np.asarray(M.midpoint(x, y)) - half, size, 10 * allowed)
     return suite.report()
+
+
+def _in_the_arrays_around(M: Space, x, w) -> list[np.ndarray]:
+    """What equations change by along w, along the correction that is to make up for it, and along w made tangent."""
+
+    @jax.jit
+    def changes(x, w):
+        along = lambda v: jax.jvp(M._constraints, (x,), (v + jnp.zeros_like(x),))[1]  # noqa: E731
+        return along(w), along(M._correction(x, along(w))), along(M._along(x, w))
+
+    return [np.asarray(c) for c in changes(x, np.asarray(w, dtype=M.dtype))]
 
 
 def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import geomstats.geometry.euclidean as gs_euclidean
+import geomstats.geometry.full_rank_correlation_matrices as gs_correlation
 import geomstats.geometry.grassmannian as gs_grassmannian
 import geomstats.geometry.hyperboloid as gs_hyperboloid
 import geomstats.geometry.hypersphere as gs_hypersphere
@@ -44,7 +45,21 @@ TOLERANCES = {
 
 seeds = st.integers(0, 10**6)
 BATCH = 3
-SLOW = ("S^1", "S^3", "SO(4)", "SU(2)", "SU(3)", "SE(2)", "SE(3)", "St(4, 2)", "SO(3) x R^3", "Heisenberg(1)", "SL(2)")
+SLOW = (
+    "S^1",
+    "S^3",
+    "SO(4)",
+    "SU(2)",
+    "SU(3)",
+    "SE(2)",
+    "SE(3)",
+    "St(4, 2)",
+    "SO(3) x R^3",
+    "Heisenberg(1)",
+    "SL(2)",
+    "Corr(3)",
+    "Fl(1, 1, 2)",
+)
 """Spaces whose whole suite is left to the slow tests: together they compile for more than a minute."""
 
 BY_FACTORS = (mf.Product, mf.Power, mf.SpecialEuclidean)
@@ -239,6 +254,12 @@ class Twin:
     transport: str = "closed form"  # or how else it is to be had
 
 
+def _flat_correlations():
+    space = gs_correlation.FullRankCorrelationMatrices(3, equip=False)
+    space.equip_with_metric(gs_correlation.EuclideanCholeskyMetric)
+    return space
+
+
 def _tight_stiefel():
     space = gs_stiefel.Stiefel(4, 2)
     space.metric.log_solver.tol = 1e-13  # 1e-8 by default
@@ -259,6 +280,8 @@ TWINS = {
     "St(4, 2)": Twin(_tight_stiefel, transport="ladder"),
     "Gr(3, 1)": Twin(lambda: gs_grassmannian.Grassmannian(3, 1)),
     "Gr(4, 2)": Twin(lambda: gs_grassmannian.Grassmannian(4, 2)),
+    "Corr(3)": Twin(_flat_correlations),
+    "Oblique(3, 2)": Twin(lambda: gs_nfold.NFoldManifold(gs_hypersphere.Hypersphere(2), 2), transport="none"),
     "(S^2)^4": Twin(lambda: gs_nfold.NFoldManifold(gs_hypersphere.Hypersphere(2), 4), transport="none"),
     "S^2 x R^3": Twin(
         lambda: gs_product.ProductManifold((gs_hypersphere.Hypersphere(2), gs_euclidean.Euclidean(3))),
@@ -275,6 +298,7 @@ WITHOUT_TWIN = {
     "SU(3)": "geomstats has no SU(n): compared with its totally geodesic subgroup SO(3) below",
     "Heisenberg(1)": "its exponential is that of the group, with a test suite of its own",
     "SL(2)": "likewise",
+    "Fl(1, 1, 2)": "geomstats has no flags: see test_homogeneous for what has other names",
     "level set": "geomstats has none of one's own: see test_level_set for a sphere as one",
 }
 

@@ -1,0 +1,136 @@
+"""Correlation matrices of full rank, with a flat metric."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._sizes import checked_size
+from ..matrices.linear import largest
+from ..matrices.symmetric import cholesky, symmetrized
+from .base import Space, register
+
+
+@register((3,))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class Correlation(Space):
+    """Symmetric positive definite n x n matrices with ones on the diagonal, and the Euclidean-Cholesky metric.
+
+    The Cholesky factor L of x, with each row divided by its entry on the diagonal, is a triangular matrix with ones on
+    the diagonal, and any such matrix belongs to one x. Its other entries are coordinates in which the metric is the sum
+    of products, so that the space is complete and flat, and geodesics are unique [Thanwerdas & Pennec 2022].
+    """
+
+    n: int
+    metric = "Euclidean-Cholesky"
+
+    def __post_init__(self):
+        checked_size(self.n, 2, "Correlation(n)")
+
+    @property
+    def name(self):
+        return f"Corr({self.n})"
+
+    @property
+    def dim(self):
+        return self.n * (self.n - 1) // 2
+
+    @property
+    def shape(self):
+        return (self.n, self.n)
+
+    def _residual(self, x):
+        return jnp.where(self._inside(x), largest(self._rest(x)), jnp.inf)
+
+    def _project(self, x):
+        """The correlations of a covariance."""
+        scale = 1.0 / jnp.sqrt(jnp.diagonal(x, axis1=-2, axis2=-1))
+        y = self._with_ones(symmetrized(x) * scale[..., :, None] * scale[..., None, :])
+        return jnp.where(self._inside(y)[..., None, None], y, jnp.nan)
+
+    def _with_ones(self, x):
+        return jnp.where(np.eye(self.n, dtype=bool), 1.0, x)
+
+    def _rest(self, x):
+        """What of a matrix is skew, and its diagonal less one."""
+        return jnp.where(np.eye(self.n, dtype=bool), x - 1.0, 0.5 * (x - x.swapaxes(-1, -2)))
+
+    def _constraints(self, x):
+        return self.to_vector(self._rest(x))
+
+    def _normal(self, x, c):
+        return self.from_vector(c)
+
+    def _along(self, x, w):
+        return self._project_tangent(x, w)
+
+    def _rounded(self, x):
+        return self.to_vector(jnp.abs(x))
+
+    def _inside(self, x):
+        return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
+
+    @property
+    def _normals(self):
+        return 2 * self.n**2
+
+    def _from_normals(self, w):
+        rows = w.reshape(*w.shape[:-1], self.n, 2 * self.n)
+        return self._project(rows @ rows.swapaxes(-1, -2))
+
+    def _project_tangent(self, x, w):
+        return jnp.where(np.eye(self.n, dtype=bool), 0.0, symmetrized(w))
+
+    # -- the coordinates, and back ------------------------------------------------------------------------------------
+
+    def _chart(self, x):
+        factor = cholesky(x)
+        rows = factor / jnp.diagonal(factor, axis1=-2, axis2=-1)[..., None]
+        return rows[..., *np.tril_indices(self.n, -1)]
+
+    def _placed(self, c):
+        rows = jnp.zeros((*c.shape[:-1], self.n, self.n)).at[..., *np.tril_indices(self.n, -1)].set(c) + np.eye(self.n)
+        rows = rows / jnp.sqrt((rows**2).sum(axis=-1, keepdims=True))
+        return self._with_ones(rows @ rows.swapaxes(-1, -2))
+
+    def _coordinates(self, x, v):
+        x, v = jnp.broadcast_arrays(x, v)
+        return jax.jvp(self._chart, (x,), (v,))[1]
+
+    def _from_coordinates(self, x, c):
+        start = self._chart(x)
+        start, c = jnp.broadcast_arrays(start, c)
+        return jax.jvp(self._placed, (start,), (c,))[1]
+
+    def _frame(self, x):
+        return jax.vmap(lambda e: self._from_coordinates(x, e), out_axes=-3)(jnp.eye(self.dim))
+
+    def _inner(self, x, u, v):
+        return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+
+    def _flat(self, x, v):
+        c = self._coordinates(x, v)
+        return symmetrized(jax.vjp(self._chart, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0])
+
+    def _sharp(self, x, alpha):
+        x, alpha = jnp.broadcast_arrays(x, alpha)
+        start = self._chart(x)
+        return self._from_coordinates(x, jax.vjp(self._placed, start)[1](alpha)[0])
+
+    def _exp(self, x, v):
+        return self._placed(self._chart(x) + self._coordinates(x, v))
+
+    def _log(self, x, y):
+        return self._from_coordinates(x, self._chart(y) - self._chart(x))
+
+    def _transport(self, x, v, u):
+        return self._from_coordinates(self._exp(x, v), self._coordinates(x, u))
+
+    def _why_off(self, x, residual):
+        if np.isfinite(x).all() and not np.isfinite(residual):
+            return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
+        return super()._why_off(x, residual)
