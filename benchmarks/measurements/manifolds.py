@@ -97,7 +97,8 @@ def _rows(space: mf.Space, way: str, steps: int) -> list[list]:
 def child(number: str, way: str, steps: str) -> dict[str, list]:
     """For each method the first answer; the time of a step, there and on R^d; drift, residual and order."""
     space, count = list(mf.registered_spaces())[int(number)], int(steps)
-    x0, found = np.asarray(space.to_vector(space.random(3))), {}
+    x0 = np.asarray(space.to_vector(space.random(3)))
+    found: dict[str, list] = {}
     methods = METHODS if way == "around" else {"RK4": lt.MetriplecticRungeKutta(4, retraction=way)}
     for name, method in methods.items():
         began = time.process_time()

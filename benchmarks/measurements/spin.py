@@ -38,15 +38,12 @@ PROGRAMS = {"without charts": "spin_around.c", "in charts": "spin.c"}
 def run(quick: bool) -> Report:
     """Time a step of the midpoint scheme in one thread, and a run of order eight beside heyoka's."""
     steps, rounds = (2000, 1) if quick else (100_000, 5)
-    rate, tables, text, skipped = RELAXATION / (STEP * steps), [], [INTRODUCTION], {}
+    rate, tables, text = RELAXATION / (STEP * steps), [], [INTRODUCTION]
     ratios: dict[str, float | None] = {}
+    skipped: dict[str, str] = {}
     for way in METHODS:
-        works, missing = take_part(
-            {
-                C: lambda way=way: functools.partial(program(rate, way).integrate, X0, STEP, steps),
-                COMPILED: lambda way=way: by_library(rate, steps, steps, "compiled", way),
-            }
-        )
+        runs = functools.partial(_by_c, rate, steps, way), functools.partial(_compiled, rate, steps, way)
+        works, missing = take_part(dict(zip((C, COMPILED), runs, strict=True)))
         skipped |= missing
         caption = f"{steps:,} steps of size {STEP} {way}, relaxing all the way (rate {rate:g}); one state kept."
         table, times = contest(caption, works, steps, rounds, C)
@@ -71,6 +68,14 @@ A spin with an easy axis in a tilted field, which heats a bath as it comes to re
 library as functions of the state and its space. Without charts the midpoint scheme runs in the space around the \
 sphere. In charts it is the paper's, with the midpoint map exp~: there *C* is written for this sphere, and needs the \
 energy's derivative along a geodesic, where the library takes the gradient of the energy in a chart."""
+
+
+def _by_c(rate: float, steps: int, way: str) -> Callable:
+    return functools.partial(program(rate, way).integrate, X0, STEP, steps)
+
+
+def _compiled(rate: float, steps: int, way: str) -> Callable:
+    return by_library(rate, steps, steps, "compiled", way)
 
 
 def _beside_heyoka(rounds: int) -> tuple[Table, float]:

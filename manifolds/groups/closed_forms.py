@@ -35,7 +35,7 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rodrigues' formula ``I + c1 X + c2 X^2``."""
     z, X = _square(x)[..., None], algebra.hat(x)
-    return np.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
+    return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -48,7 +48,7 @@ def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
     X = algebra.hat(x)[..., :3, :3]
-    return np.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
+    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -61,7 +61,7 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rotation by Rodrigues' formula, translation ``(I + c2 W + c3 W^2) u``."""
     z, u = _square(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
-    rotation = np.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
+    rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
     return affine(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
 
 
@@ -118,7 +118,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
     det(I + X) <= 0.
     """
-    X, identity = algebra.hat(x), np.eye(2)
+    X, identity = algebra.hat(x), jnp.eye(2)
     half = jnp.trace(X, axis1=-2, axis2=-1)[..., None, None] / 2
     X = X - half * identity
     square = -jnp.trace(X @ X, axis1=-2, axis2=-1).real[..., None, None] / 2
@@ -127,7 +127,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
-    X, identity = algebra.hat(x), np.eye(4)
+    X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
     dual = jnp.zeros_like(X)
     for i, j, k, m in [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (3, 1, 0, 2), (2, 3, 0, 1)]:
@@ -147,7 +147,7 @@ def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
     X = algebra.hat(x)
-    return np.eye(X.shape[-1]) + X + X @ X / 2
+    return jnp.eye(X.shape[-1]) + X + X @ X / 2
 
 
 def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:

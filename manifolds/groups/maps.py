@@ -107,7 +107,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes the rounding that the
     roots amplify.
     """
-    identity, batch = np.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
+    identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 
     def far(state):
         s, _, converged = state

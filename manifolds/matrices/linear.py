@@ -40,7 +40,7 @@ def complement(u) -> jax.Array:
         size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
         normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
         u = reflect(u, normals[-1])
-    rest = axes[:, p:]
+    rest = jnp.asarray(axes[:, p:])
     for normal in reversed(normals):
         rest = reflect(rest, normal)
     return rest
