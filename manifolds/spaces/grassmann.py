@@ -152,7 +152,10 @@ class Grassmann(Space):
         return v
 
     def _sharp(self, x, alpha):
-        return _bracket(_bracket(symmetrized(alpha), x), x)
+        x = symmetrized(x)
+        product = symmetrized(alpha) @ x
+        turned = (product - product.swapaxes(-1, -2)) @ x  # [[alpha, x], x], whose products are transposes of others
+        return turned + turned.swapaxes(-1, -2)
 
     def _exp(self, x, v):
         turn = expm(_bracket(v, x))
