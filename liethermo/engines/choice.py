@@ -25,9 +25,9 @@ from .stepping import State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
 
-SMALL_DIM, SMALL_PROGRAM = 16, 20_000
+SMALL_DIM, SMALL_PROGRAM = 16, 30_000
 """Components of a state and operations of a step up to which it is compiled in no more time than XLA takes, so that
-"auto" always takes it. On a step of 8,000 operations XLA spends three times as long."""
+"auto" always takes it. On a step of 8,000 operations XLA spends three times as long, on one of 28,000 as long."""
 
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""

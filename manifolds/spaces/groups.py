@@ -483,6 +483,6 @@ def _rotation(x):
 
 
 def _random_rotation(w):
-    """Of normal numbers, so that Haar's measure is theirs: those of the columns are rotation invariant."""
+    """The rotation that normal numbers make, whose measure is Haar's: that of the columns is rotation invariant."""
     x = orthonormal_columns(w)
     return x * jnp.where(np.arange(w.shape[-1]) == 0, determinant(x)[..., None, None], 1.0)
