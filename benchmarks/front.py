@@ -68,6 +68,7 @@ THEMES: dict[str, list[Pair]] = {
         Pair("general", 0, "midpoint, quartic H and logarithmic S", COMPILED, "C"),
         *(Pair("variational", i, f"variational scheme {i + 1}", COMPILED, "C") for i in range(3)),
         Pair("spin", 0, "midpoint, a spin on its sphere", COMPILED, "C"),
+        Pair("spin", 1, "the same in charts", COMPILED, "C"),
         Pair("ensemble", 0, "10,000 bodies, 200 midpoint steps", COMPILED, "C with SIMD"),
     ],
     "One trajectory at equal accuracy": [
@@ -103,7 +104,7 @@ THEMES: dict[str, list[Pair]] = {
         ),
         Pair("lattice", 0, "10⁵ coupled spins, two cores", "array engine", "C, 2 threads"),
     ],
-    "Manifolds": [],
+    "Manifolds": [Pair("spin", 2, "a spin with a bath to an error of 1e-8", COMPILED, "heyoka")],
     "Quantum systems": [],
     "Learning": [],
 }

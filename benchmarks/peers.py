@@ -239,11 +239,11 @@ def _heyoka_system(rate: float) -> list:
     return list(zip((x, y, z), body_field(x, y, z, rate), strict=True))
 
 
-def heyoka_equations(system: lt.System) -> list:
-    """The equations of motion of a system, from its scalar program: nothing is typed twice."""
+def heyoka_equations(field: Callable, dim: int) -> list:
+    """The equations of motion of a vector field, from its scalar program: nothing is typed twice."""
     hy = module("heyoka")
-    program = scalarize(jax.make_jaxpr(system.vector_field)(jnp.zeros(system.dim)))
-    variables = [hy.make_vars(f"x{i}") for i in range(system.dim)]
+    program = scalarize(jax.make_jaxpr(field)(jnp.zeros(dim)))
+    variables = [hy.make_vars(f"x{i}") for i in range(dim)]
     values = dict(zip(program.inputs[0], variables, strict=True))
     for target, op, args in program.instructions:
         name = str(op)
