@@ -20,7 +20,6 @@ import numba
 import numpy as np
 from scipy.integrate import solve_ivp
 
-import liethermo as lt
 from liethermo.tracing.scalarize import scalarize
 
 from .machine import cores
