@@ -110,8 +110,8 @@ def measured(problem: Problem, quick: bool) -> list[list]:
     half = round(problem.end / problem.step) + 1
     test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
     found_scales = scales(train, x.shape[2], None)
-    steps, width = (50, 8) if quick else (6000, 32)
-    settings = {"matching": steps, "shooting": 50 if quick else 300, "rate": 5e-3, "validation": 0.1}
+    steps, width = (50, 8) if quick else (8000, 32)
+    settings = {"matching": steps, "shooting": 50 if quick else 200, "rate": 5e-3, "validation": 0.1}
     long = round((2 if quick else LONG) * problem.end / problem.step)
     rows = []
 

@@ -120,9 +120,8 @@ def fit(
     whole = trajectories(data, system, observed)
     found = scales(whole, system.dim, observed)
     sigma = _noise(noise, len(places))
-    if observed is None:
-        system = in_units(system, found, np.concatenate([x for _, x in whole]))
-    elif validation:
+    system = in_units(system, found, np.concatenate([_whole(x, places, system.dim) for _, x in whole]))
+    if observed is not None and validation:
         raise InputError("validation is for data of all components: what is not observed has no start that is known")
     own = losses.weights(system, also, positive)
     if not own.start.size:

@@ -45,10 +45,13 @@ class Metriplectic(MetriplecticSystem):
         Of the networks, and of the friction.
     seed : int
         Of the first weights.
+    validate : bool
+        Where the Poisson tensor is known, test the axioms at a few random points: an entropy that is not constant along
+        its motions is refused, learned or not. A learned tensor has the entropy in its kernel.
 
     Raises
     ------
-    InputError, FunctionError
+    CasimirError, AxiomError, FunctionError, InputError
     """
 
     def __init__(
@@ -62,20 +65,22 @@ class Metriplectic(MetriplecticSystem):
         depth: int = 2,
         rank: int = 1,
         seed: int = 0,
+        validate: bool = True,
     ):
         energy = Energy(dim, width, depth, 4 * seed) if energy is None else as_energy(energy, "the energy")
         entropy = Entropy(dim, width, depth, 4 * seed + 1) if entropy is None else as_energy(entropy, "the entropy")
         if poisson is None:
             poisson = Poisson(dim, width, depth, 4 * seed + 2)
-        elif isinstance(poisson, mf.PoissonStructure) and poisson.dim is not None:
-            poisson = behind(poisson, dim)
         if isinstance(poisson, Poisson):
             poisson = eqx.tree_at(lambda p: p.entropy, poisson, entropy, is_leaf=lambda part: part is None)
+        elif isinstance(poisson, mf.PoissonStructure) and poisson.dim is not None:
+            poisson = behind(poisson, dim)
         if isinstance(friction, str):
             if friction != "learned":
                 raise InputError(f"friction is a Dissipation, a list of them, 'learned' or None, not {friction!r}")
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
-        super().__init__(poisson, energy, entropy, friction, dim=dim, validate=False)
+        by_form = isinstance(poisson, Poisson)  # but for the Jacobi identity
+        super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not by_form)
         self.poisson = tied_to(self.poisson, self.entropy)
 
 

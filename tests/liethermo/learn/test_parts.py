@@ -47,6 +47,13 @@ def test_known_tensors_are_poisson(poisson, dim):
     assert _failed(system) == set()
 
 
+def test_an_entropy_that_the_motion_would_change_is_refused():
+    with pytest.raises(lt.CasimirError):
+        lt.learn.Metriplectic(3, poisson=mf.Canonical(1), width=4)
+    entropy = lt.learn.Entropy(1, width=4).on([2])
+    assert _failed(lt.learn.Metriplectic(3, entropy=entropy, poisson=mf.Canonical(1), width=4)) == set()
+
+
 def test_a_friction_off_another_energy_is_found():
     """The control: the kernel of the friction is that of the energy, not of any function."""
 
@@ -96,6 +103,7 @@ def test_a_plain_step_is_the_step_but_for_rounding(order):
         (lambda: lt.learn.Friction(3, rank=0), "rank is a positive integer"),
         (lambda: lt.learn.Metriplectic(4, friction=lt.learn.Friction(3)), "3 components, but the state has 4"),
         (lambda: lt.learn.Metriplectic(2, poisson=mf.Canonical(2)), "4 coordinates, more than the 2"),
+        (lambda: lt.learn.Metriplectic(4, poisson=lt.learn.Poisson(3)), "dim is 4, but the Poisson structure has 3"),
         (lambda: lt.learn.Metriplectic(2, friction="some"), "not 'some'"),
     ],
 )
