@@ -134,6 +134,8 @@ class Course:
         blocks = -(-phase.steps // length)
         descend, look = _programs(phase, self.optimiser)
         before = sum(p.steps for p in self.phases[: self.index])
+        if self.block == 0 and phase.held_out is not None and np.isfinite(found := look(self.vector)):
+            self.least = found  # what does worse on what is held out than the weights before is not taken
         while self.block < blocks:
             random = np.random.default_rng([seed, self.index, self.block])
             batch = min(phase.batch, phase.task.items)
