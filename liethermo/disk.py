@@ -83,7 +83,7 @@ def is_dead(part: Path) -> bool:
 
 
 def why(error: OSError | ValueError) -> str:
-    """What went wrong, in words; ValueErrors are of what is no path."""
+    """What went wrong, in words; a ValueError means that it is not a path."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -77,6 +77,21 @@ def test_prose_follows_the_rules(kind):
     assert not found, "\n".join(found)
 
 
+MANNER = (
+    "Work in one thread is timed by the processor's clock, so that a busy machine does not count.",
+    "A call of 1000 steps beside them, every state kept.",
+    "There is no target: No target but to state what is found.",
+    "Where a constant is added to H, nothing smaller can be seen, and everything larger is.",
+    "So the first of several zeros is found, and one that is undone before the step ends.",
+    "They differ where a method is used on what is no metriplectic system.",
+    "What is known then is computed then.",
+    "It is rounded once where the processor can; which ones are does not depend on the number of lanes.",
+    "Keep every n-th state, n this number, and the last.",
+    "Which entries of the ledger a solution has in its energy, and its laws are stated without.",
+)
+"""Sentences that readers stumbled over, each for a manner."""
+
+
 @pytest.mark.parametrize(
     "sentence",
     [
@@ -84,6 +99,7 @@ def test_prose_follows_the_rules(kind):
         "It starts from a step of nothing.",
         "Laws hold. Of the same energy the schemes keep the rest.",
         "One idea " + "and another " * 40 + "is too much.",
+        *MANNER,
     ],
 )
 def test_a_fault_is_found(sentence):

@@ -218,7 +218,7 @@ def total(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | No
     Raises
     ------
     InputError
-        If the list is empty, or holds what is no dissipation.
+        If the list is empty, or an entry is not a dissipation.
     """
     if given is None or isinstance(given, Dissipation):
         return given

@@ -67,7 +67,7 @@ is to be looked at; it is where what is watched changes its sign; it is at its e
 
 
 TOLD = ("x", "energy", "entropy", "step", "t", "taken")
-"""What is told of each attempt of a trajectory that is looked at: fields of its state, its time and its step."""
+"""What is recorded of each attempt of a trajectory that is watched: fields of its state, its time and its step."""
 
 
 class Pacing(Module):
@@ -177,7 +177,7 @@ def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
 
 
 def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
-    """The same for one that is no part of another: none ends just short of where one has to end."""
+    """The same for one that is not a part of another: none ends just short of where one has to end."""
     if pacing.adaptive:
         left = pace.stop - pace.t
         arrives = left <= pace.proposed * (1 + 1e-12)

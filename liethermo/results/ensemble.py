@@ -311,7 +311,7 @@ class Ensemble(Saved):
     # -- files --------------------------------------------------------------------------------------------------------
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """An ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; what is no array as attributes (JSON).
+        """An ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else as attributes (JSON).
 
         ``status_text`` and ``message`` say of every trajectory how it ended. Each variable says its long
         name, energy and entropy the law that the system promises of them.

@@ -38,7 +38,7 @@ SHORT = 1e-3
 """The first of them, as a fraction of the time in which the state changes by its size."""
 
 WHOLE = 0.01
-"""Fraction of the whole motion below which the distance of a step does not count: a body that has come to rest may take
+"""Fraction of the whole motion below which the distance of a step is ignored: a body that has come to rest may take
 long steps."""
 
 ROUNDED = 1e-10

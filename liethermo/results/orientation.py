@@ -145,7 +145,7 @@ def precession(solution: Turned, axis=None) -> np.ndarray:
 
 
 def angles(solution: Turned) -> dict[str, np.ndarray]:
-    """All that is known of the orientation of a body, by name; nothing of what is no body with attitudes."""
+    """All that is known of the orientation of a body, by name; empty where there is no body with attitudes."""
     if not _turns(solution):
         return {}
     found = {"quaternion": quaternions(solution)}

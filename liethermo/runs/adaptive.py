@@ -1,4 +1,4 @@
-"""Steps chosen by an estimate of the local error: what is asked for, as the engines are told of it."""
+"""Steps chosen by an estimate of the local error: the request, in the form that engines take."""
 
 from __future__ import annotations
 

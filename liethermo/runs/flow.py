@@ -48,7 +48,7 @@ def flow(
     method : OneStepMethod
         ``MetriplecticGauss(1)`` by default, of order 2.
     save_every : int, optional
-        Return the states on the way too: every n-th, n this number, and the first and the last one.
+        Return the states on the way too: those of every ``save_every``-th step, the first and the last.
     attitude : array, shape (m, m), optional
         At the start, where a torque depends on it: the identity by default. What is returned are momenta all the same.
 

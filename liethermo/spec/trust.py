@@ -76,7 +76,7 @@ def _found(name: str, folder: Path) -> ModuleType:
 
 
 def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
-    """The module in a file, which is no other than that of this name."""
+    """The module in a file; it is the one of this name."""
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__file__", None) == str(file):
         return known

@@ -176,7 +176,7 @@ class TemporaryFolder:
 
 
 def read(path: Path) -> bytes:
-    """The content of a file, which is no link and nothing but a file.
+    """The content of a plain file; a link is refused.
 
     Raises
     ------

@@ -380,7 +380,7 @@ def _digest(axes: Axes) -> str:
 
 
 def _dim(name: str, k: int, shape: tuple[int, ...]) -> str:
-    """The name of a dimension of a measure that is no axis."""
+    """The name of a dimension of a measure that is not an axis."""
     return f"{name}_component" if len(shape) == 1 else f"{name}_component_{k}"
 
 

@@ -25,7 +25,7 @@ class Call(Block):
     name : str
         A key of :data:`FUNCTIONS`.
     sizes : tuple of int
-        What its function is told of the matrices.
+        What its function learns about the matrices.
     is_complex : bool
     """
 

@@ -344,7 +344,7 @@ def polygamma(b, eqn, order, x):
 
     def of_one(m, v):
         if type(m) is str or m != int(m) or m < 1:
-            raise NotImplementedError("of an order that is no positive integer known at compile time")
+            raise NotImplementedError("of an order that is not a positive integer known at compile time")
         sign = 1.0 if int(m) % 2 else -1.0
         return b.mul(sign * math.factorial(int(m)), zeta(b, m + 1.0, v))
 

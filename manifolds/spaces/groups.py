@@ -44,7 +44,7 @@ class GroupSpace(Space):
     Raises
     ------
     SpaceError
-        If that is no group of matrices.
+        If that is not a group of matrices.
     ParameterError
         If ``inner`` is not symmetric and positive definite.
     """

@@ -8,7 +8,7 @@ from typing import Any
 from llvmlite import ir
 
 INSIDE = 700.0
-"""Arguments below this size have a result that is no subnormal number; of others the C library is asked."""
+"""Arguments below this size have a result that is not subnormal; the C library computes the others."""
 
 LOG2_HIGH = float.fromhex("0x1.62e42fee00000p-1")
 """log(2) but for its last bits, so that a whole number up to 2^11 times it is exact."""

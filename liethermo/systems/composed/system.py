@@ -356,7 +356,7 @@ def _as_law(k) -> Callable:
 
 
 class _Exchanged(Module):
-    """A law of two bodies, told of them in the other order."""
+    """A law of two bodies, with the bodies in the other order."""
 
     law: Callable
 
