@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import fcntl
 import itertools
 import json
 import os
@@ -117,12 +118,22 @@ class Browser:
             f"--user-data-dir={profile}",
             "about:blank",
         ]
+        # Chromium reads from 3 and writes to 4; both may be in use here, so they are set in the new process.
+        ends = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (to_child, from_child)]
+
+        def at_three_and_four() -> None:
+            for end, number in zip(ends, (3, 4), strict=True):
+                os.dup2(end, number)
+
         self._process = subprocess.Popen(
-            ["sh", "-c", f'exec "$@" 3<&{to_child} 4>&{from_child}', "sh", *command],
-            pass_fds=(to_child, from_child),
+            command,
+            close_fds=False,
+            preexec_fn=at_three_and_four,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
+        for end in ends:
+            os.close(end)
         os.close(to_child)
         os.close(from_child)
         self._buffer, self._numbers, self.events = b"", itertools.count(1), []
