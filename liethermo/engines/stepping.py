@@ -12,7 +12,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import orderless, pulled
 from ..integrators.explicit import LEVELS
 from ..systems import System
-from ..tracing.programs import program
+from ..tracing.programs import hasty_program, program
 from .codes import Code
 from .rules import EPS, RULES, Rules
 from .stages import Equations, Solved, explicit, fixed_point, newton_steps, noise_of, solve_stages
@@ -87,7 +87,7 @@ def _of_guesses(method: OneStepMethod, k) -> jax.Array:
     return k[:0] if method.explicit else k
 
 
-begin = program(first_state)
+begin = hasty_program(first_state)
 
 
 def in_order(

@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..systems import System
 from ..tracing.interpret import at_points
+from ..tracing.remembered import remembered
 from .base import OneStepMethod, TransportingMethod, Wrapping
 from .charts import in_charts
 from .midpoint import MetriplecticMidpoint
@@ -109,12 +110,12 @@ class Fluctuating(Wrapping, TransportingMethod):
         return jnp.zeros_like(k)
 
     def keeps(self, system: System, name: str) -> bool:
-        return self.method.keeps(system, name) and undisturbed(system, system.functions()[name])
+        return self.method.keeps(system, name) and undisturbed(system)[name]
 
     def check(self, system: System) -> None:
         """Raise InputError where there is no noise that belongs to the dissipation."""
         self.method.check(system)
-        misfit = np.nanmax(at_points(_misfit, system, system.samples(4)), initial=0.0)
+        misfit = np.nanmax(_tested(system)[0], initial=0.0)
         if not misfit <= MISFIT:
             raise InputError(
                 f"the factor B that a dissipation gives is none of its friction matrix K: B B^T dS misses K dS "
@@ -145,9 +146,18 @@ def with_noise(system: System, method: OneStepMethod, boltzmann, temperature, de
         )
     if temperature is not None and not lowers:
         raise InputError("the dissipation keeps the energy, so there is no bath that could have a temperature")
-    size = sum(B.size for _, B in factors_at(system.dissipation, system, jnp.asarray(system.samples(1)[0])))
     T = 1.0 if temperature is None else temperature
-    return Fluctuating(method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(size))
+    return Fluctuating(
+        method, jnp.asarray(boltzmann, float), jnp.asarray(T, float), density, jnp.zeros(_columns(system))
+    )
+
+
+def _columns(system: System) -> int:
+    """How many columns the factors have together."""
+    assert system.dissipation is not None
+    dissipation, point = system.dissipation, jnp.asarray(system.samples(1)[0])
+    made = jax.eval_shape(lambda x: [jnp.zeros(B.size) for _, B in factors_at(dissipation, system, x)], point)
+    return sum(columns.shape[0] for columns in made)
 
 
 def noise_dimension(method: OneStepMethod) -> int:
@@ -168,23 +178,28 @@ def _noisy(part) -> bool:
     return isinstance(part, Fluctuating)
 
 
-def undisturbed(system: System, function: Energy) -> bool:
-    """Whether no noise changes a function: ``B^T grad f = 0`` at random points."""
-    moved, size = at_points(_moved, (system, function), system.samples(4)).T
-    inside = np.isfinite(moved)
-    return bool(inside.any() and (moved[inside] <= MISFIT * size[inside]).all())
+def undisturbed(system: System) -> dict[str, bool]:
+    """Whether no noise changes a function, for each of a system's: ``B^T grad f = 0`` at random points."""
+    found = {}
+    for name, (moved, size) in _tested(system)[1].items():
+        inside = np.isfinite(moved)
+        found[name] = bool(inside.any() and (moved[inside] <= MISFIT * size[inside]).all())
+    return found
 
 
-def _misfit(system: System, x):
+@remembered
+def _tested(system: System) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    return at_points(_tests, system, system.samples(4))
+
+
+def _tests(system: System, x):
+    """What the factors miss of K, and how far they move each function, beside the size of what moves it."""
     assert system.dissipation is not None
-    return residuals(system.dissipation, system, x)[SQUARE]
-
-
-def _moved(model: tuple[System, Energy], x):
-    system, function = model
-    assert system.dissipation is not None
-    B, gradient = beside([B for _, B in factors_at(system.dissipation, system, x)]), function.gradient(x)
+    B = beside([B for _, B in factors_at(system.dissipation, system, x)])
     # they see columns as large as any
-    size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in elsewhere(len(gradient), 2)]))
-    size = size * jnp.linalg.norm(gradient)
-    return jnp.stack([jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size])
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in elsewhere(x.shape[0], 2)]))
+    moved = {}
+    for name, function in system.functions().items():
+        gradient = function.gradient(x)
+        moved[name] = jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size * jnp.linalg.norm(gradient)
+    return residuals(system.dissipation, system, x)[SQUARE], moved

@@ -132,11 +132,8 @@ def exact_samples(system: System, noise: Fluctuations, x0, near: np.ndarray, see
         If several functions are kept, or rays do not meet a level once.
     """
     kept = {"the energy": system.energy} if system.energy_law == "conserved" else {}
-    kept |= {
-        name: system.functions()[name]
-        for name in sorted(system.first_integrals())
-        if undisturbed(system, system.functions()[name])
-    }
+    untouched = undisturbed(system)
+    kept |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if untouched[name]}
     if len(kept) > 1:
         raise ValueError(f"motion and noise keep {', '.join(kept)}: for more than one give samples of the measure")
     random, n = np.random.default_rng(seed), system.dim

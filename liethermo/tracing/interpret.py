@@ -6,6 +6,7 @@ What is too large for that, or cannot be unrolled, is compiled after all.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .programs import program
+from manifolds._arrays import is_traced
+
+from .programs import hasty_program
 from .remembered import Latest, fingerprint, remembered
 from .scalarize import UnsupportedPrimitive, scalarize
 from .traced import settled
@@ -115,10 +118,12 @@ def _known(what: str, key: tuple, find: Callable) -> Any:
 
 
 def _by_compiler(function: Callable, model: Any, points: np.ndarray) -> Any:
-    with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+    # this may be asked while something else is traced; where nothing is, constants need no programs of their own
+    traced = is_traced(jnp.zeros(()))
+    with jax.ensure_compile_time_eval() if traced else contextlib.nullcontext():
         return jax.tree_util.tree_map(np.asarray, _compiled(function, model, jnp.asarray(points)))
 
 
-@program
+@hasty_program
 def _compiled(function, model, points):
     return jax.vmap(lambda x: function(model, x))(points)

@@ -23,9 +23,21 @@ Function = TypeVar("Function", bound=Callable)
 _programs: Latest[Callable] = Latest(KEPT)
 
 
+HASTY = {"xla_backend_optimization_level": 0}
+"""How a program is compiled that is run once: to optimise it takes longer than it would save."""
+
+
 def program(function: Function) -> Function:
     """Decorator: compile a function of pytrees, arrays being its arguments and all else a part of the program."""
+    return _program(function, None)
 
+
+def hasty_program(function: Function) -> Function:
+    """The same, for a function that a run calls once or twice."""
+    return _program(function, HASTY)
+
+
+def _program(function: Function, options: dict | None) -> Function:
     @functools.wraps(function)
     def call(*arguments):
         leaves, structure = jax.tree_util.tree_flatten(arguments)
@@ -33,7 +45,8 @@ def program(function: Function) -> Function:
         static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
         shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
         key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
-        return _programs.find(key, lambda: jax.jit(_Whole(function, structure, static)))(dynamic)
+        whole = _Whole(function, structure, static)
+        return _programs.find(key, lambda: jax.jit(whole, compiler_options=options))(dynamic)
 
     return call  # type: ignore[return-value]
 
