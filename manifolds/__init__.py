@@ -13,6 +13,7 @@ from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenbe
 from .algebras.invariants import TracePolynomial
 from .algebras.killing import trilinear_form
 from .algebras.lie_algebra import LieAlgebra
+from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.polynomial import Polynomial
 from .algebras.sums import direct_sum, semidirect_sum
@@ -124,6 +125,7 @@ __all__ = [
     "LieAlgebra",
     "LieAlgebraError",
     "LiePoisson",
+    "MagneticExtension",
     "ManifoldsError",
     "MatrixAlgebra",
     "MatrixGroup",
@@ -172,6 +174,7 @@ __all__ = [
     "galilei",
     "gl",
     "heisenberg",
+    "magnetic_extension",
     "power",
     "registered",
     "registered_groups",

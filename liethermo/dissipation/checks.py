@@ -8,7 +8,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import real_array
-from manifolds.matrices.blocks import BlockDiagonal
+from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.conditions import require
@@ -105,6 +105,10 @@ def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
 def check_matrix(form, dim: int, what: str) -> None:
     """Raise unless a form, or what a function of the state gives, acts on states of this dimension."""
     if isinstance(form, BlockDiagonal):
+        return
+    if isinstance(form, Diagonal):
+        if form.entries.shape != (dim,):
+            raise InputError(f"{what} has {form.entries.size} entries, and a state has {dim} components")
         return
     shape = jax.eval_shape(lambda x: jnp.asarray(form_at(form, x)), zero_state(dim)).shape
     if shape != (dim, dim):

@@ -6,7 +6,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 
+from manifolds._arrays import real_array
+from manifolds.matrices.blocks import Diagonal
+
+from ..functions.conditions import require
 from ..functions.indices import Indices
 from .base import Dissipation
 from .checks import check_matrix, checked_bath, checked_rate, over_sites, semidefinite
@@ -24,9 +29,10 @@ class DoubleBracket(Dissipation):
     Parameters
     ----------
     rate : float, >= 0
-    metric : array, shape (n, n), optional
-        The positive semidefinite form ^♯; by default the identity, or on a manifold the metric of the space. On copies
-        of an algebra it may be that of one site, shape (d, d). With either the bracket acts site by site.
+    metric : array, shape (n, n) or (n,), optional
+        The positive semidefinite form ^♯, or its diagonal; by default the identity, or on a manifold the metric of the
+        space. On copies of an algebra it may be that of one site, shape (d, d). With either the bracket acts site by
+        site.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
 
@@ -46,7 +52,7 @@ class DoubleBracket(Dissipation):
     def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
         self.bath = checked_bath(bath)
-        self.metric = None if metric is None else semidefinite(metric, "the metric")
+        self.metric = None if metric is None else _form(metric)
 
     @property
     def energy_law(self):
@@ -93,3 +99,11 @@ class DoubleBracket(Dissipation):
 
         size = system.isotropic_size if root is None else system.dim
         return Factor(size, times, velocity=velocity).scaled(self.rate)
+
+
+def _form(metric) -> Any:
+    if np.ndim(metric) != 1:
+        return semidefinite(metric, "the metric")
+    entries = real_array(metric)
+    require(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, not {value}")
+    return Diagonal(entries)

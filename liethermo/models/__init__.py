@@ -9,6 +9,7 @@ from .body_with_wheels import body_with_wheels
 from .cylinder import cylinder
 from .gas_piston import gas_piston
 from .heat_grid import heat_grid
+from .magnetic_fluid import magnetic_fluid
 from .mass_spring_gas import mass_spring_gas
 from .open_gases import IdealMixture, porous_piston, reaction_vessel
 from .oscillator import damped_oscillator
@@ -32,6 +33,7 @@ __all__ = [
     "free_rigid_body",
     "gas_piston",
     "heat_grid",
+    "magnetic_fluid",
     "mass_spring_gas",
     "moving_thermo_particles",
     "porous_piston",

@@ -196,6 +196,16 @@ class QuantisedSphere:
         """The vorticity matrix W of a state, shape (..., N, N)."""
         return self.algebra.dual_matrix(mu)
 
+    def magnetic_state(self, vorticity, potential) -> jax.Array:
+        """The state of a :func:`magnetic_fluid` from vorticity and magnetic potential, each a state of this sphere."""
+        raised = self.algebra.tables.raised(jnp.asarray(potential))
+        return jnp.concatenate([jnp.asarray(vorticity), raised], axis=-1)
+
+    def magnetic_fields(self, x) -> tuple[jax.Array, jax.Array]:
+        """Vorticity and magnetic potential of states of a magnetic fluid: the inverse of :meth:`magnetic_state`."""
+        x, n = jnp.asarray(x), self.algebra.dim
+        return x[..., :n], self.algebra.tables.lowered(x[..., n:])
+
     def from_coefficients(self, a) -> jax.Array:
         """The state of ``omega = sum_l a_l0 Y_l0 + sum_{m > 0} 2 Re(a_lm Y_lm)``, shape (N^2 - 1,).
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 
+from .degrees import degree_by_arrays
 from .programs import hasty_program
 from .remembered import Latest, fingerprint, remembered
 from .scalarize import UnsupportedPrimitive, scalarize
@@ -83,10 +84,12 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
         if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
             return math.inf  # a function that closes over what is being traced
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            return scalarize(closed, limit=LIMIT).degree(len(leaves))
+            try:
+                return scalarize(closed, limit=LIMIT).degree(len(leaves))
+            except UnsupportedPrimitive:
+                return degree_by_arrays(closed, len(leaves))
 
-    found = _known("degree", (function, form, dim), degree)
-    return math.inf if found is None else found
+    return _known("degree", (function, form, dim), degree)
 
 
 def _parts(model: Any) -> tuple[list, Any, Callable]:

@@ -144,6 +144,13 @@ class MatrixAlgebra(OnDemand):
         """The inverse of :meth:`dual_matrix`; of any matrix, that of its part in the algebra, shape (..., dim)."""
         return self.tables.products(self._parts(square_matrices(M, self.matrix_size, "M")))
 
+    def trace_covector(self, x) -> jax.Array:
+        """The covector ``Re tr(x .)`` of the trace form, which is invariant and has no kernel, shape (..., dim)."""
+        x = self._element(x, "x")
+        if self.known.compact:
+            return -self.tables.lowered(x)
+        return self.tables.products(_adjoint(self.tables.matrix(x)))
+
     def _parts(self, matrix) -> Parts:
         return (matrix.real, matrix.imag)[: self.tables.parts]
 

@@ -14,14 +14,19 @@ from tests.cases import DISSIPATIONS, build, slow
 from tests.liethermo.closed_systems import ISOLATED
 from tests.liethermo.integrators.test_convergence import SYSTEMS
 
+NEEDED = {
+    "zeitlin": {"N": 4},
+    "magnetic_fluid": {"N": 4},
+    "tumbling_body": {"inertia": (3.0, 2.0, 1.5), "rate": 0.1},
+}
+
 
 def each_system():
     yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
     yield from SYSTEMS.items()
     yield from ((f"simple closed, {name}", lambda name=name: ISOLATED[name]) for name in ISOLATED)
     for name in sorted({*lt.models.__all__} - {"QuantisedSphere"}):  # which is no system
-        needed = {"zeitlin": {"N": 4}, "tumbling_body": {"inertia": (3.0, 2.0, 1.5), "rate": 0.1}}.get(name, {})
-        yield f"model {name}", functools.partial(getattr(lt.models, name), **needed)
+        yield f"model {name}", functools.partial(getattr(lt.models, name), **NEEDED.get(name, {}))
 
 
 def _field(system, x):

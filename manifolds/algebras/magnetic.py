@@ -1,0 +1,258 @@
+"""The magnetic extension of a Lie algebra: its semidirect sum with its own dual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._arrays import real_components
+from ..errors import ParameterError
+from ..matrices.blocks import BlockDiagonal, Diagonal
+from .blocks import DirectSum
+from .lie_algebra import LieAlgebra
+from .matrix_algebra import MatrixAlgebra
+from .on_demand import OnDemand
+from .sums import LARGEST_BY_CONSTANTS, semidirect_sum
+
+FOLLOWED = 2
+"""Casimirs of g that are followed along a motion of its extension, where each makes two."""
+
+
+def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlgebra:
+    """``g ⋉ g*`` by the coadjoint action: ``[(x, a), (y, b)] = ([x, y], ad*_y a - ad*_x b)``.
+
+    Momenta are pairs (W, B) of W in g* and B in g, with ``ad*_(x, a) (W, B) = (ad*_x W - ad*_B a, -[x, B])``: B is
+    carried by the velocity x and pushes back on W. The extension of so(3) is the algebra of the heavy top, and that of
+    the fields without divergence is the one of ideal magnetohydrodynamics [Vishik & Dolzhanskii 1978; Marsden, Ratiu
+    & Weinstein 1984].
+    Invariant functions f(B) are Casimirs, and so is the cross helicity ``<W, B>``.
+
+    Parameters
+    ----------
+    g : LieAlgebra
+    by_brackets : bool, optional
+        Whether the extension acts by the brackets of g, without structure constants of its own: by default above
+        dimension 40.
+
+    Returns
+    -------
+    LieAlgebra
+        Of dimension ``2 * g.dim``: the components of g first, then those of g*.
+
+    Raises
+    ------
+    ParameterError
+    """
+    if not isinstance(g, LieAlgebra):
+        raise ParameterError(f"the magnetic extension is that of a LieAlgebra, not of {type(g).__name__}")
+    extension = MagneticExtension(g)
+    few = extension.dim <= LARGEST_BY_CONSTANTS
+    return extension.by_constants if (few if by_brackets is None else not by_brackets) else extension
+
+
+@jax.tree_util.register_static
+class MagneticExtension(OnDemand):
+    """``g ⋉ g*`` by what g does; see :func:`manifolds.magnetic_extension`.
+
+    Attributes
+    ----------
+    algebra : LieAlgebra
+        g.
+    """
+
+    def __init__(self, algebra: LieAlgebra):
+        super().__init__(f"{algebra.name} x {algebra.name}*", 2 * algebra.dim)
+        self.algebra = algebra
+
+    @property
+    def _key(self):
+        return self.algebra
+
+    def _made_by_constants(self) -> LieAlgebra:
+        # rho(x) a = -ad*_x a
+        return semidirect_sum(self.algebra, -self.algebra.structure_constants, name=self.name)
+
+    def halves(self, x, what: str = "x") -> tuple[jax.Array, jax.Array]:
+        """The two parts of an element, shape (..., dim) each."""
+        x = real_components(x, self.dim, what)
+        return x[..., : self.algebra.dim], x[..., self.algebra.dim :]
+
+    # -- the operations -----------------------------------------------------------------------------------------------
+
+    def bracket(self, x, y) -> jax.Array:
+        g, (x, a), (y, b) = self.algebra, self.halves(x), self.halves(y, "y")
+        return jnp.concatenate([g.bracket(x, y), g.ad_star(y, a) - g.ad_star(x, b)], axis=-1)
+
+    def ad_star(self, x, mu) -> jax.Array:
+        g, (x, a), (W, B) = self.algebra, self.halves(x), self.halves(mu, "mu")
+        return jnp.concatenate([g.ad_star(x, W) - g.ad_star(B, a), g.bracket(B, x)], axis=-1)
+
+    def action(self, x) -> ExtendedAction:
+        return ExtendedAction(self, x)
+
+    # -- structure ----------------------------------------------------------------------------------------------------
+
+    def killing_signature(self) -> tuple[int, int, int]:
+        positive, negative, zero = self.algebra.killing_signature()  # the form is twice that of g, and zero on g*
+        return positive, negative, zero + self.algebra.dim
+
+    def killing_form(self) -> np.ndarray:
+        self._check_square("the Killing form")
+        return np.pad(2.0 * self.algebra.killing_form(), (0, self.algebra.dim))
+
+    def killing_inner_product(self):
+        g = self.algebra
+        if not g.is_compact_type():
+            return -self.killing_form()
+        form = g.killing_inner_product()
+        blocks = (_Twice(jnp.asarray(form) if isinstance(form, np.ndarray) else form), Diagonal(jnp.zeros(())))
+        return BlockDiagonal(blocks, (g.dim, g.dim), (1, 1))
+
+    def is_abelian(self) -> bool:
+        return self.algebra.is_abelian()
+
+    def is_unimodular(self) -> bool:
+        return True  # the traces of ad_x on g and on g* cancel
+
+    def derived_series(self) -> list[int]:
+        return [self.dim] if self.algebra.is_semisimple() else self.by_constants.derived_series()
+
+    def lower_central_series(self) -> list[int]:
+        return [self.dim] if self.algebra.is_semisimple() else self.by_constants.lower_central_series()
+
+    # -- Casimirs -----------------------------------------------------------------------------------------------------
+
+    def casimir_count(self) -> int:
+        g = self.algebra
+        return self.by_constants.casimir_count() if invariant_form(g) is None else 2 * g.casimir_count()
+
+    def casimirs(self, degree: int) -> list:
+        """``f(B)`` and ``<W, grad f(B)>`` of each Casimir f of g, moved to g by its invariant form.
+
+        Where no such form is known, those that the structure constants have.
+        """
+        if invariant_form(self.algebra) is None:
+            return self.by_constants.casimirs(degree)
+        return [F for _, F in self._of_both([(str(f), f) for f in self.algebra.casimirs(degree)])]
+
+    def leading_casimirs(self) -> list[tuple[str, Callable]]:
+        if invariant_form(self.algebra) is None:
+            return [("<W, B>", CrossHelicity(self))]
+        return self._of_both(self.algebra.leading_casimirs()[:FOLLOWED])
+
+    def _of_both(self, known: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
+        kinds = (("of B", OfField), ("along W at B", AlongMomentum))
+        return [(f"{name} {where}", kind(self, f)) for name, f in known for where, kind in kinds]
+
+
+class ExtendedAction:
+    """The action of one element, by that of its part in g."""
+
+    def __init__(self, g: MagneticExtension, x):
+        self.g, (x, self.a) = g, g.halves(x)
+        self.of_g = g.algebra.action(x)
+
+    def bracket(self, y) -> jax.Array:
+        y, b = self.g.halves(y, "y")
+        return jnp.concatenate(
+            [self.of_g.bracket(y), self.g.algebra.ad_star(y, self.a) - self.of_g.ad_star(b)], axis=-1
+        )
+
+    def ad_star(self, mu) -> jax.Array:
+        W, B = self.g.halves(mu, "mu")
+        pushed = self.of_g.ad_star(W) - self.g.algebra.ad_star(B, self.a)
+        return jnp.concatenate([pushed, -self.of_g.bracket(B)], axis=-1)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class _Twice:
+    """Twice a linear map."""
+
+    form: Any
+
+    def __matmul__(self, x) -> jax.Array:
+        return 2.0 * (self.form @ x)
+
+
+def invariant_form(g: LieAlgebra) -> Callable | None:
+    """An invariant bilinear form without a kernel, as a map from elements to dual vectors, shape (..., dim).
+
+    The trace form of large matrix algebras, the Killing form of others that are semisimple; None where none is known.
+    """
+    if isinstance(g, MatrixAlgebra):
+        return g.trace_covector
+    if isinstance(g, DirectSum):
+        forms = [invariant_form(part) for part, _ in g.blocks]
+        return None if None in forms else lambda x: _blockwise(g, forms, x)
+    if not g.is_semisimple():
+        return None
+    form = g.killing_form()
+    return lambda x: x @ form
+
+
+def _blockwise(g: DirectSum, forms, x) -> jax.Array:
+    parts = [form(part) for form, part in zip(forms, g.split(x), strict=True)]
+    return jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class CrossHelicity:
+    """``<W, B>``, shape (..., dim) to (...)."""
+
+    algebra: MagneticExtension
+
+    @property
+    def dim(self) -> int:
+        return self.algebra.dim
+
+    def __call__(self, mu) -> jax.Array:
+        W, B = self.algebra.halves(mu, "mu")
+        return jnp.sum(W * B, axis=-1)
+
+    def __str__(self) -> str:
+        return "<W, B>"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class OfField:
+    """A Casimir f of g at the invariant form of B, shape (..., dim) to (...)."""
+
+    algebra: MagneticExtension
+    casimir: Callable
+
+    @property
+    def dim(self) -> int:
+        return self.algebra.dim
+
+    def __call__(self, mu) -> jax.Array:
+        return self.casimir(_dual(self.algebra, self.algebra.halves(mu, "mu")[1]))
+
+    def __str__(self) -> str:
+        return f"{self.casimir} of B"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class AlongMomentum(OfField):
+    """``<W, grad f>`` there: of the Casimir of degree two a multiple of the cross helicity."""
+
+    def __call__(self, mu) -> jax.Array:
+        W, B = self.algebra.halves(mu, "mu")
+        return jnp.sum(W * jax.grad(lambda b: jnp.sum(self.casimir(b)))(_dual(self.algebra, B)), axis=-1)
+
+    def __str__(self) -> str:
+        return f"{self.casimir} along W at B"
+
+
+def _dual(extension: MagneticExtension, B) -> jax.Array:
+    form = invariant_form(extension.algebra)
+    assert form is not None
+    return form(B)
