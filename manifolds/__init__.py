@@ -68,6 +68,7 @@ from .spaces import (
     SpecialUnitary,
     Sphere,
     Stiefel,
+    TangentBundle,
     registered_spaces,
 )
 from .spaces.geomstats_bridge import GeomstatsSpace, from_geomstats
@@ -161,6 +162,7 @@ __all__ = [
     "Spins",
     "SplitContact",
     "Stiefel",
+    "TangentBundle",
     "TracePolynomial",
     "abelian",
     "aff",

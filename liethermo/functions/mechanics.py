@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._module import Module
 
@@ -86,8 +87,10 @@ class _Apart(Module):
         return self.V(y[:-1], y[-1])
 
 
-def is_mechanical(energy: Energy, dim: int) -> bool:
+def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
     """Whether H is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite [SML 28], and each term known to be of that kind.
+
+    On a space of positions ``P(q) G(q)`` has to be semidefinite near it, P the projector along it: its symmetric part.
 
     Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes that of a
     quadratic term at the midpoint. A plain function of the whole state is not known to be of any kind, unless it is
@@ -96,7 +99,8 @@ def is_mechanical(energy: Energy, dim: int) -> bool:
     if is_traced(energy):
         return False
     points = np.random.default_rng(0).standard_normal((4, dim))
-    return all(_is_kinetic(term, points) or is_free_of_momenta(term, points) for term in energy.terms)
+    along = None if space is None else at_points(_projector, space, points[:, : space.size])
+    return all(_is_kinetic(term, points, along) or is_free_of_momenta(term, points) for term in energy.terms)
 
 
 def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
@@ -112,22 +116,29 @@ def is_free_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool
     return isinstance(term, Pullback) and not at_points(_jacobian, term, points)[:, :, components].any()
 
 
-def _is_kinetic(term: Energy, points: np.ndarray) -> bool:
+def _is_kinetic(term: Energy, points: np.ndarray, along: np.ndarray | None) -> bool:
     """Whether it is a semidefinite form in p, whatever else it is in q and S; without mixed terms."""
     n = points.shape[1] // 2
     if isinstance(term, Kinetic):
-        return _is_semidefinite(at_points(_metric, term, points))
+        return _is_semidefinite(at_points(_metric, term, points), along)
     if not term.is_quadratic:
         return False
     slope, hessian = at_points(_by_momenta, term, np.zeros_like(points[:1]))
     mixed = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
-    return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n])
+    return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n], along)
 
 
-def _is_semidefinite(G: np.ndarray) -> bool:
-    """Whether all of these matrices, shape (..., n, n), are positive semidefinite."""
-    eigenvalues = np.linalg.eigvalsh(G)
+def _is_semidefinite(G: np.ndarray, along: np.ndarray | None) -> bool:
+    """Whether all of these matrices, shape (..., n, n), are positive semidefinite; behind projectors, if there are."""
+    G = G if along is None else along @ G
+    eigenvalues = np.linalg.eigvalsh(0.5 * (G + G.swapaxes(-1, -2)))
     return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
+
+
+def _projector(space: mf.Space, q):
+    point = space.from_vector(q)
+    along = lambda w: space.to_vector(space._along(point, space.from_vector(w)))  # noqa: E731
+    return jax.vmap(along, out_axes=1)(jnp.eye(space.size))
 
 
 def _metric(term: Kinetic, x):

@@ -154,6 +154,11 @@ class OneStepMethod(Module):
         del tolerance
         return self
 
+    @property
+    def in_charts(self) -> bool:
+        """Whether on a manifold it runs in the charts of a retraction, and not in the space around."""
+        return getattr(self, "retraction", None) is not None
+
     def __str__(self) -> str:
         return type(self).__name__
 

@@ -62,8 +62,7 @@ def of_steps(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
     """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
-    charts = getattr(method, "retraction", None) is not None
-    found = driven(system if charts else embedded(system))
+    found = driven(system if method.in_charts else embedded(system))
     method = traced_energies(pulled(method, found).on(found, tolerance), found.dim)
     wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
     if wanted is None or not (attitude or system.needs_attitude):

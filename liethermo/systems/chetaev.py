@@ -18,7 +18,7 @@ from ..errors import FunctionError, InputError
 from ..functions.arguments import Steady, needed_arguments
 from ..functions.checks import check_shape
 from ..tracing.interpret import at_points
-from .simple_closed import Forces, SimpleClosedSystem, in_one_array
+from .simple_closed import Forces, SimpleClosedSystem, lagrangian_of
 
 NEWTON_STEPS, SOLVED = 12, 1e-12
 """For S' where the form depends on it; and the share of its terms that the constraint may miss then."""
@@ -61,7 +61,7 @@ class ChetaevSystem(SimpleClosedSystem):
     production_name: ClassVar[str] = "S'"
 
     def __init__(self, lagrangian, eta: Callable, dim: int | None = None, momentum_maps=(), validate: bool = True):
-        structure, size, energy = self._prepare(in_one_array(lagrangian), dim)
+        structure, size, energy = self._prepare(lagrangian_of(lagrangian), dim)
         self.friction = self.external = self.heat_power = None
         self.form = Form.of(eta, size // 2)
         forces = ChetaevForces(None, None, None, _law_of(self.form, size))

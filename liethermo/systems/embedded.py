@@ -67,13 +67,19 @@ class EmbeddedSystem(System):
         return f"a point of {_space(self.manifold).name}"
 
     @property
+    def ledger(self) -> dict[str, Energy]:
+        return self.manifold.ledger
+
+    @property
     def surface(self) -> OnLevels:
         return OnLevels(_space(self.manifold), self.conforming)
 
     def outside(self, x) -> str:
         space, x = _space(self.manifold), np.asarray(x)
-        if not np.isfinite(x).all() or at_points(_inside, self.surface, x[None])[0] > 0.0:
+        if not np.isfinite(x).all():
             return ""
+        if at_points(_inside, self.surface, x[None])[0] > 0.0:
+            return self.manifold.outside(x)
         return f"the step leaves {space.name}: {space._why_off(np.asarray(self.points(x)), np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------

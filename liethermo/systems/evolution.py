@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -9,13 +10,16 @@ import jax
 import jax.numpy as jnp
 
 import manifolds as mf
+from manifolds._module import Module
 
 from ..dissipation.base import Law, SkewFriction
 from ..errors import InputError
+from ..functions.arguments import needed_arguments
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, Quadratic, as_energy
 from ..functions.mechanics import is_mechanical
 from .base import System
+from .embedded import EmbeddedSystem
 
 
 class LiouvilleFriction(SkewFriction):
@@ -57,9 +61,26 @@ class OnContactManifold(System):
         """The contact structure."""
         return self.poisson.contact
 
+    @property
+    def configurations(self) -> mf.Space | None:
+        """The space of positions Q; None for R^n."""
+        return configurations(self.contact)
+
+    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+        """In the space around: its fields are tangent to the level sets of the constraints by form."""
+        return (self if self.space is None else EmbeddedSystem(self, conforming=True)), x
+
+    @property
+    def tensor_by_form(self) -> bool:
+        return self.space is not None
+
+    def _vector_field(self, x) -> jax.Array:
+        """From the gradients as they are, since what they are across the manifold counts for nothing."""
+        return self.field(x, self.energy.gradient(x), None if self.entropy is None else self.entropy.gradient(x))
+
 
 class EvolutionSystem(OnContactManifold):
-    """The evolution field of an energy on T*R^n x R: an isolated system with friction [SML 7, §4].
+    """The evolution field of an energy on T*Q x R: an isolated system with friction [SML 7, §4].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p``, with the temperature ``T = H_S``. The energy is constant and the path
     is tangent to the kernel of ``eta = dS - p dq``, which is the first law. The second holds where
@@ -70,17 +91,24 @@ class EvolutionSystem(OnContactManifold):
     (not with the coordinate increment as printed, unless G is diagonal). Where the same H is written as one
     plain function, they keep the energy exactly too, but the entropy may fall at a coarse step.
 
+    Q is R^n, or a ``space``. There a state has the arrays of q and p in one row, and S behind them. The array p is that
+    along Q which acts on velocities as the momentum does, ``sum(p * v)``. What energies are off Q counts for nothing.
+    The methods run in the arrays around Q, whose equations hold to rounding. The second law holds to rounding there for
+    the Gauss and the explicit methods where ``P(q) G(q)`` is semidefinite, P the projector along Q, as for one mass.
+
     Parameters
     ----------
-    energy : function from (q, p, S) in one array, shape (dim,), to a scalar, or an Energy
-        Or of that and the time t: see :class:`liethermo.TimeDependent`.
-    dim : int
-        Number of state components, 2n + 1.
+    energy : function from (q, p, S), or from all in one array, shape (dim,), to a scalar; or an Energy
+        Or of the one array and the time t: see :class:`liethermo.TimeDependent`.
+    dim : int, optional
+        Number of state components, 2n + 1; not needed with a space.
     momentum_maps : dict of functions, or a sequence of them
         Conserved quantities of a symmetry: checked by :meth:`check`, recorded and audited along runs.
     validate : bool
         Test the axioms at a few random points. Turn off where the energy is not defined at normally distributed
         points, and use ``system.check(points=...)``.
+    space : manifolds.Space, optional
+        Q: a space of real arrays. A function of (q, p, S) is then one of arrays of its shape.
 
     Raises
     ------
@@ -90,15 +118,25 @@ class EvolutionSystem(OnContactManifold):
     ----------
     contact : manifolds.CanonicalContact
         ``contact.evolution_vector_field(energy)`` is the vector field.
+    configurations : manifolds.Space or None
     """
 
     production_name: ClassVar[str] = "Delta_Q H"
 
-    def __init__(self, energy, dim: int, momentum_maps=(), validate: bool = True):
-        structure = canonical(dim)
-        energy = check_scalar(as_energy(energy, "the energy"), dim, "the energy", timed=True)
-        friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim))
-        self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
+    def __init__(
+        self,
+        energy,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        dim = components(dim, space)
+        energy = as_energy(in_one_array(energy, space), "the energy")
+        energy = check_scalar(energy, dim, "the energy", timed=True)
+        friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim, space))
+        entropy, states = entropy_component(dim), states_on(space)
+        self._build(canonical(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
 
     def temperature(self, x, t=None) -> jax.Array:
         """``T = H_S`` at a state or a batch of states, shape (...); at a time, where the energy depends on one."""
@@ -109,19 +147,27 @@ class EvolutionSystem(OnContactManifold):
 
 
 class ContactSystem(OnContactManifold):
-    """The plain contact field X_H of an energy on T*R^n x R, for comparison [SML §2.2].
+    """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p - H``. It describes no isolated system: ``H' = -H_S H``, and S is the
     action. The metriplectic midpoint scheme keeps that law in the form ``H(x') - H(x) = -h (dgrad H)_S H(z)``.
 
     Parameters
     ----------
-    energy, dim, momentum_maps, validate
+    energy, dim, momentum_maps, validate, space
         As for :class:`EvolutionSystem`.
     """
 
-    def __init__(self, energy, dim: int, momentum_maps=(), validate: bool = True):
-        self._build(canonical(dim), dim, energy, None, ReebDrift(), momentum_maps, validate)
+    def __init__(
+        self,
+        energy,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        dim, energy = components(dim, space), in_one_array(energy, space)
+        self._build(canonical(dim, space), dim, energy, None, ReebDrift(), momentum_maps, validate, states_on(space))
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         return decay(self, x)
@@ -130,12 +176,63 @@ class ContactSystem(OnContactManifold):
 # -- shared with the Lagrangian side ----------------------------------------------------------------------------------
 
 
-def canonical(dim: int) -> mf.Cosymplectic:
-    """The structure of T*R^n x R, on dim = 2n + 1 coordinates."""
-    return mf.Cosymplectic(mf.CanonicalContact(degrees_of_freedom(dim)))
+def canonical(dim: int, space: mf.Space | None = None) -> mf.Cosymplectic:
+    """The structure of T*Q x R, on dim = 2n + 1 coordinates."""
+    return mf.Cosymplectic(mf.CanonicalContact(degrees_of_freedom(dim), bundle=bundle_of(space)))
 
 
-def degrees_of_freedom(dim: int) -> int:
+def bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
+    """The tangent bundle of a space of positions, which stands for the cotangent bundle too; None for R^n."""
+    if space is None:
+        return None
+    bundle = mf.TangentBundle(space)
+    if not bundle.surrounded:
+        raise InputError(f"{space.name} has no equations in the arrays around it, so no momenta are taken along it")
+    return bundle
+
+
+def states_on(space: mf.Space | None, more: int = 0) -> mf.Space | None:
+    """The space of states (q, p, S), with so many components behind them; None for R^n."""
+    bundle = bundle_of(space)
+    return None if bundle is None else mf.Product(bundle, mf.Euclidean(1 + more))
+
+
+def configurations(contact: mf.SplitContact) -> mf.Space | None:
+    """Q, of a contact structure on T*Q x R or TQ x R; None for R^n."""
+    return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
+
+
+def components(dim: int | None, space: mf.Space | None) -> int:
+    """The number of components of (q, p, S)."""
+    if space is None:
+        return 2 * degrees_of_freedom(dim) + 1
+    if not isinstance(space, mf.Space):
+        raise InputError(f"space is a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
+    if dim not in (None, found := 2 * space.size + 1):
+        raise InputError(f"on {space.name} a state (q, p, S) has {found} components, not {dim}: leave dim out")
+    return found
+
+
+class Joined(Module):
+    """A function of (q, p, S), or (q, v, S) and more, as one of one array and more; q has a shape."""
+
+    function: Callable
+    shape: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __call__(self, x, *more):
+        n = len(x) // 2
+        q, v = (part if self.shape is None else part.reshape(self.shape) for part in (x[:n], x[n : 2 * n]))
+        return self.function(q, v, x[2 * n], *more)
+
+
+def in_one_array(function, space: mf.Space | None = None):
+    """A function of (q, p, S) as one of one array, and other things as they are."""
+    if not callable(function) or isinstance(function, Energy) or needed_arguments(function) != 3:
+        return function
+    return Joined(function, None if space is None else space.shape)
+
+
+def degrees_of_freedom(dim: int | None) -> int:
     """n of a state with 2n + 1 components (q, p, S)."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(

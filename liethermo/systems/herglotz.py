@@ -27,6 +27,8 @@ from .evolution import (
     LiouvilleFriction,
     OnContactManifold,
     ReebDrift,
+    bundle_of,
+    components,
     decay,
     degrees_of_freedom,
     entropy_component,
@@ -44,16 +46,19 @@ class OnVelocities(OnContactManifold):
         """The contact structure ``eta_L = dS - L_v dq`` [SML §3.1]."""
         return cast(mf.LagrangianContact, self.poisson.contact)
 
-    def _prepare(self, lagrangian, dim: int | None) -> tuple[mf.Cosymplectic, int, Energy]:
+    def _prepare(
+        self, lagrangian, dim: int | None, space: mf.Space | None = None
+    ) -> tuple[mf.Cosymplectic, int, Energy]:
         """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
         L = as_energy(lagrangian, "the Lagrangian")
-        if dim is None and isinstance(L, Quadratic):
+        if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
-        if dim is None:
+        if dim is None and space is None:
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
+        dim = components(dim, space)
         n = degrees_of_freedom(dim)
         self.lagrangian = L = recognised(check_scalar(L, dim, "the Lagrangian"), dim)
-        contact = mf.LagrangianContact(L.value, n)
+        contact = mf.LagrangianContact(L.value, n, bundle_of(space))
         _need_regular(contact)
         return mf.Cosymplectic(contact), dim, _energy(L, dim)
 
@@ -244,6 +249,9 @@ def _need_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
     points = np.random.default_rng(0).standard_normal((4, contact.dim))
+    if isinstance(contact.bundle, mf.TangentBundle):
+        on = contact.bundle
+        points = np.concatenate([np.asarray(on.to_vector(on.random(0, (4,)))), points[:, -1:]], axis=1)
     if singular_everywhere(at_points(_hessian, contact, points)):
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "

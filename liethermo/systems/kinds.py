@@ -95,6 +95,11 @@ class Kind(Module):
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
+    @property
+    def tensor_by_form(self) -> bool:
+        """Whether Pi is a Poisson tensor whatever the user gives, and dear to check when a system is built."""
+        return False
+
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
         if self.space is None:

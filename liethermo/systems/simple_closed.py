@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import ClassVar, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,7 @@ from ..functions.arguments import needed_arguments
 from ..functions.conditions import require
 from ..functions.energy import Energy
 from ..tracing.interpret import at_points
-from .evolution import entropy_component
+from .evolution import configurations, entropy_component, in_one_array, states_on
 from .herglotz import OnVelocities
 from .ledger import BesideLedger, ForcesAndHeat, WithLedger, field
 
@@ -34,9 +36,9 @@ class Forces(ForcesAndHeat):
     def force(self, system, x, dH, dS, dL):
         n = system.degrees_of_freedom
         q, _, S, t = system.parts(x)
-        rates = jax.jacfwd(system.contact.momentum)(x[: 2 * n + 1])
-        W, by_S = rates[:, n : 2 * n], rates[:, 2 * n]
-        v = solve(W, dH[n : 2 * n, None])[:, 0]  # the velocity and the temperature that the gradient stands for
+        _, W, by_S = system.contact.rates(x[: 2 * n + 1])
+        by_S = by_S[:, 0]
+        v = solve(W, system.along(q, dH[n : 2 * n])[:, None])[:, 0]  # the velocity and the temperature of the gradient
         T = dH[2 * n] - jnp.dot(by_S, v)
         friction, push = system.friction_at(q, v, S, t, T), system.external_force(q, v, S, t)
         power = system.heating(q, v, S, t)
@@ -47,7 +49,7 @@ class Forces(ForcesAndHeat):
 class SimpleClosedSystem(WithLedger, OnVelocities):
     """A simple closed system: a Lagrangian L(q, v, S), friction, an external force and heat from outside [GBY 2.4].
 
-    ``d/dt L_v - L_q = F_ext + F_fr`` and ``T S' = P_H - F_fr . v``, ``T = -L_S > 0``, on R^n. The energy
+    ``d/dt L_v - L_q = F_ext + F_fr`` and ``T S' = P_H - F_fr . v``, ``T = -L_S > 0``, on R^n or a manifold. The energy
     ``E = v . L_v - L`` changes by the work and heat received, ``E' = F_ext . v + P_H``, and the entropy production
     is ``-F_fr . v / T``: friction has to brake, which :meth:`check` tests.
 
@@ -58,6 +60,9 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     both sides of the ledger.
 
     :class:`liethermo.VariationalIntegrator` discretises its variational principle; the metriplectic schemes run it too.
+
+    With ``space=`` the positions are the points of a manifold Q, and states have the arrays of q and v in one row.
+    Forces act along Q: what a function gives across it is what the constraint takes up.
 
     Parameters
     ----------
@@ -76,6 +81,8 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     validate : bool
         Test the axioms at a few random points, that friction brakes among them. Turn off where a function is not
         defined at normally distributed points, and use ``system.check(points=...)``.
+    space : manifolds.Space, optional
+        Q: a space of real arrays, of whose shape q, v and forces then are in all of these functions.
 
     Raises
     ------
@@ -87,6 +94,9 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     contact : manifolds.LagrangianContact
     lagrangian : Energy
     degrees_of_freedom : int
+        Components of q.
+    configurations : manifolds.Space or None
+        Q, where it is not R^n.
     """
 
     friction: Callable | None
@@ -105,12 +115,13 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         heat_power=None,
         momentum_maps=(),
         validate: bool = True,
+        space: mf.Space | None = None,
     ):
-        structure, size, energy = self._prepare(in_one_array(lagrangian), dim)
-        n = size // 2
-        self.friction = _force(friction, n, "friction")
-        self.external = None if external is None else _field(external, n, (n,), "the external force")
-        self.heat_power = None if heat_power is None else _field(heat_power, n, (), "the heat power")
+        structure, size, energy = self._prepare(lagrangian_of(lagrangian, space), dim, space)
+        at = (size // 2,) if space is None else space.shape
+        self.friction = _force(friction, at, "friction")
+        self.external = None if external is None else _field(external, at, at, "the external force")
+        self.heat_power = None if heat_power is None else _field(heat_power, at, (), "the heat power")
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else Forces(*given)
         self._assemble(structure, size, energy, forces, momentum_maps, validate)
@@ -118,7 +129,8 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     def _assemble(self, structure, size: int, energy: Energy, forces: Forces | None, momentum_maps, validate) -> None:
         whole, total, energy = self._beside_ledger(structure, size, energy)
         entropy = entropy_component(total, size - 1)
-        self._build(whole, total, energy, entropy, forces, momentum_maps, validate)
+        states = states_on(configurations(structure.contact), total - size)
+        self._build(whole, total, energy, entropy, forces, momentum_maps, validate, states)
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -128,8 +140,16 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
 
     @property
+    def configurations(self) -> mf.Space | None:
+        return configurations(self.contact)
+
+    @property
     def degrees_of_freedom(self) -> int:
         return self.own_size // 2
+
+    def along(self, q, v) -> jax.Array:
+        """The part of a velocity or a force at q that is along Q, shape (n,); itself on R^n."""
+        return self.contact.along(q, v)
 
     def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """q, v, S and t of one state; t = 0 where it has none."""
@@ -163,7 +183,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     def friction_force(self, q, v, S, t) -> jax.Array:
         """F_fr, shape (n,)."""
-        return jnp.zeros_like(v) if self.friction is None else jnp.asarray(self.friction(q, v, S, t))
+        return jnp.zeros_like(v) if self.friction is None else self.along(q, jnp.asarray(self.friction(q, v, S, t)))
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         """F_fr where a discretisation has the temperature T, shape (n,)."""
@@ -172,7 +192,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     def external_force(self, q, v, S, t) -> jax.Array:
         """F_ext, shape (n,)."""
-        return jnp.zeros_like(v) if self.external is None else jnp.asarray(self.external(q, v, S, t))
+        return jnp.zeros_like(v) if self.external is None else self.along(q, jnp.asarray(self.external(q, v, S, t)))
 
     def heating(self, q, v, S, t) -> jax.Array:
         """P_H."""
@@ -199,16 +219,6 @@ def _temperature(system: SimpleClosedSystem, x):
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-class _Joined(Module):
-    """L(q, v, S) as a function of one array."""
-
-    function: Callable
-
-    def __call__(self, x):
-        n = len(x) // 2
-        return self.function(x[:n], x[n : 2 * n], x[2 * n])
-
-
 class _Linear(Module):
     """``-R v``."""
 
@@ -219,20 +229,19 @@ class _Linear(Module):
         return -(self.R @ v if self.R.ndim == 2 else self.R * v)
 
 
-def in_one_array(lagrangian):
-    if not callable(lagrangian) or isinstance(lagrangian, Energy):
-        return lagrangian
-    if needed_arguments(lagrangian) == 4:
+def lagrangian_of(lagrangian, space: mf.Space | None = None):
+    """A Lagrangian as a function of one array."""
+    if callable(lagrangian) and not isinstance(lagrangian, Energy) and needed_arguments(lagrangian) == 4:
         raise InputError(
             "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
         )
-    return _Joined(lagrangian) if needed_arguments(lagrangian) == 3 else lagrangian
+    return in_one_array(lagrangian, space)
 
 
-def _force(friction, n: int, what: str) -> Callable | None:
+def _force(friction, at: tuple[int, ...], what: str) -> Callable | None:
     if friction is None or callable(friction):
-        return None if friction is None else _field(friction, n, (n,), what)
-    R = jnp.asarray(friction, dtype=jnp.float64)
+        return None if friction is None else _field(friction, at, at, what)
+    R, n = jnp.asarray(friction, dtype=jnp.float64), math.prod(at)
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.shape not in ((n,), (n, n)):
         raise InputError(f"a coefficient of {what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
@@ -244,6 +253,18 @@ def _force(friction, n: int, what: str) -> Callable | None:
     return _Linear(R)
 
 
-def _field(function, n: int, shape: tuple[int, ...], what: str) -> Callable:
-    """As a function of (q, v, S, t), whose shape has been checked."""
-    return field(function, ((n,), (n,), ()), shape, what, f"(q, v, S), q and v of shape ({n},)")
+class _Flat(Module):
+    """A function of arrays q and v as one of their entries in a row."""
+
+    function: Callable
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, q, v, S, t):
+        found = jnp.asarray(self.function(q.reshape(self.shape), v.reshape(self.shape), S, t))
+        return found.ravel() if found.ndim else found
+
+
+def _field(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
+    """As a function of (q, v, S, t), whose shape has been checked; q and v of shape ``at``, and flat in the result."""
+    checked = field(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
+    return checked if len(at) == 1 else _Flat(checked, at)

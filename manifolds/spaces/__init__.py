@@ -12,6 +12,7 @@ from .product import Oblique, Power, Product
 from .spd import SPD
 from .sphere import Sphere
 from .stiefel import Stiefel
+from .tangent_bundle import TangentBundle
 
 __all__ = [
     "SPD",
@@ -32,5 +33,6 @@ __all__ = [
     "SpecialUnitary",
     "Sphere",
     "Stiefel",
+    "TangentBundle",
     "registered_spaces",
 ]

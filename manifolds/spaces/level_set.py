@@ -152,6 +152,9 @@ class LevelSet(Space):
         x = jax.lax.fori_loop(0, _NEWTON_STEPS, lambda _, y: y - self._normal(y, self._constraints(y)), x)
         return jnp.where(self._scale(self._residual(x) <= MEMBERSHIP_TOLERANCE, jnp.ones_like(x)) > 0, x, jnp.nan)
 
+    def _returned(self, x):
+        return x - self._normal(x, self._constraints(x))
+
     def _residual(self, x):
         away = jnp.abs(self._normal(x, self._constraints(x))).max(axis=self._axes)
         return away / jnp.maximum(jnp.abs(x).max(axis=self._axes), 1.0)

@@ -108,6 +108,9 @@ class Product(Space):
         pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
         return self.join(*(factor._from_normals(own) for factor, own in pairs))
 
+    def _returned(self, x):
+        return self._joined("_returned", x)
+
     def _project_tangent(self, x, w):
         return self._joined("_project_tangent", x, w)
 
@@ -298,6 +301,9 @@ class Power(Space):
 
     def _from_normals(self, w):
         return self.base._from_normals(w.reshape(*w.shape[:-1], self.count, -1))
+
+    def _returned(self, x):
+        return self.base._returned(x)
 
     def _project_tangent(self, x, w):
         return self.base._project_tangent(x, w)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -152,14 +152,63 @@ class ContactForm(ContactStructure):
         return jnp.asarray(self.function(x))
 
 
+class Bundle(Protocol):
+    """Positions on a manifold with their velocities or momenta: a :class:`manifolds.TangentBundle`."""
+
+    @property
+    def size(self) -> int: ...
+
+    def along(self, q, w) -> jax.Array: ...
+
+    def moving(self, x) -> tuple[jax.Array, jax.Array]: ...
+
+
+class Tangents(NamedTuple):
+    """The tangent vectors of a bundle at a point, and what covectors do along them.
+
+    Attributes
+    ----------
+    P : array, shape (n, n)
+        The projector along Q.
+    N : array, shape (n, n)
+        What takes v along with q: ``N q'`` is the part across Q of the velocity of v.
+    """
+
+    P: jax.Array
+    N: jax.Array
+
+    def lift(self, w) -> jax.Array:
+        """The tangent vector with the part of w along Q, its second part nearest to that of w; shape (2n + 1,)."""
+        n = len(self.P)
+        a = self.P @ w[:n]
+        return jnp.concatenate([a, self.P @ w[n : 2 * n] + self.N @ a, w[2 * n :]])
+
+    def lower(self, alpha) -> jax.Array:
+        """The transposed map: it forgets what of a covector acts on no tangent vector."""
+        n = len(self.P)
+        by_v = alpha[n : 2 * n]
+        return jnp.concatenate([self.P @ (alpha[:n] + by_v @ self.N), self.P @ by_v, alpha[2 * n :]])
+
+
 class SplitContact(ContactStructure):
     """A contact structure whose bivector is a Poisson bivector and a rest: ``Lambda = Lambda_0 + Delta ^ R`` [SML 6].
 
     The brackets are ``[f, g] = {f, g}_0 + {f, g}_Delta``: a reversible part, for which S is a Casimir function, and
     the thermodynamic one. Delta is the Liouville field ``p d/dp`` on T*Q x R [SML 2].
+
+    With a ``bundle``, the positions are those of a manifold Q in the arrays around it, and so are the momenta: all of
+    the structure is that of T*Q x R, or TQ x R. Its fields are tangent to it, near it to the level sets of its
+    constraints; and what a covector does across these counts for nothing.
+
+    Attributes
+    ----------
+    degrees_of_freedom : int
+        Components of q: more than the dimension of Q where it lies in arrays.
+    bundle : manifolds.TangentBundle, optional
     """
 
     degrees_of_freedom: int = eqx.field(static=True)
+    bundle: Bundle | None = eqx.field(static=True, kw_only=True, default=None)
 
     def __check_init__(self):
         if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
@@ -204,9 +253,24 @@ class SplitContact(ContactStructure):
         n = self.degrees_of_freedom
         return x[:n], x[n : 2 * n], x[2 * n :]
 
+    def bivector(self, x) -> jax.Array:
+        if self.bundle is None:
+            return super().bivector(x)
+        return jax.vmap(lambda alpha: self.bivector_sharp(x, alpha))(jnp.eye(self.dim))
+
+    # -- on a manifold ------------------------------------------------------------------------------------------------
+
+    def along(self, q, v) -> jax.Array:
+        """The part of a velocity, of a momentum or of a force at q that is along Q, shape (n,); itself on R^n."""
+        return v if self.bundle is None else self.bundle.along(q, v)
+
+    def tangents(self, x) -> Tangents | None:
+        """What makes vectors tangent at x, on a manifold."""
+        return None if self.bundle is None else Tangents(*self.bundle.moving(x[: 2 * self.degrees_of_freedom]))
+
 
 class CanonicalContact(SplitContact):
-    """``eta = dS - p dq`` on T*R^n x R, coordinates (q_1 … q_n, p_1 … p_n, S) [SML §2].
+    """``eta = dS - p dq`` on T*Q x R, coordinates (q_1 … q_n, p_1 … p_n, S) [SML §2].
 
     ``Lambda = d/dp ^ (d/dq + p d/dS)`` (4), and the evolution field of f is
     ``q' = f_p, p' = -f_q - p f_S, S' = p . f_p`` (7).
@@ -221,18 +285,19 @@ class CanonicalContact(SplitContact):
 
     def liouville(self, x) -> jax.Array:
         q, p, S = self._split(x)
-        return jnp.concatenate([jnp.zeros_like(q), p, jnp.zeros_like(S)])
+        return jnp.concatenate([jnp.zeros_like(q), self.along(q, p), jnp.zeros_like(S)])
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.bivector_sharp(x, alpha) + alpha[-1] * self.reeb(x)
 
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        del x  # Lambda_0 is constant
-        by_q, by_p, by_S = self._split(alpha)
-        return jnp.concatenate([by_p, -by_q, jnp.zeros_like(by_S)])
+        tangents = self.tangents(x)
+        by_q, by_p, by_S = self._split(alpha if tangents is None else tangents.lower(alpha))
+        motion = jnp.concatenate([by_p, -by_q, jnp.zeros_like(by_S)])
+        return motion if tangents is None else tangents.lift(motion)
 
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        p, (by_q, by_p, by_S) = self._split(x)[1], self._split(alpha)
+        p, (by_q, by_p, by_S) = self._split(self.liouville(x))[1], self._split(alpha)
         return jnp.concatenate([jnp.zeros_like(by_q), -p * by_S, jnp.dot(p, by_p)[None]])
 
 
@@ -245,16 +310,32 @@ class LagrangianContact(SplitContact):
     ----------
     lagrangian : function from (q, v, S) in one array, shape (2n + 1,), to a scalar
     degrees_of_freedom : int
+    bundle : manifolds.TangentBundle, optional
+        On a manifold Q, n being the number of components of its arrays.
     """
 
     lagrangian: Callable
 
-    def __init__(self, lagrangian: Callable, degrees_of_freedom: int):
-        self.lagrangian, self.degrees_of_freedom = lagrangian, degrees_of_freedom
+    def __init__(self, lagrangian: Callable, degrees_of_freedom: int, bundle: Bundle | None = None):
+        self.lagrangian, self.degrees_of_freedom, self.bundle = lagrangian, degrees_of_freedom, bundle
 
     def momentum(self, x) -> jax.Array:
-        """``p = L_v``, shape (n,)."""
-        return self._split(jax.grad(self.lagrangian)(x))[1]
+        """``p = L_v``, shape (n,), as a covector of Q."""
+        return self.along(self._split(x)[0], self._split(jax.grad(self.lagrangian)(x))[1])
+
+    def rates(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The derivatives of the momentum by q, v and S, shapes (n, n), (n, n) and (n, 1), along the manifold.
+
+        The second is the Hessian W, which on a manifold is made invertible: across Q it is a multiple of 1.
+        """
+        n, tangents = self.degrees_of_freedom, self.tangents(x)
+        rates = jax.jacfwd(self.momentum)(x)
+        by_q, W, by_S = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
+        if tangents is None:
+            return by_q, W, by_S
+        P, N = tangents
+        by_q, W = P @ (by_q + W @ N) @ P, P @ W @ P
+        return by_q, W + jnp.max(jnp.abs(W)) * (jnp.eye(n) - P), P @ by_S
 
     def legendre(self, x) -> jax.Array:
         """The Legendre transform ``FL(q, v, S) = (q, p, S)``, shape (dim,)."""
@@ -262,9 +343,8 @@ class LagrangianContact(SplitContact):
         return jnp.concatenate([q, self.momentum(x), S])
 
     def hessian(self, x) -> jax.Array:
-        """``W = L_vv``, shape (n, n) [SML 8]."""
-        n = self.degrees_of_freedom
-        return jax.jacfwd(self.momentum)(x)[:, n : 2 * n]
+        """``W = L_vv``, shape (n, n) [SML 8]; as :meth:`rates` has it on a manifold."""
+        return self.rates(x)[1]
 
     def energy(self, x) -> jax.Array:
         """``E_L = v·L_v - L``, shape ()."""
@@ -293,25 +373,24 @@ class LagrangianContact(SplitContact):
 
     @property
     def _canonical(self) -> CanonicalContact:
-        return CanonicalContact(self.degrees_of_freedom)
+        return CanonicalContact(self.degrees_of_freedom, bundle=self.bundle)
 
     def _pulled_back(self, x, sharp: Callable, alpha) -> jax.Array:
         """``TFL^-1 sharp(FL(x), TFL^-T alpha)``: with p = L_v, ``dp = L_vq dq + W dv + L_vS dS``."""
-        n = self.degrees_of_freedom
-        rates = jax.jacfwd(self.momentum)(x)
-        by_q, W, by_S = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
-        alpha_q, alpha_v, alpha_S = self._split(alpha)
+        (by_q, W, by_S), tangents = self.rates(x), self.tangents(x)
+        alpha_q, alpha_v, alpha_S = self._split(alpha if tangents is None else tangents.lower(alpha))
         beta_p = solve(W, alpha_v[:, None])[:, 0]  # W is symmetric
         beta = jnp.concatenate([alpha_q - beta_p @ by_q, beta_p, alpha_S - beta_p @ by_S])
         q_dot, p_dot, S_dot = self._split(sharp(self.legendre(x), beta))
         v_dot = solve(W, (p_dot - by_q @ q_dot - by_S @ S_dot)[:, None])[:, 0]
-        return jnp.concatenate([q_dot, v_dot, S_dot])
+        motion = jnp.concatenate([q_dot, v_dot, S_dot])
+        return motion if tangents is None else tangents.lift(motion)
 
 
 class Cosymplectic(PoissonStructure):
     """The Poisson structure Lambda_0 of a split contact structure: S is a Casimir function [SML §2.1].
 
-    On T*R^n x R it is the canonical one, ``q' = H_p, p' = -H_q, S' = 0``.
+    On T*R^n x R it is the canonical one, ``q' = H_p, p' = -H_q, S' = 0``; on T*Q x R that of T*Q.
     """
 
     contact: SplitContact

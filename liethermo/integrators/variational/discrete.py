@@ -16,10 +16,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+import manifolds as mf
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
+from ...functions.surface import OnLevels
 from ...systems import SimpleClosedSystem
 
 
@@ -28,7 +30,8 @@ class FiniteDifference(Module):
 
         phi(q_0, q_1, S_0, S_1) = ((1 - alpha) q_0 + alpha q_1, V; (1 - beta) S_0 + beta S_1, s)
 
-    Forces act where q is represented, ``F^-_d = h (1 - alpha) F`` and ``F^+_d = h alpha F``.
+    Forces act where q is represented, ``F^-_d = h (1 - alpha) F`` and ``F^+_d = h alpha F``. On a manifold q moves from
+    q_0 to q_1 on a curve, :class:`Curve`, of which alpha is the parameter.
 
     A subclass may represent a pair otherwise: it gives :meth:`position`, :meth:`velocity` or :meth:`entropy`, with
     ``phi(q, q, S, S) = (q, 0; S, 0)``, and says whether it ``is_symmetric`` under exchange of the two points.
@@ -67,14 +70,6 @@ class FiniteDifference(Module):
         """The entropy between two; a time between two is found in the same way."""
         return S0 + (self.beta * h) * s
 
-    def ends(self, q0, V, h, F) -> tuple[jax.Array, jax.Array]:
-        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q·F``, ``D_2 q·F``."""
-        if type(self).position is FiniteDifference.position:
-            return (1.0 - self.alpha) * F, self.alpha * F
-        _, back = jax.vjp(lambda q0, V: self.position(q0, V, h), q0, V)
-        both, second = back(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
-        return both - second / h, second / h
-
     def mirrored(self) -> FiniteDifference | None:
         """The map that represents (q_1, q_0, S_1, S_0) backward in time as this one does (q_0, …); None if unknown."""
         if type(self) is not FiniteDifference:
@@ -85,6 +80,38 @@ class FiniteDifference(Module):
     def is_symmetric(self) -> bool:
         """Whether it represents (q_1, q_0, S_1, S_0) backward in time as it does (q_0, q_1, S_0, S_1)."""
         return type(self) is FiniteDifference and self.alpha == self.beta == 0.5
+
+
+class Curve(Module):
+    """A curve on a space from q_0 to q_1, at the parameters 0 to 1: what finite difference maps are made of there.
+
+    The chord in the arrays around, brought to the space by Newton's method: as symmetric as a chord. Or, with a chart,
+    that which the chart makes of a straight line, ``point(q_0, alpha vector(q_0, q_1))``: of the Riemannian one the
+    geodesic.
+    """
+
+    space: mf.Space = eqx.field(static=True)
+    chart: mf.Chart | None = eqx.field(static=True, default=None)
+
+    def represented(self, alpha: float, q0, V, h) -> tuple[jax.Array, jax.Array]:
+        """The point of the curve and its velocity there, from ``V = (q_1 - q_0) / h``; shape (n,) each."""
+        vector, point = self.space.to_vector, self.space.from_vector
+        if self.chart is None:
+            return jax.jvp(self._returned, (q0 + (alpha * h) * V,), (V,))
+        start, chart = point(q0), self.chart
+        w = chart._vector(start, point(q0 + h * V))
+        q, v = jax.jvp(lambda a: chart._point(start, a * w), (jnp.asarray(alpha),), (1.0 / h,))
+        return vector(q), vector(v)
+
+    def _returned(self, q) -> jax.Array:
+        point = self.space.from_vector(q)
+        for _ in range(RETURNS):
+            point = self.space._returned(point)
+        return self.space.to_vector(point)
+
+
+RETURNS = 3
+"""Steps of Newton's method from a chord to the space: each squares the distance, relative to the curvature."""
 
 
 class Point(NamedTuple):
@@ -116,6 +143,8 @@ class DiscreteSystem(Module):
     lagrangian_maps, force_maps, constraint_maps : tuple of FiniteDifference
     h : step (time)
     t : time at its start
+    curve : Curve, optional
+        On a manifold.
     """
 
     system: SimpleClosedSystem
@@ -124,15 +153,29 @@ class DiscreteSystem(Module):
     constraint_maps: tuple[FiniteDifference, ...]
     h: jax.Array
     t: jax.Array
+    curve: Curve | None = None
 
     # -- in difference quotients, per unit of time ------------------------------------------------------------------
 
     def _points(self, maps, pair: Pair) -> Iterator[Point]:
         total = sum(map.weight for map in maps)
         for map in maps:
-            q, v = map.position(pair.q0, pair.V, self.h), map.velocity(pair.q0, pair.V, self.h)
+            q, v = self._represented(map, pair.q0, pair.V)
             S, t = map.entropy(pair.S0, pair.s, self.h), map.entropy(self.t, 1.0, self.h)
             yield Point(map, map.weight / total, q, v, S, t)
+
+    def _represented(self, map: FiniteDifference, q0, V) -> tuple[jax.Array, jax.Array]:
+        if self.curve is None:
+            return map.position(q0, V, self.h), map.velocity(q0, V, self.h)
+        return self.curve.represented(map.alpha, q0, V, self.h)
+
+    def _ends(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
+        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q·F``, ``D_2 q·F``."""
+        if self.curve is None and type(map).position is FiniteDifference.position:
+            return (1.0 - map.alpha) * F, map.alpha * F
+        _, back = jax.vjp(lambda q0, V: self._represented(map, q0, V)[0], pair.q0, pair.V)
+        both, second = back(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
+        return both - second / self.h, second / self.h
 
     def action(self, q0, V, S0, s) -> jax.Array:
         """``L_d / h``."""
@@ -146,19 +189,32 @@ class DiscreteSystem(Module):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
-            at_first, at_second = p.map.ends(pair.q0, pair.V, self.h, p.part * F)
+            at_first, at_second = self._ends(p.map, pair, p.part * F)
             first, second = first + at_first, second + at_second
         return first, second
 
-    def motion(self, p0, pair: Pair) -> jax.Array:
-        """Misfit of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the step before, shape (n,)."""
+    def misfit(self, p0, pair: Pair) -> jax.Array:
+        """That of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the step before, shape (n,)."""
         by_q, by_V = jax.grad(self.action, argnums=(0, 1))(*pair)
         return p0 - by_V + self.h * (by_q + self.impulses(pair)[0])
 
-    def force(self, pair: Pair) -> jax.Array:
-        """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,)."""
+    def motion(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
+        """What has to vanish, shape (n,): the misfit; on a manifold its part along Q, and how far q_1 is off Q.
+
+        The latter is multiplied by a ``mass`` of the size of L_vv, so that all of it is momentum.
+        """
+        missed = self.misfit(p0, pair)
+        if self.curve is None:
+            return missed
+        surface = OnLevels(self.curve.space, tangent=True)
+        off = surface._change(pair.q0, 0.0, self.h * pair.V) / self.h
+        return self.system.along(pair.q0, missed) + mass * surface._moved(pair.q0, off)
+
+    def force(self, p0, pair: Pair) -> jax.Array:
+        """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
         first, second = self.impulses(pair)
-        return jax.grad(self.action)(*pair) + (first + second)
+        force = jax.grad(self.action)(*pair) + (first + second)
+        return force if self.curve is None else force - self.misfit(p0, pair) / self.h
 
     def production(self, pair: Pair) -> jax.Array:
         """``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN where a temperature is not positive [GBY 3.9]."""
@@ -203,7 +259,8 @@ class DiscreteSystem(Module):
         """p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
         by_first, by_second = jax.grad(self.lagrangian, argnums=(0, 1))(q0, q1, S0, S1)
         first, second = self.forces(q0, q1, S0, S1)
-        return -by_first - first, by_second + second
+        along = self.system.along
+        return along(q0, -by_first - first), along(q1, by_second + second)
 
     def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
         """The matrix (3.13), shape (n + 1, n + 1): where it is invertible the step from q_1, S_1 is determined."""

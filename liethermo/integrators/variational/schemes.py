@@ -6,18 +6,23 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
-from ...systems import ComposedSystem, SimpleClosedSystem, System
+from ...functions.gradients import compensated
+from ...functions.surface import OnLevels
+from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
 from ...tracing.interpret import polynomial_degree
 from ...tracing.programs import program
 from ..base import ONE_SIZE, OneStepMethod, register
-from .discrete import DiscreteSystem, FiniteDifference, Pair
+from .composed import OnBodies
+from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
 
 CONSTRAINT_TOLERANCE = 1e-10
 """Largest misfit of a given first step, relative to the heat ``T |S_1 - S_0|`` and the work that make it up."""
@@ -49,13 +54,20 @@ class VariationalIntegrator(OneStepMethod):
     the size of (q, S) a step, solved by Newton's method with the matrix (3.13); where the motion does not depend on
     S_k+1 and is affine in q_k+1 it is solved outright.
 
-    It runs a :class:`liethermo.ComposedSystem` too, of several entropies, by one finite difference map (schemes 1, 2
-    and their alpha family): with ``p_k = -D_1 L_d - F^-_d`` the equations are, in the variables (q, p, S),
+    On a manifold Q the maps look at a curve from q_k to q_k+1, at its parameter alpha, for the position and the
+    velocity. It is the chord in the arrays around, brought to Q; or with ``retraction`` the curve that this makes, such
+    as the geodesic of ``"exp"``, whose difference quotients are logarithms. Equation (3.12) holds along Q, and q_k+1 is
+    a point of it to rounding. The order is that on R^n, but 1 with a chart whose lines are not the same seen from both
+    ends ("cayley", "projection").
 
-        (q_k+1 - q_k)/h = H_p,  (p_k+1 - p_k)/h = -H_q + F,  T_a (S_a,k+1 - S_a,k)/h = the heat that body a receives,
+    It runs a :class:`liethermo.ComposedSystem` too, of several entropies: with ``p_k = -D_1 L_d - F^-_d`` the equations
+    are, in the variables (q, p, S) and at the points (q_i, P_i, S_i) of the maps, each with a momentum of its own,
 
-    all at ``((1 - alpha) q_k + alpha q_k+1, alpha p_k + (1 - alpha) p_k+1, (1 - beta) S_k + beta S_k+1)``. The sum of
-    the entropies falls at no step, for every energy, friction and conductance.
+        (q_k+1 - q_k)/h = H_p(q_i, P_i, S_i) for each i,   sum w_i (P_i - h (1 - alpha_i) (-H_q + F)_i) = p_k,
+        (p_k+1 - p_k)/h = sum w_i (-H_q + F)_i,   T_a (S_a,k+1 - S_a,k)/h = sum w_i (the heat that body a receives)_i,
+
+    with ``T_a = sum w_i H_S_a``, where friction and heat are made of these temperatures too. The sum of the entropies
+    falls at no step, for every energy, friction and conductance.
 
     Parameters
     ----------
@@ -63,6 +75,8 @@ class VariationalIntegrator(OneStepMethod):
         For the discrete Lagrangian.
     forces, constraint : likewise, optional
         For the forces and the constraint, where they are chosen separately [GBY Remark 3.5]; phi by default.
+    retraction : str or manifolds.Retraction, optional
+        On a manifold, of which the curves are made: :func:`manifolds.retraction` names them. Chords by default.
     """
 
     systems = "simple closed and composed systems"
@@ -71,26 +85,34 @@ class VariationalIntegrator(OneStepMethod):
     phi: tuple[FiniteDifference, ...]
     forces: tuple[FiniteDifference, ...]
     constraint: tuple[FiniteDifference, ...]
+    retraction: str | mf.Retraction | None = eqx.field(static=True)
 
-    def __init__(self, phi: Maps, forces: Maps | None = None, constraint: Maps | None = None):
+    def __init__(
+        self,
+        phi: Maps,
+        forces: Maps | None = None,
+        constraint: Maps | None = None,
+        retraction: str | mf.Retraction | None = None,
+    ):
         self.phi = _maps(phi, "phi")
         self.forces = self.phi if forces is None else _maps(forces, "the maps of the forces")
         self.constraint = self.phi if constraint is None else _maps(constraint, "the maps of the constraint")
+        self.retraction = retraction
 
     @classmethod
-    def verlet(cls) -> VariationalIntegrator:
+    def verlet(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Scheme 1: everything at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction."""
-        return cls("verlet")
+        return cls("verlet", retraction=retraction)
 
     @classmethod
-    def midpoint(cls, alpha: float = 0.5) -> VariationalIntegrator:
+    def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Scheme 2: everything at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 1 but for alpha = 1/2."""
-        return cls(FiniteDifference(alpha))
+        return cls(FiniteDifference(alpha), retraction=retraction)
 
     @classmethod
-    def symmetrised(cls) -> VariationalIntegrator:
+    def symmetrised(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Scheme 3: the mean of both ends; order 2."""
-        return cls("symmetrised")
+        return cls("symmetrised", retraction=retraction)
 
     @property
     def stages(self) -> int:
@@ -98,7 +120,16 @@ class VariationalIntegrator(OneStepMethod):
 
     @property
     def order(self) -> int:
-        return 2 if all(map(_is_symmetric, (self.phi, self.forces, self.constraint))) else 1
+        return 2 if all(map(_is_symmetric, (self.phi, self.forces, self.constraint))) and self._is_symmetric else 1
+
+    @property
+    def _is_symmetric(self) -> bool:
+        """Whether curves on a manifold are the same seen from both ends."""
+        return self.retraction in SYMMETRIC or isinstance(self.retraction, LINES)
+
+    @property
+    def in_charts(self) -> bool:
+        return False
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -112,53 +143,76 @@ class VariationalIntegrator(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a variational principle of this kind."""
-        if not isinstance(system, ComposedSystem):
+        if isinstance(system, EmbeddedSystem) and isinstance(system.manifold, SimpleClosedSystem):
+            if any(type(map) is not FiniteDifference for map in (*self.phi, *self.forces, *self.constraint)):
+                raise InputError(
+                    "on a manifold a finite difference map looks at a curve of the space: give an lt.FiniteDifference "
+                    "and a retraction, no subclass of it"
+                )
+            self.curve(system.manifold)
+        elif self.retraction is not None:
+            raise InputError(f"a {system.kind} without a manifold of positions takes no retraction: leave it out")
+        elif isinstance(system, ComposedSystem):
+            self._check_bodies(system)
+        else:
             need_simple_closed(system, "VariationalIntegrator")
-        elif not (len(self.phi) == 1 and type(self.phi[0]) is FiniteDifference and self._maps_are_one):
+
+    def _check_bodies(self, system: ComposedSystem) -> None:
+        if not (self.phi == self.forces == self.constraint):
+            raise InputError(f"{self} has other maps for forces or the constraint: for several bodies all are phi")
+        if any(type(map) is not FiniteDifference for map in self.phi):
+            raise InputError(f"{self} has finite difference maps of its own: several bodies take lt.FiniteDifference")
+        if len(self.phi) > 1 and system.poisson.species:
             raise InputError(
-                f"{self} takes means over several finite difference maps, and composed systems run by one: take "
-                "lt.VariationalIntegrator.midpoint() or .verlet()"
+                f"{self} takes means over several finite difference maps, and bodies that exchange particles run by "
+                "one: take lt.VariationalIntegrator.midpoint() or .verlet()"
             )
 
-    @property
-    def _maps_are_one(self) -> bool:
-        return self.phi == self.forces == self.constraint
+    def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
+        return OnBodies(self, self.phi) if isinstance(system, ComposedSystem) and self.retraction is None else self
 
     def discrete(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
         """L_d, F_d and P_d of a step of size h from the time t on."""
-        return DiscreteSystem(system, self.phi, self.forces, self.constraint, jnp.asarray(h), jnp.asarray(t))
+        curve = self.curve(system)
+        return DiscreteSystem(system, self.phi, self.forces, self.constraint, jnp.asarray(h), jnp.asarray(t), curve)
+
+    def curve(self, system: SimpleClosedSystem) -> Curve | None:
+        """What the maps look at on a manifold; None on R^n."""
+        space, kind = system.configurations, self.retraction
+        if space is None or kind is None:
+            return None if space is None else Curve(space)
+        found = mf.retraction(space, kind) if isinstance(kind, str) else kind
+        if found.space != space:
+            raise InputError(f"the retraction is one of {found.space.name}, and the positions are in {space.name}")
+        return Curve(space, found.chart)
 
     # -- the step ---------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        if isinstance(system, ComposedSystem):
-            return system.vector_field(x + (compensation + h * self._share(system) * k[0]))[None]
+        system = system.manifold if isinstance(system, EmbeddedSystem) else system
         assert isinstance(system, SimpleClosedSystem)
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.parts(x + compensation)
         discrete, p0 = self.discrete(system, h, t), system.momentum(q0, v0, S0)
-        V, s = _solved(discrete, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
+        V, s = _solved(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
         v_dot = velocity_slope(
-            system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.force(pair), h
+            system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.force(p0, pair), h
         )
         ledger = jnp.stack([*discrete.received(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
         return jnp.concatenate([V, v_dot, s[None], ledger])[None]
 
-    def _share(self, system: ComposedSystem) -> np.ndarray:
-        """How far on its way each component of a composed system is looked at."""
-        (map,), (q, p, _, _) = self.phi, system.poisson.places
-        share = np.full(system.dim, map.beta)
-        share[q], share[p] = map.alpha, 1.0 - map.alpha
-        return share
-
     def linearised(self, system: System, x, compensation, h, k) -> Callable:
-        if isinstance(system, ComposedSystem):
-            return super().linearised(system, x, compensation, h, k)
         return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]
+
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
+        if system.surface is None:
+            return super().move(system, x, compensation, h, k)
+        d = self.increment(h, k)  # which ends on the surface by itself
+        return system.surface.settled(*compensated(x, compensation + d))
 
     # -- starts and records -------------------------------------------------------------------------------------------
 
@@ -182,6 +236,9 @@ class VariationalIntegrator(OneStepMethod):
             momentum.
         """
         need_simple_closed(system, "VariationalIntegrator")
+        space = system.configurations
+        if space is not None:
+            q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
         q0, q1 = (jnp.atleast_1d(jnp.asarray(q, dtype=jnp.float64)) for q in (q0, q1))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
             raise InputError(f"q0 and q1 have shape ({system.degrees_of_freedom},), not {q0.shape} and {q1.shape}")
@@ -222,7 +279,7 @@ class VariationalIntegrator(OneStepMethod):
         return np.asarray(_energies(self, system, jnp.asarray(h), x[:-1], x[1:]))
 
     def explain(self, system: System, x, k, h) -> str:
-        if not isinstance(system, SimpleClosedSystem):
+        if not isinstance(system, SimpleClosedSystem) or system.configurations is not None:
             return ""
         n = system.degrees_of_freedom
         q0, _, S0, t = system.parts(jnp.asarray(x))
@@ -243,10 +300,11 @@ class VariationalIntegrator(OneStepMethod):
 # -- the step equations -----------------------------------------------------------------------------------------------
 
 
-def _solved(discrete: DiscreteSystem, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
+def _solved(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
     """V and s after one step of Newton's method for (3.12), from a guess or, where that is exact, from nothing."""
     n, (q0, V, S0, s) = len(guess.V), guess
-    outright = (
+    mass = size_of_mass(discrete.system, q0, v0, S0)
+    outright = discrete.curve is None and (
         polynomial_degree(_motion_by_V, (discrete, p0, guess), n) <= 1
         and polynomial_degree(_motion_by_s, (discrete, p0, guess), 1) == 0
     )
@@ -254,7 +312,11 @@ def _solved(discrete: DiscreteSystem, p0, guess: Pair) -> tuple[jax.Array, jax.A
         A, misfit = _with_jacobian(lambda V: discrete.motion(p0, Pair(q0, V, S0, jnp.zeros(()))), jnp.zeros(n))
         V = -solve(A, misfit[:, None])[:, 0]
     else:  # (3.15), s eliminated
-        both = lambda V, s: (discrete.motion(p0, Pair(q0, V, S0, s)), discrete.production(Pair(q0, V, S0, s)))  # noqa: E731
+
+        def both(V, s):
+            pair = Pair(q0, V, S0, s)
+            return discrete.motion(p0, pair, mass), discrete.production(pair)
+
         ((A, B), (C, D)), (misfit, gain) = _with_jacobian(both, V, s)
         V = V - solve(A - jnp.outer(B, C) / D, (misfit - B * (gain / D))[:, None])[:, 0]
     s = jnp.zeros(()) if polynomial_degree(_production_by_s, (discrete, p0, guess), 1) <= 1 else s
@@ -297,7 +359,28 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
     affine = polynomial_degree(_momentum_by_v, (system, q1, S1), len(v0)) <= 1
     slope = jnp.zeros_like(v0) if affine else slope
     W, p = _with_jacobian(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
-    return slope - solve(W, ((p - p0) / h - force)[:, None])[:, 0]
+    W, missed = _with_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
+    return slope - solve(W, missed[:, None])[:, 0]
+
+
+def _with_tangents(system: SimpleClosedSystem, q, v, W, missed, h=1.0) -> tuple[jax.Array, jax.Array]:
+    """The matrix and the misfit, over h, of an equation for a momentum at v; on a manifold along Q, and v tangent."""
+    space = system.configurations
+    if space is None:
+        return W, missed
+    surface, mass = OnLevels(space, tangent=True), jnp.max(jnp.abs(W))
+
+    def across(w):
+        return surface._moved(q, jax.jvp(space._constraints, (space.from_vector(q),), (space.from_vector(w),))[1])
+
+    along = jax.vmap(lambda w: system.along(q, w), in_axes=1, out_axes=1)
+    W = along(W) + mass * jax.vmap(across, out_axes=1)(jnp.eye(len(v)))
+    return W, system.along(q, missed) + mass / h * across(v)
+
+
+def size_of_mass(system: SimpleClosedSystem, q, v, S) -> jax.Array:
+    """The size of ``L_vv``."""
+    return jnp.max(jnp.abs(jax.jacfwd(system.momentum, argnums=1)(q, v, S)))
 
 
 def _momentum_by_v(model, v):
@@ -308,7 +391,14 @@ def _momentum_by_v(model, v):
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
+SYMMETRIC = (None, "exp", "midpoint", "euclidean", "midpoint_euclidean", "group_exp", "midpoint_group_exp")
+LINES = (mf.RiemannianRetraction, mf.EuclideanRetraction, mf.GroupRetraction, mf.MidpointRetraction)
+"""Retractions of which a line through two points is the same in the charts around both."""
+
+
 def need_simple_closed(system: System, name: str) -> None:
+    if isinstance(system, EmbeddedSystem):
+        raise InputError(f"{name} runs on R^n: on a manifold take lt.VariationalIntegrator or a metriplectic method")
     if not isinstance(system, SimpleClosedSystem):
         raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {system.kind}")
 
@@ -351,10 +441,11 @@ def _velocity(system: SimpleClosedSystem, q, S, p, v):
 
     def newton(_, v):
         W, found = _with_jacobian(lambda v: system.momentum(q, v, S), v)
-        return v - solve(W, (found - p)[:, None])[:, 0]
+        W, missed = _with_tangents(system, q, v, W, found - p)
+        return v - solve(W, missed[:, None])[:, 0]
 
     v = jax.lax.fori_loop(0, 20, newton, v)
-    defect = jnp.max(jnp.abs(system.momentum(q, v, S) - p))
+    defect = jnp.max(jnp.abs(system.along(q, system.momentum(q, v, S) - p)))
     return jnp.where(defect <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
 
 

@@ -392,11 +392,13 @@ def piston():
         (lt.VariationalIntegrator.midpoint(), 2.0),
         (lt.VariationalIntegrator.verlet(), 1.0),
         (lt.VariationalIntegrator.midpoint(0.3), 1.0),
+        (lt.VariationalIntegrator.symmetrised(), 2.0),
+        (lt.VariationalIntegrator([lt.FiniteDifference(0.2), lt.FiniteDifference(0.9)]), 1.0),
     ],
     ids=str,
 )
 def test_variational_integrators_of_several_entropies(method, order):
-    """Scheme 2 is stationary for its discrete action, by difference quotients of that; orders; no entropy falls."""
+    """The schemes are stationary for their discrete action, by difference quotients; orders; no entropy falls."""
     system, x0 = piston(), np.array([0.1, -0.2, 0.2, 0.5, 0.3])
     exact = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticGauss(4)).x[-1]
     runs = [lt.integrate(system, x0, (0.0, 1.0), h, method) for h in (0.02, 0.01)]
@@ -406,21 +408,50 @@ def test_variational_integrators_of_several_entropies(method, order):
     assert np.ptp(runs[0].energy) > 1e-7  # the energy is what the metriplectic schemes keep
 
     # (3.12) of three nodes, L_d and the forces by hand
-    alpha, h, (first, middle, last) = method.phi[0].alpha, 0.02, runs[0].x[:3]
+    shares, h, (first, middle, last) = [map.alpha for map in method.phi], 0.02, runs[0].x[:3]
     U = lambda q, S: float(  # noqa: E731
         np.exp(S[0]) * (1 + q) ** (-2 / 3) + np.exp(S[1]) * (1 - q) ** (-2 / 3) + 0.01 * np.exp(S[2])
     )
 
     def action(q0, q1, a, b):  # the entropies are those of the nodes a, b
-        S = (1 - alpha) * a[[0, 1, 4]] + alpha * b[[0, 1, 4]]
-        return h * (0.5 * ((q1 - q0) / h) ** 2 - U((1 - alpha) * q0 + alpha * q1, S))
+        potentials = [
+            U((1 - alpha) * q0 + alpha * q1, (1 - alpha) * a[[0, 1, 4]] + alpha * b[[0, 1, 4]]) for alpha in shares
+        ]
+        return h * (0.5 * ((q1 - q0) / h) ** 2 - np.mean(potentials))
 
     q, e = [x[2] for x in (first, middle, last)], 1e-5
     by_middle = action(q[0], q[1] + e, first, middle) - action(q[0], q[1] - e, first, middle)
     by_middle += action(q[1] + e, q[2], middle, last) - action(q[1] - e, q[2], middle, last)
-    friction = -0.2 * (alpha * (q[1] - q[0]) + (1 - alpha) * (q[2] - q[1]))
+    friction = -0.2 * np.mean([alpha * (q[1] - q[0]) + (1 - alpha) * (q[2] - q[1]) for alpha in shares])
     assert abs(by_middle / (2 * e) + friction) < 1e-9
     assert abs(friction) > 1e-5
+
+
+def test_means_over_maps_where_the_mass_depends_on_the_position():
+    """Scheme 3 gives each map a momentum of its own: order 2 against a Gauss method, and the same step by SciPy."""
+    metric = lambda q: jnp.array([1.0 + 0.5 * q[0] ** 2])  # noqa: E731
+    body = lt.Subsystem(
+        lt.Kinetic(metric) + lt.Potential(lambda q, S: 0.5 * q[0] ** 2 + jnp.exp(S)), 3, friction=0.3, name="body"
+    )
+    room = lt.Subsystem(lambda x: 2.0 * jnp.exp(x[0] / 2.0), 1, name="room")
+    system, x0 = lt.ComposedSystem([body, room], conductance=0.4), np.array([0.8, 0.3, 0.1, -0.4])
+    method = lt.VariationalIntegrator.symmetrised()
+    exact = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticGauss(4)).x[-1]
+    runs = [lt.integrate(system, x0, (0.0, 1.0), h, method) for h in (0.04, 0.02)]
+    errors = [np.abs(run.x[-1] - exact).max() for run in runs]
+    assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.15, errors
+    assert np.diff(runs[0].entropy).min() > 0.0
+
+    # L = v^2 / (2 G(q)) - V: the momentum between two steps is D_2 L_d of the one and -D_1 L_d of the other
+    h, (q0, q1) = 0.04, runs[0].x[:2, 0]
+    mass, slope = lambda q: 1.0 / (1.0 + 0.5 * q * q), lambda q: -q / (1.0 + 0.5 * q * q) ** 2
+    v = (q1 - q0) / h
+    p0 = 0.5 * v * (mass(q0) + mass(q1)) - 0.5 * h * (0.5 * slope(q0) * v * v - q0 - 0.3 * v)
+    assert abs(p0 - x0[1]) < 1e-13
+    with pytest.raises(lt.InputError, match=r"exchange particles run by one: take"):
+        lt.integrate(lt.models.porous_piston(), np.ones(7), (0.0, 1.0), 0.1, method)
+    with pytest.raises(lt.InputError, match="for several bodies all are phi"):
+        lt.integrate(system, x0, (0.0, 1.0), 0.1, lt.VariationalIntegrator("midpoint", forces="verlet"))
 
 
 @pytest.mark.slow

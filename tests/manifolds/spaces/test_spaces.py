@@ -59,6 +59,7 @@ SLOW = (
     "SL(2)",
     "Corr(3)",
     "Fl(1, 1, 2)",
+    "T S^2",
 )
 """Spaces whose whole suite is left to the slow tests: together they compile for more than a minute."""
 
@@ -300,6 +301,7 @@ WITHOUT_TWIN = {
     "SL(2)": "likewise",
     "Fl(1, 1, 2)": "geomstats has no flags: see test_homogeneous for what has other names",
     "level set": "geomstats has none of one's own: see test_level_set for a sphere as one",
+    "T S^2": "it stands for phase spaces: see test_configurations for the motions on them",
 }
 
 

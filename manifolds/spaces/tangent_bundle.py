@@ -1,0 +1,130 @@
+"""The tangent bundle of a state space: positions with their velocities, or with their momenta."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from ..errors import SpaceError
+from ..matrices.linear import solve_near_identity
+from .base import Space, random_key, register
+from .sphere import Sphere
+
+
+@register((Sphere(2),))
+@jax.tree_util.register_static
+@dataclass(frozen=True, repr=False)
+class TangentBundle(Space):
+    """Pairs (q, v) of a point of a space and a tangent vector there, shape ``(2, *base.shape)``.
+
+    It stands for the cotangent bundle too: a covector p at q is paired with tangent vectors by ``sum(p * v)``, and of
+    all arrays that do the same the one that is tangent itself is taken. In these arrays the form ``p dq`` is the
+    canonical one of T*Q. The metric is that of the arrays around.
+
+    Parameters
+    ----------
+    base : Space
+        Of real arrays.
+    """
+
+    base: Space
+
+    def __post_init__(self):
+        if not isinstance(self.base, Space):
+            raise SpaceError(f"a tangent bundle is that of a state space, not of {type(self.base).__name__}")
+        if self.base.dtype.kind == "c":
+            raise SpaceError(f"a tangent bundle is that of a space of real arrays, and {self.base.name} is complex")
+
+    @property
+    def name(self):
+        return f"T {self.base.name}"
+
+    @property
+    def dim(self):
+        return 2 * self.base.dim
+
+    @property
+    def shape(self):
+        return (2, *self.base.shape)
+
+    @property
+    def surrounded(self):
+        return self.base.surrounded
+
+    @property
+    def smooth(self):  # type: ignore[override]
+        return self.base.smooth
+
+    @property
+    def _has_equations(self):
+        return self.base._has_equations
+
+    def along(self, q, w) -> jax.Array:
+        """The part along Q of an array w at a point q of it, both in one row, shape (n,), with n their entries."""
+        base = self.base
+        return base.to_vector(base._along(base.from_vector(q), base.from_vector(w)))
+
+    def moving(self, x) -> tuple[jax.Array, jax.Array]:
+        """How the point (q, v), in one row, can move: the matrices P and N, shape (n, n).
+
+        P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the part of v' across Q that
+        takes it along. So tangent vectors are the ``(P a, P b + N P a)``.
+        """
+        base, (q, v) = self.base, self._parts(self.from_vector(x))
+        tilts = jax.jacfwd(lambda y: self._tilt(base.from_vector(y), v))(base.to_vector(q))
+        if not self._has_equations:
+            P = jax.vmap(lambda w: self.along(x[: base.size], w), out_axes=1)(jnp.eye(base.size))
+            return P, -tilts
+        rows = base._rows(q)
+        raised = solve_near_identity(rows @ rows.T, rows).T
+        return jnp.eye(base.size) - raised @ rows, -raised @ tilts
+
+    # -- maps ---------------------------------------------------------------------------------------------------------
+
+    def _tilt(self, q, v):
+        """What v has across the space, shape (..., m): the rates of the constraints of Q along it."""
+        if self._has_equations:
+            return jax.jvp(self.base._constraints, (q,), (v,))[1]
+        return self.base.to_vector(v - self.base._along(q, v))
+
+    def _constraints(self, x):
+        q, v = self._parts(x)
+        return jnp.concatenate([self.base._constraints(q), self._tilt(q, v)], axis=-1)
+
+    def _normal(self, x, c):
+        if self._has_equations:
+            return super()._normal(x, c)
+        return self.from_vector(c)
+
+    def _inside(self, x):
+        return self.base._inside(self._parts(x)[0])
+
+    def _project(self, x):
+        q, v = self._parts(x)
+        q = self.base._project(q)
+        return self._pair_of(q, self.base._project_tangent(q, v))
+
+    def _random(self, key, size):
+        at, along = jax.random.split(random_key(key))
+        q = self.base._random(at, size)
+        return self._pair_of(q, self.base._project_tangent(q, jax.random.normal(along, q.shape)))
+
+    def _project_tangent(self, x, w):
+        return self._along(x, w) if self._has_equations else super()._project_tangent(x, w)
+
+    def _sharp(self, x, alpha):
+        return self._project_tangent(x, alpha)
+
+    def _flat(self, x, v):
+        return v + jnp.zeros_like(x)
+
+    # -- helpers ------------------------------------------------------------------------------------------------------
+
+    def _parts(self, x):
+        axis = -1 - len(self.base.shape)
+        return tuple(jnp.take(x, i, axis=axis) for i in (0, 1))
+
+    def _pair_of(self, q, v):
+        return jnp.stack(jnp.broadcast_arrays(q, v), axis=-1 - len(self.base.shape))
