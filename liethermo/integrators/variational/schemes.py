@@ -60,14 +60,12 @@ class VariationalIntegrator(OneStepMethod):
     a point of it to rounding. The order is that on R^n, but 1 with a chart whose lines are not the same seen from both
     ends ("cayley", "projection").
 
-    It runs a :class:`liethermo.ComposedSystem` too, of several entropies: with ``p_k = -D_1 L_d - F^-_d`` the equations
-    are, in the variables (q, p, S) and at the points (q_i, P_i, S_i) of the maps, each with a momentum of its own,
-
-        (q_k+1 - q_k)/h = H_p(q_i, P_i, S_i) for each i,   sum w_i (P_i - h (1 - alpha_i) (-H_q + F)_i) = p_k,
-        (p_k+1 - p_k)/h = sum w_i (-H_q + F)_i,   T_a (S_a,k+1 - S_a,k)/h = sum w_i (the heat that body a receives)_i,
-
-    with ``T_a = sum w_i H_S_a``, where friction and heat are made of these temperatures too. The sum of the entropies
-    falls at no step, for every energy, friction and conductance.
+    It runs a :class:`liethermo.ComposedSystem` too, of several entropies, in the variables (q, p, S) with
+    ``p_k = -D_1 L_d - F^-_d``. At the point (q_i, P_i, S_i) of each map, with a momentum of its own, the velocity
+    ``H_p`` is ``(q_k+1 - q_k)/h``. The momenta obey ``p_k = sum w_i (P_i - h (1 - alpha_i) (F - H_q)_i)`` and
+    ``p_k+1 = p_k + h sum w_i (F - H_q)_i``. Each entropy grows by the mean of the heat that its body receives, over the
+    mean temperature ``sum w_i H_S``, with which forces and heat are made too. The sum of the entropies falls at no
+    step, for every energy, friction and conductance.
 
     Parameters
     ----------
