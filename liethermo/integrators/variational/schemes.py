@@ -99,17 +99,26 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def verlet(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 1: everything at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction."""
+        """Scheme 1: everything at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction.
+
+        On a manifold along the curves of ``retraction``.
+        """
         return cls("verlet", retraction=retraction)
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 2: everything at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 1 but for alpha = 1/2."""
+        """Scheme 2: everything at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 1 but for alpha = 1/2.
+
+        On a manifold along the curves of ``retraction``.
+        """
         return cls(FiniteDifference(alpha), retraction=retraction)
 
     @classmethod
     def symmetrised(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 3: the mean of both ends; order 2."""
+        """Scheme 3: the mean of both ends; order 2.
+
+        On a manifold along the curves of ``retraction``.
+        """
         return cls("symmetrised", retraction=retraction)
 
     @property
