@@ -92,8 +92,10 @@ def _beside_heyoka(rounds: int) -> tuple[Table, float]:
 
     def ours(steps: int) -> Callable[[], np.ndarray]:
         method, span = lt.MetriplecticRungeKutta(8), (0.0, T_END)
-        options = {"save_every": steps, "engine": "compiled", "on_failure": "return"}
-        return lambda: lt.integrate(system(rate), X0, span, T_END / steps, method, **options).x[-1]
+        step = T_END / steps
+        return lambda: lt.integrate(
+            system(rate), X0, span, step, method, save_every=steps, engine="compiled", on_failure="return"
+        ).x[-1]
 
     steps = next(n for n in (int(FEWEST * 1.1**i) for i in range(40)) if missed(ours(n)()) <= WANTED)
     tolerance = next(t for t in TOLERANCES if missed(build(t).end()) <= WANTED)
