@@ -210,3 +210,35 @@ def test_an_energy_that_depends_on_time():
     assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
     assert runs[0].audit().passed
     assert np.abs(np.linalg.norm(runs[0].x, axis=1) - 1.0).max() < ON_THE_SPACE
+
+
+def hypersphere():
+    from geomstats.geometry.hypersphere import Hypersphere
+
+    return Hypersphere(2)
+
+
+def spd_matrices():
+    from geomstats.geometry.spd_matrices import SPDMatrices
+
+    return SPDMatrices(2)
+
+
+@pytest.mark.parametrize(
+    ("space", "theirs"),
+    [(mf.Sphere(2), hypersphere), pytest.param(mf.SPD(2), spd_matrices, marks=pytest.mark.slow)],
+    ids=["sphere", "SPD"],
+)
+def test_gradient_flows_run_along_the_geodesics_of_geomstats(space, theirs):
+    """Half the squared distance from p falls along the geodesic to it: its length shrinks by exp(-t)."""
+    metric, p, x0 = theirs().metric, np.asarray(space.random(1)), np.asarray(space.random(2))
+
+    def half_the_square(x):
+        v = space.log(p, x)
+        return 0.5 * space.inner(p, v, v)
+
+    system = lt.MetriplecticSystem(None, half_the_square, dissipation=lt.Friction(), space=space)
+    run = lt.integrate(system, x0, (0.0, 1.0), 0.05, RK8)
+    exact = np.array([metric.exp(np.exp(-t) * metric.log(x0, p), p) for t in run.t])
+    assert np.abs(system.points(run.x) - exact).max() < 1e-11
+    assert run.audit().passed
