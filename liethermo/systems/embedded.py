@@ -51,7 +51,7 @@ class EmbeddedSystem(System):
         self.entropy = None if manifold.entropy is None else recognised(manifold.entropy, self.dim)
         as_they_are = conforming or isinstance(manifold.poisson, mf.NoPoisson)
         self.poisson = manifold.poisson if as_they_are else _Tangent(manifold)
-        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold, conforming)
+        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold)
         self.momentum_maps = {name: self._recognised(J) for name, J in manifold.momentum_maps.items()}
         self.preserved_as, self.decided = manifold.preserved_as, manifold.decided
 
@@ -143,16 +143,18 @@ class _Tangent(mf.PoissonStructure):
 
 
 class _Force(Carried):
-    """A dissipation that is handed the metric of the space, tangent where it is not so by form."""
+    """A dissipation that is handed the metric of the space, ``P K P`` near it.
+
+    There P is symmetric, and what it gives is along the level sets; it need not be a projector, so that K between two
+    of them does no work.
+    """
 
     manifold: System
-    conforming: bool = eqx.field(static=True)
 
     def force(self, system, x, dH, dS, dL):
         """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
         along = lambda v: None if v is None else _along(self.manifold, x, v)  # noqa: E731
-        force = self.part.force(self.manifold, x, along(dH), along(dS), tuple(map(along, dL)))
-        return force if self.conforming else along(force)
+        return along(self.part.force(self.manifold, x, along(dH), along(dS), tuple(map(along, dL))))
 
     def factor(self, system, x, dH, dL):
         along = lambda v: _along(self.manifold, x, v)  # noqa: E731
