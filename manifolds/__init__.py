@@ -37,7 +37,7 @@ from .errors import (
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
 from .groups.matrix_group import MatrixGroup, registered_groups
 from .matrices.divided import ScalarFunction
-from .matrices.spectral import spectral, spectral_trace
+from .matrices.spectral import spectral, spectral_difference, spectral_trace
 from .retractions.charts import (
     CayleyRetraction,
     EuclideanRetraction,
@@ -188,6 +188,7 @@ __all__ = [
     "so",
     "sp",
     "spectral",
+    "spectral_difference",
     "spectral_trace",
     "su",
     "testing",

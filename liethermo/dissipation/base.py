@@ -109,6 +109,18 @@ class Dissipation(Module):
             Gradients of the functions in :attr:`preserve`, in their order.
         """
 
+    @property
+    def has_generator(self) -> bool:
+        """Whether :meth:`generated` gives the force in a form that the gradient of the entropy is not in."""
+        return False
+
+    def generated(self, system: Geometry, x, dH) -> jax.Array:
+        """The force at the gradients that energy and entropy have at x, shape (n,); see :attr:`has_generator`.
+
+        Such a form needs no entropy, as Lindblad's equation needs no logarithm of the density matrix.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no such form")
+
     def velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
         """sigma with force ``Pi(x) sigma``, shape (n,), where the dissipation says that it acts so; else None.
 
@@ -205,6 +217,13 @@ class Several(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         return sum(part.force(system, x, dH, dS, own) for part, own in portions(self, dL))
+
+    @property
+    def has_generator(self) -> bool:
+        return all(part.has_generator for part in self.parts)
+
+    def generated(self, system, x, dH):
+        return sum(part.generated(system, x, dH) for part in self.parts)
 
     def factor(self, system, x, dH, dL):
         found = [part.factor(system, x, dH, own) for part, own in portions(self, dL)]

@@ -178,6 +178,32 @@ class ThermalJumps(Dissipation):
         lost = jnp.sum(turned.conj() * image).real
         return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-lost / T)])
 
+    @property
+    def has_generator(self) -> bool:
+        return True
+
+    def generated(self, system, x, dH):
+        """Lindblad's equation, and the heat that the bath takes."""
+        structure, n = system.structure, system.body_dim
+        rho, fixed = structure.matrix(x[:n]), np.stack([np.asarray(jump.operator) for jump in self.jumps])
+        adjoint = fixed.conj().swapaxes(-1, -2)
+        taken, given = adjoint @ fixed, fixed @ adjoint
+        # the frequency is linear in H, by a table that is known when programs are written
+        along = (taken - given) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
+        with jax.ensure_compile_time_eval():
+            along = np.asarray(structure.vector(along))
+        omega = along @ dH[:n]
+        T = jnp.asarray(jnp.inf) if self.isolated else dH[n + self.bath]
+        strengths, grown = self._strengths(omega, T), jnp.exp(omega / (2.0 * T))
+        rates = jnp.concatenate([strengths * grown, strengths / grown])
+        jumps = np.concatenate([fixed, adjoint])
+        moved = (rates[:, None, None] * jumps) @ rho @ np.concatenate([adjoint, fixed])
+        lost = jnp.tensordot(rates, np.concatenate([taken, given]), 1) @ rho
+        force = structure.vector(jnp.sum(moved, axis=0) - lost)  # the Hermitian part has both terms of what is lost
+        if self.isolated:
+            return force
+        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-jnp.dot(dH[:n], force) / T)])
+
     def _strengths(self, omega, T) -> jax.Array:
         rates = [self.rates[jump.source] for jump in self.jumps]
         return jnp.stack(

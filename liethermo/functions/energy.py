@@ -219,6 +219,34 @@ class Quadratic(Energy):
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
 
 
+class Linear(Energy):
+    """``b @ x``, whose gradient does not depend on the state.
+
+    Parameters
+    ----------
+    b : array, shape (n,)
+    """
+
+    b: jax.Array
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def value(self, x) -> jax.Array:
+        return jnp.dot(self.b, x)
+
+    def gradient(self, x) -> jax.Array:
+        del x
+        return self.b
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        return pattern([], [], dim)
+
+    def __neg__(self) -> Energy:
+        return Linear(-self.b)
+
+
 class Function(Energy):
     """An energy given by a plain function from a JAX array, shape (n,), to a scalar; differentiated by JAX.
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .energy import Energy
+from .path import Path
 
 
 class OfFirst(Energy):
@@ -39,3 +40,10 @@ class OfFirst(Energy):
         ends, n = (x, d, jnp.zeros_like(x) + compensation), self.dim
         parts = [term.discrete_gradient(scheme, *(v[:n] for v in ends)) for term in self.energy.terms]
         return jnp.concatenate([sum(parts[1:], parts[0]), jnp.zeros(x.shape[0] - n)])
+
+    def stage_gradients(self, scheme, path: Path) -> jax.Array:
+        if self.is_quadratic:
+            return scheme(self, path)
+        own = path.part(slice(None, self.dim))
+        parts = [term.stage_gradients(scheme, own) for term in self.energy.terms]
+        return jnp.pad(sum(parts[1:], parts[0]), ((0, 0), (0, path.start.shape[0] - self.dim)))

@@ -6,9 +6,12 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import scipy
 
-from .energy import Energy
+from manifolds._arrays import is_traced
+
+from .energy import Energy, Linear
 from .indices import pattern
 
 NEAR = 1 / 32
@@ -62,6 +65,25 @@ class Warmth(Energy):
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         return pattern(range(dim), range(dim), dim)
+
+
+class Reservoir(Linear):
+    """``sum_b T_b y_b`` of the entropies y: the energy of baths of infinite capacity, which keep their temperatures."""
+
+    @property
+    def temperature(self) -> jax.Array:
+        return self.b
+
+    @property
+    def capacity(self) -> jax.Array:
+        return jnp.full_like(self.b, jnp.inf)
+
+
+def warmth(capacity: jax.Array, temperature: jax.Array) -> Warmth | Reservoir:
+    """The energy of baths of constant capacities, finite or infinite, shape (m,) each."""
+    if is_traced(capacity) or not np.isinf(np.asarray(capacity)).all():
+        return Warmth(capacity, temperature)
+    return Reservoir(temperature)
 
 
 def _grown(z) -> tuple[jax.Array, jax.Array]:

@@ -43,6 +43,10 @@ class WithBaths(Energy):
         return (*of_body, *self.baths.on(range(self.size, self.dim)).terms)
 
     @property
+    def is_quadratic(self) -> bool:
+        return self.body.is_quadratic and self.baths.is_quadratic
+
+    @property
     def depends_on_time(self) -> bool:
         return self.body.depends_on_time
 
@@ -81,7 +85,7 @@ class WithBaths(Energy):
 
     def stage_gradients(self, scheme, path: Path) -> jax.Array:
         def of(energy: Energy, components: slice) -> jax.Array:
-            part = _part(path, components)
+            part = path.part(components)
             return _total(term.stage_gradients(scheme, part) for term in energy.terms)
 
         return jnp.concatenate([of(self.body, slice(None, self.size)), of(self.baths, slice(self.size, None))], axis=1)
@@ -99,20 +103,6 @@ class WithBaths(Energy):
 
     def __neg__(self) -> Energy:
         return WithBaths(-self.body, -self.baths, self.size, self.dim)
-
-
-def _part(path: Path, components: slice) -> Path:
-    """The path of some components."""
-    further = path.further
-    return path._replace(
-        start=path.start[components],
-        compensation=(jnp.zeros_like(path.start) + path.compensation)[components],
-        step=path.step[components],
-        points=path.points[:, components],
-        slopes=path.slopes[:, components],
-        further=None if further is None else (further[0][:, components], further[1][:, components]),
-        symmetries=None if path.symmetries is None else path.symmetries[:, :, components],
-    )
 
 
 def _total(parts: Iterable[jax.Array]) -> jax.Array:

@@ -19,7 +19,7 @@ from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, in_charts
-from .levels import CORRECTIONS, LAWS, Law, corrected
+from .levels import ALONG, CORRECTIONS, LAWS, Law, corrected
 from .preserved import check_preserved, preserved_functions, seen_on
 
 SLOPE, ERROR, DEFECT, LEVELS, OWN = range(5)
@@ -70,6 +70,10 @@ class ExplicitMethod(TransportingMethod):
 
     Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
     quadrature.
+
+    Where the motion has a form without the gradient of the entropy, as Lindblad's equation has
+    [:attr:`liethermo.Dissipation.has_generator`], the stages are spared the entropy:
+    ``S(x') = max(S(y), S(x))``, to the same order.
 
     A subclass says what the step is before it is corrected: :meth:`uncorrected`.
 
@@ -155,6 +159,8 @@ class ExplicitMethod(TransportingMethod):
         """The vectors that the step hands on; of those before it the levels alone are needed."""
         laws = self._laws(system)
         d, changes, error, between = self.uncorrected(system, laws, x, compensation, h)
+        if system.has_generator:
+            changes = self._own_changes(laws, x, compensation, d)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
             changes = changes + self._steering(system, laws, x, compensation, k[LEVELS])
         d, defect = corrected(system, laws, x, compensation, d, changes, self.corrections)
@@ -178,9 +184,27 @@ class ExplicitMethod(TransportingMethod):
         ]
         return jax.lax.stop_gradient(jnp.stack(found))
 
+    def _own_changes(self, laws: list[Law], x, compensation, d) -> jax.Array:
+        """What an uncorrected step changes the functions by that have to rise or fall, where that has the right sign.
+
+        The motion does so too, so that a step with the wrong sign is off the motion by no less than what is mended.
+        """
+
+        def own(law: Law) -> jax.Array:
+            if law.sign == 0.0:
+                return jnp.zeros(())
+            return law.sign * jnp.maximum(law.sign * jnp.dot(ALONG(law.function, x, d, compensation), d), 0.0)
+
+        return jnp.stack([own(law) for law in laws])
+
     def rates(self, system: System, laws: list[Law], x) -> tuple[jax.Array, jax.Array]:
-        """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants."""
+        """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants.
+
+        Where the field has a form without the entropy, the rates are not needed, and zero.
+        """
         system = system.here(x)
+        if system.has_generator:
+            return system.generated(x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)

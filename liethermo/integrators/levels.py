@@ -29,6 +29,9 @@ both."""
 
 VANISHED_LENGTH = math.sqrt(VANISHED)
 
+ALONG = Gonzalez(NOISY)
+"""The discrete gradient by which it is told what a function changes by in a step."""
+
 
 class Law(NamedTuple):
     """A function, and whether it is to fall, to stay or to rise: -1, 0 or 1."""
@@ -54,7 +57,7 @@ def corrected(
     system: System, laws: list[Law], x, compensation, d, changes, corrections: int = CORRECTIONS
 ) -> tuple[jax.Array, jax.Array]:
     """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
-    change, surface = Gonzalez(NOISY), system.surface
+    change, surface = ALONG, system.surface
     functions, blocks = [law.function for law in laws], system.blocks
     before = [f.gradient(x + compensation) if f.is_quadratic else None for f in functions]
 
@@ -128,7 +131,7 @@ def ended(system: System, surface: Surface, held: Sequence[Energy], x, compensat
             laws.append(Law(function, LAWS[law]))
     if not laws:
         return surface.reached(x, compensation, d)[0]
-    change = Gonzalez(NOISY)
+    change = ALONG
     changes = [
         jnp.zeros(()) if law.sign == 0.0 else jnp.dot(change(law.function, x, d, compensation), d) for law in laws
     ]

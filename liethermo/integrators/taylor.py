@@ -109,7 +109,7 @@ class MetriplecticTaylor(ExplicitMethod):
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
-        if system.entropy is not None:
+        if system.entropy is not None and not system.has_generator:
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:
@@ -124,9 +124,11 @@ class MetriplecticTaylor(ExplicitMethod):
         numbers = np.arange(1.0, self.order + 1.0)
         c = solution(lambda y: self.rates(system, laws, y)[0], x, h, self.order)  # from the centre of a chart, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** numbers @ c)])
+        points = points[-1:] if system.has_generator else points
         fields, rates = jax.vmap(lambda y: self.rates(system, laws, y))(points)
         defect = fields[-1] - (numbers @ c) / h
-        return Unlawful(jnp.sum(c, axis=0), h * (b @ rates), defect / (self.order + 1), c / h)
+        changes = rates[-1] if system.has_generator else h * (b @ rates)
+        return Unlawful(jnp.sum(c, axis=0), changes, defect / (self.order + 1), c / h)
 
     def weights(self, theta) -> np.ndarray:
         """Weights of the polynomial and of its correction, which grows like the first term that is left out."""

@@ -549,6 +549,8 @@ class System(Kind):
             )
 
     def _vector_field(self, x) -> jax.Array:
+        if self.has_generator:
+            return self.generated(x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *self._preserved_gradients(x)
         dH, dS, *dL = (alpha if self.space is None else self.lowered(x, self.raised(x, alpha)) for alpha in gradients)

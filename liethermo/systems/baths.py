@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from manifolds._module import Module
 from ..errors import InputError
 from ..functions.each import Each
 from ..functions.energy import Energy
-from ..functions.warmth import Warmth
+from ..functions.warmth import Reservoir, Warmth, warmth
 
 
 class HeatBaths(Module):
@@ -63,33 +64,35 @@ class HeatBaths(Module):
         self.number = number
         if energy is None:
             given = {"capacity": capacity, "temperature": temperature}
-            self.energy = Warmth(*(_positive(value, what, number, what == "capacity") for what, value in given.items()))
+            self.energy = warmth(*(_positive(value, what, number, what == "capacity") for what, value in given.items()))
         else:
             self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
     @property
     def positive(self) -> bool:
         """Whether every state has positive temperatures, by form."""
-        return isinstance(self.energy, Warmth)
+        return isinstance(self.energy, Warmth | Reservoir)
 
     @property
     def scale(self) -> np.ndarray | float:
         """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
         energy = self.energy
-        if not isinstance(energy, Warmth) or is_traced(energy):
+        if not isinstance(energy, Warmth) or is_traced(energy):  # of what keeps its temperature any will do
             return 1.0
         capacity = np.asarray(energy.capacity)
         return np.where(np.isfinite(capacity), capacity, 1.0)
 
 
 def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
-    array = real_array(value)
-    if array.shape not in ((), (number,)):
+    known = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
+    with known:  # numbers, while a family of systems is traced
+        array = jnp.broadcast_to(real_array(value), (number,)) if np.ndim(value) == 0 else real_array(value)
+    if array.shape != (number,):
         raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
-    if not is_traced(array) and not bool(((array > 0.0) & (infinite | jnp.isfinite(array))).all()):
+    if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):
         allowed = "positive" if infinite else "positive and finite"
         raise InputError(f"the {what} of a bath must be {allowed}, not {array.tolist()}")
-    return jnp.broadcast_to(array, (number,))
+    return array
 
 
 class _OfEntropy(Module):

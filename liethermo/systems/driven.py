@@ -290,6 +290,13 @@ class _OnBody(Carried):
     def force(self, system, x, dH, dS, dL):
         return jnp.pad(self.part.force(system._now(x), *_part_of_body(x, dH, dS, dL)), (0, 2))
 
+    @property
+    def has_generator(self) -> bool:
+        return self.part.has_generator
+
+    def generated(self, system, x, dH):
+        return jnp.pad(self.part.generated(system._now(x), x[:-2], dH[:-2]), (0, 2))
+
     def factor(self, system, x, dH, dL):
         B = self.part.factor(system._now(x), x[:-2], dH[:-2], tuple(L[:-2] for L in dL))
         return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, 2)))

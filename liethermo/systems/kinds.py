@@ -100,6 +100,17 @@ class Kind(Module):
         """Whether Pi is a Poisson tensor whatever the user gives, and dear to check when a system is built."""
         return False
 
+    @property
+    def has_generator(self) -> bool:
+        """Whether the motion has a form without the gradient of the entropy: see :meth:`generated`."""
+        return self.dissipation is not None and self.dissipation.has_generator
+
+    def generated(self, x) -> jax.Array:
+        """:meth:`field` at the gradients of the functions, in the form that the entropy is not in."""
+        assert self.dissipation is not None
+        dH = self.energy.gradient(x)
+        return self.poisson.sharp(x, dH) + self.dissipation.generated(self, x, dH)
+
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
         if self.space is None:

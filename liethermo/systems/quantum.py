@@ -17,9 +17,9 @@ from ..dissipation.base import Dissipation, total
 from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, checked_hermitian, checked_matrix
 from ..errors import InputError
 from ..functions.density import Expectation, VonNeumann
-from ..functions.energy import Energy, Quadratic, Sum, TimeDependent
+from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
 from ..functions.of_first import OfFirst
-from ..functions.warmth import Warmth
+from ..functions.warmth import Reservoir, Warmth
 from ..functions.with_baths import WithBaths
 from .base import TIMES, System
 from .baths import BesideBaths, EntropyOfBaths, HeatBaths
@@ -228,7 +228,7 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        p = np.linalg.eigvalsh(np.asarray(self.density(x)))
+        p = np.linalg.eigvalsh(self.structure.matrix(np.asarray(x)[: self.body_dim]))
         entropy = next(term for term in self.entropy.terms)  # type: ignore[union-attr]
         floor = getattr(entropy, "floor", getattr(getattr(entropy, "energy", None), "floor", 0.0))
         if abs(p.sum() - 1.0) > 1e-9:
@@ -319,10 +319,11 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
         return len(found), TimeDependent(Expectation(hamiltonian, structure))
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
-        return structure.size, Quadratic(jnp.zeros(structure.dim), structure.vector(hamiltonian))
+        return structure.size, Linear(structure.vector(hamiltonian))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     structure = mf.DensityMatrices(len(H))
-    return len(H), Quadratic(jnp.zeros(structure.dim), structure.vector(H))
+    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+        return len(H), Linear(structure.vector(H))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:
@@ -359,7 +360,8 @@ def _beside(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
 def _joined(one: HeatBaths | None, other: HeatBaths | None) -> HeatBaths | None:
     if one is None or other is None:
         return one or other
-    if not isinstance(one.energy, Warmth) or not isinstance(other.energy, Warmth):
+    kinds = Warmth | Reservoir
+    if not isinstance(one.energy, kinds) or not isinstance(other.energy, kinds):
         raise InputError("baths of a product have constant capacities: build the product with baths of its own")
     capacity, temperature = (
         jnp.concatenate([getattr(one.energy, name), getattr(other.energy, name)])

@@ -92,6 +92,14 @@ class _Force(Carried):
     def force(self, system, x, dH, dS, dL):
         return self.matrix @ self.part.force(self.system, *self._old(x, dH, dS, dL)) / self.units[0]
 
+    @property
+    def has_generator(self) -> bool:
+        return self.part.has_generator
+
+    def generated(self, system, x, dH):
+        old = self._old(x, dH, None, ())[:2]
+        return self.matrix @ self.part.generated(self.system, *old) / self.units[0]
+
     def velocity(self, system, x, dH, dS, dL):
         found = self.part.velocity(self.system, *self._old(x, dH, dS, dL))
         return None if found is None else self.units[1] * (self.inverse.T @ found)
@@ -210,6 +218,13 @@ class _Share(Carried):
     def force(self, system, x, dH, dS, dL):
         return self.share * self.part.force(system, x, dH, dS, dL)
 
+    @property
+    def has_generator(self) -> bool:
+        return self.part.has_generator
+
+    def generated(self, system, x, dH):
+        return self.share * self.part.generated(system, x, dH)
+
     def velocity(self, system, x, dH, dS, dL):
         found = self.part.velocity(system, x, dH, dS, dL)
         return None if found is None else self.share * found
@@ -254,6 +269,14 @@ class _OnOne(Carried):
         own = slice(i, i + n)
         dS, dL = None if dS is None else dS[own], tuple(L[own] for L in dL)
         return jnp.pad(self.part.force(self.system, x[own], dH[own], dS, dL), (i, n - i))
+
+    @property
+    def has_generator(self) -> bool:
+        return self.part.has_generator
+
+    def generated(self, system, x, dH):
+        n, i = self.system.dim, self.start
+        return jnp.pad(self.part.generated(self.system, x[i : i + n], dH[i : i + n]), (i, n - i))
 
 
 class Pair(System):

@@ -282,9 +282,12 @@ def side_by_side(case: Case) -> Outcome:
 
 
 def neighbour(case: Case) -> np.ndarray:
-    """Another state, by a twentieth away."""
+    """Another state, by a twentieth away; where not all vectors are states, a twentieth of the way to another one."""
     v = np.random.default_rng(case.seed + 1).standard_normal(case.x0.shape)
-    return case.x0 + 0.05 * case.size * v / np.linalg.norm(v)
+    found = case.x0 + 0.05 * case.size * v / np.linalg.norm(v)
+    if not case.system.outside(found.ravel()):
+        return found
+    return case.x0 + 0.05 * (start_of(case.system, case.seed + 1).reshape(case.x0.shape) - case.x0)
 
 
 # -- time -----------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from functools import reduce
@@ -26,7 +27,7 @@ def _matrices(x: np.ndarray) -> np.ndarray:
 def called(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[np.ndarray]:
     """The results of a call, as arrays of scalars."""
     is_complex = isinstance(b, ComplexBuilder)
-    call = Call(name, sizes, is_complex)
+    call = _call(name, sizes, is_complex)
     given: list[Scalar] = []
     for x in matrices:
         entries = x.ravel().tolist()
@@ -39,6 +40,12 @@ def called(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[
             parts = [Pair(re, im) for re, im in zip(parts, list(itertools.islice(found, size)), strict=True)]
         arrays.append(array(parts, shape))
     return arrays
+
+
+@functools.lru_cache(maxsize=256)
+def _call(*what) -> Call:
+    """One object for equal calls, so that those of the same matrices merge."""
+    return Call(*what)
 
 
 def product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:

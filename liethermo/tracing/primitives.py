@@ -160,19 +160,27 @@ def _cumulative(combine: Callable[..., Scalar]) -> Rule:
 
 
 UNROLLED_PRODUCTS, OF_HELD = 900, 100
-"""Products of entries in a product of matrices that is unrolled, at most: more are a loop. Where one of the matrices
-lies in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier."""
+"""Products of real numbers in a product of matrices that is unrolled, at most: more are a loop. Where one of them lies
+in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier."""
 
 
 def _products(rows: np.ndarray, columns: np.ndarray) -> int:
     """How many products of entries a product of two matrices takes, those with a zero left out."""
-    return int(np.sum((rows != 0).sum(axis=0) * (columns != 0).sum(axis=0)))
+    counts = [np.reshape([not _zero(a) for a in x.ravel().tolist()], x.shape).sum(axis=0) for x in (rows, columns)]
+    return int(np.sum(counts[0] * counts[1]))
+
+
+def _zero(a: Scalar) -> bool:
+    parts = (a.re, a.im) if isinstance(a, Pair) else (a,)
+    return all(type(part) is not str and part == 0 for part in parts)
 
 
 def _is_loop(b, rows: np.ndarray, columns: np.ndarray) -> bool:
     """Whether the product of two matrices, the second by its columns, is better a loop."""
     count = _products(rows, columns)
-    if count > UNROLLED_PRODUCTS or count <= OF_HELD or b.real is not b:
+    if b.real is not b:  # of complex numbers
+        return 4 * count > UNROLLED_PRODUCTS
+    if count > UNROLLED_PRODUCTS or count <= OF_HELD:
         return count > UNROLLED_PRODUCTS
     return any(min(x.shape) > 1 and algebra.held(b, x) is not None for x in (rows, columns))
 
@@ -187,7 +195,8 @@ def _dot_general(b, eqn, x, y):
     right = y.transpose(*batch_y, *rest_y, *sum_y).reshape(batch, math.prod(y.shape[i] for i in rest_y), size)
     zero, result = constant(0, _dtype(eqn)).item(), []
     for rows, columns in zip(left, right, strict=True):
-        sparse = [[(k, a) for k, a in enumerate(row) if a != 0] for row in rows.tolist()]  # as structure constants are
+        # as structure constants are
+        sparse = [[(k, a) for k, a in enumerate(row) if not _zero(a)] for row in rows.tolist()]
         if eqn.outvars[0].aval.dtype.kind in "fc" and _is_loop(b, rows, columns):
             result += algebra.product(b, rows, columns.T).ravel().tolist()
             continue

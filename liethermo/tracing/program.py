@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ class Program:
         """How many instructions there are of each kind."""
         return Counter(str(instruction.op) for instruction in self.instructions)
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """How many instructions compute something, those inside loops among them: what is moved alone costs little."""
         inner = (getattr(i.op, name, None) for i in self.instructions for name in ("test", "body"))

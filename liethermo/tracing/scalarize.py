@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -189,32 +190,60 @@ def _call(b, eqn, *arguments):
 
 
 def _chain(b, eqn, *arguments):
-    """A function of matrices, whose derivatives have been taken: unrolled here, or a routine where that is long."""
+    """Functions of matrices, whose derivatives have been taken: at one place after another, by the same routines."""
     (out,), rank = (var.aval for var in eqn.outvars), arguments[0].ndim - 2
-    if not rank or eqn.params["function"].shares:
-        return _one_chain(b, arguments, out, eqn.params)
-    front, result = out.shape[:rank], np.empty(out.shape, object)
-    for place in np.ndindex(*front):  # one after another, by the same routine
+    function, slots = eqn.params["function"], eqn.params["slots"]
+    avals = [var.aval.update(shape=var.aval.shape[rank:]) for var in eqn.invars]
+    count, result = len(arguments) - len(slots), np.empty(out.shape, object)
+    for place in np.ndindex(*out.shape[:rank]):
         own = [x[tuple(i if n > 1 else 0 for i, n in zip(place, x.shape, strict=False))] for x in arguments]
-        result[place] = _one_chain(b, own, out.update(shape=out.shape[rank:]), eqn.params)
+        given: list[np.ndarray] = []
+        kinds_given: list = []
+        for x, aval in zip(own[:count], avals, strict=False):  # of equal matrices once, since what is equal merges
+            found, made = _by_routine(b, _Prepared(function), [x], [aval])
+            given += found
+            kinds_given += made
+        rest = _Chain(function, slots, len(given) // count)
+        (result[place],), _ = _by_routine(b, rest, [*given, *own[count:]], [*kinds_given, *avals[count:]])
     return result
 
 
-def _one_chain(b, arguments, out, params) -> np.ndarray:
-    shifts = len(arguments) - len(params["slots"])
-    avals = tuple(
-        jax.ShapeDtypeStruct(x.shape, np.float64 if i == shifts else out.dtype) for i, x in enumerate(arguments)
-    )
-    closed, routine = _routine(avals, **params)
+@dataclass(frozen=True)
+class _Prepared:
+    """What is prepared of a matrix for chains of a function."""
+
+    function: chains.Chained
+
+    def __call__(self, a):
+        return self.function.prepared(a, unrolled=True)
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """A chain of a function, from what is prepared of its matrices: so many arrays each."""
+
+    function: chains.Chained
+    slots: tuple[int, ...]
+    each: int
+
+    def __call__(self, *arguments):
+        end = len(arguments) - len(self.slots)
+        prepared = [arguments[i : i + self.each] for i in range(0, end, self.each)]
+        return (self.function.chain(prepared, self.slots, arguments[end], arguments[end + 1 :], unrolled=True),)
+
+
+def _by_routine(b, function, arguments: Sequence[np.ndarray], avals: Sequence) -> tuple[list[np.ndarray], list]:
+    """The results of a function of arrays, unrolled here or by a routine where that is long, and their types."""
+    closed, routine = _routine(function, tuple(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
+    made = [var.aval for var in closed.jaxpr.outvars]
     if len(routine.program.instructions) <= LONG:
-        return _unroll(b, closed.jaxpr, closed.consts, arguments)[0]
-    return arranged(iter(b.real.block(routine, *flat(arguments))), [out])[0]
+        return _unroll(b, closed.jaxpr, closed.consts, arguments), made
+    return arranged(iter(b.block(routine, *flat(arguments))), made), made
 
 
 @functools.lru_cache(maxsize=256)
-def _routine(avals: tuple, function, slots: tuple[int, ...]) -> tuple[ClosedJaxpr, Routine]:
-    evaluation = functools.partial(chains.evaluated, function=function, slots=slots, unrolled=True)
-    closed = jax.make_jaxpr(evaluation)(*avals)
+def _routine(function, avals: tuple) -> tuple[ClosedJaxpr, Routine]:
+    closed = jax.make_jaxpr(function)(*avals)
     own, names = Builder(LIMIT), [f"x0_{i}" for i in range(len(kinds(avals)))]
     found = flat(_unroll(own, closed.jaxpr, closed.consts, arranged(iter(names), avals)))
     return closed, Routine(_program(own, [names], [found], [(len(found),)]))

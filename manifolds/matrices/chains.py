@@ -27,17 +27,15 @@ from jax.interpreters import ad, batching, mlir
 class Chained(Protocol):
     """A function of matrices; equal ones are one function, and they can be hashed.
 
-    Attributes
-    ----------
-    shares : bool
-        Whether what several chains have in common, the matrices, is most of the work.
+    ``unrolled`` says that every operation becomes scalar instructions.
     """
 
-    @property
-    def shares(self) -> bool: ...
+    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
+        """What all chains have in common that one of the matrices is in, such as its eigenvectors."""
+        ...
 
-    def chain(self, matrices, slots: tuple[int, ...], shifts, directions, unrolled: bool) -> jax.Array:
-        """The chain of some directions; ``unrolled`` where every operation becomes scalar instructions."""
+    def chain(self, prepared, slots: tuple[int, ...], shifts, directions, unrolled: bool) -> jax.Array:
+        """The chain of some directions, from what is prepared of each matrix."""
         ...
 
 
@@ -64,10 +62,11 @@ def _of_rank(a, rank: int):
     return a if a.ndim == rank else a.reshape((1,) * (rank - a.ndim) + a.shape)
 
 
-def evaluated(*arrays, function: Chained, slots: tuple[int, ...], unrolled: bool = False) -> jax.Array:
+def evaluated(*arrays, function: Chained, slots: tuple[int, ...]) -> jax.Array:
     """What the primitive computes, in terms of others."""
     matrices, shifts, directions = _parts(arrays, slots)
-    return function.chain(matrices, slots, shifts, directions, unrolled)
+    prepared = [function.prepared(a, unrolled=False) for a in matrices]
+    return function.chain(prepared, slots, shifts, directions, unrolled=False)
 
 
 def _parts(arrays, slots) -> tuple[list, Any, list]:

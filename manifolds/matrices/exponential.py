@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,13 +30,15 @@ def expm(X) -> jax.Array:
 class Exponential:
     """The exponential of any matrices: see :class:`.chains.Chained`."""
 
-    shares: ClassVar[bool] = False
+    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
+        return (a,)
 
-    def chain(self, matrices, slots, shifts, directions, unrolled: bool) -> jax.Array:
+    def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
         """The last block of the first row of the exponential of a matrix with the directions beside its diagonal.
 
         The directions are scaled to the size of the others, lest they call for squarings [Al-Mohy & Higham 2009].
         """
+        matrices = [a for (a,) in prepared]
         k, dtype = len(directions), matrices[0].dtype
         diagonal = [
             matrices[slot] + shifts[..., j, None, None].astype(dtype) * np.eye(matrices[slot].shape[-1])

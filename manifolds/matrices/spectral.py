@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +66,24 @@ def _trace_derivative(f, primals, tangents):
     return _trace(f, a), jnp.sum(slope.swapaxes(-1, -2) * da, axis=(-2, -1)).real
 
 
+def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
+    """The Hermitian G with ``tr(G (b - a)) = tr f(b) - tr f(a)``, a discrete gradient of ``tr f``, shape (..., n, n).
+
+    ``G = sum f[p_k, q_l] |k><k|l><l|``, or its Hermitian part, over the eigenvectors of a and of b. It is ``f'(a)``
+    where both are equal, it is symmetric in both, and its rounding is relative: no difference of values is taken.
+
+    Parameters
+    ----------
+    f
+        As for :func:`spectral`.
+    a, b : array, shape (..., n, n)
+        Hermitian.
+    """
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    found = chain(Spectral(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)])
+    return (found + found.conj().swapaxes(-1, -2)) / 2
+
+
 def log_mean(logs, shift, x) -> jax.Array:
     """``L X``, with the logarithmic mean of ``e^-s A`` from the left and ``e^s A`` from the right, ``A = exp(logs)``.
 
@@ -90,10 +107,12 @@ class Spectral:
     """A function of the eigenvalues of Hermitian matrices: see :class:`.chains.Chained`."""
 
     function: ScalarFunction
-    shares: ClassVar[bool] = True
 
-    def chain(self, matrices, slots, shifts, directions, unrolled: bool) -> jax.Array:
-        found = [_eigenvectors(a, unrolled) for a in matrices]
+    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
+        return _eigenvectors(a, unrolled)
+
+    def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
+        found = prepared
         vectors, k = [found[slot][1] for slot in slots], len(directions)
         points = [
             (found[slot][0] + shifts[..., j, None])[(..., *(slice(None) if i == j else None for i in range(k + 1)))]

@@ -34,8 +34,9 @@ class DensityMatrices(PoissonStructure):
 
     def matrix(self, x) -> jax.Array:
         """The Hermitian matrices with coordinates x, shape (..., N^2) to (..., N, N)."""
-        parts = [jnp.asarray(x) @ table for table in _tables(self.size)]
-        return jax.lax.complex(*(part.reshape(*part.shape[:-1], self.size, self.size) for part in parts))
+        parts = (x @ table for table in _tables(self.size))
+        real, imaginary = (part.reshape(*part.shape[:-1], self.size, self.size) for part in parts)
+        return real + 1j * imaginary if isinstance(x, np.ndarray) else jax.lax.complex(real, imaginary)
 
     def vector(self, a) -> jax.Array:
         """The coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of :meth:`matrix`."""

@@ -22,7 +22,7 @@ NUMBERS = NUMBER.as_pointer()
 PREFIX = "liethermo_"
 """How the names of functions begin that are bound here."""
 
-ROUTINES = "dsyevd zheevd dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
+ROUTINES = "dsyev zheev dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
 
 SPECIAL = {
     "lgamma": ("gammaln", 1),
@@ -96,20 +96,16 @@ class _Kernel:
 
     def _eigh(self, n: int) -> None:
         a, w = self._entered(0, n, n), self._numbers(n)
-        letter = "zheevd" if self.call.is_complex else "dsyevd"
-        work = 2 * n + n * n if self.call.is_complex else 1 + 6 * n + 2 * n * n
+        z, work = self.call.is_complex, 34 * n  # as much as a blocked reduction to tridiagonal form wants
         arguments = [self._letter("V"), self._letter("L"), self._integer(n), a, self._integer(n), w]
         arguments += [self._numbers(work * self.parts), self._integer(work)]
-        if self.call.is_complex:
-            reals = 1 + 5 * n + 2 * n * n
-            arguments += [self._numbers(reals), self._integer(reals)]
-        arguments += [self._integers(3 + 5 * n), self._integer(3 + 5 * n)]
+        arguments += [self._numbers(3 * n)] if z else []
 
         def leave() -> None:
             self._leave(0, a, n, n)
             self._leave_row(1, w, n)
 
-        self._checked(letter, arguments, leave)
+        self._checked("zheev" if z else "dsyev", arguments, leave)
 
     def _lu(self, m: int, n: int) -> None:
         a, least = self._entered(0, m, n), min(m, n)

@@ -97,23 +97,89 @@ def test_a_qubit_beside_its_closed_form():
     assert audit.energy_drift <= 1e-13
 
 
+FULL = np.random.default_rng(7).normal(size=(3, 3, 2)) @ np.array([1.0, 1.0j])
+
+
+def random_hermitian(n, seed=11):
+    a = np.random.default_rng(seed).normal(size=(n, n, 2)) @ np.array([1.0, 1.0j])
+    return (a + a.conj().T) / 2
+
+
+SYSTEMS = {
+    "a constant temperature": lambda: lt.QuantumSystem(
+        random_hermitian(3), lt.ThermalJumps([(FULL, RATE)]), infinite()
+    ),
+    "two finite baths": lambda: lt.QuantumSystem(
+        random_hermitian(3),
+        [lt.ThermalJumps([(FULL, RATE)]), lt.ThermalJumps([(FULL.T, 0.1)], bath=1)],
+        lt.HeatBaths(capacity=[0.8, 2.0], temperature=[T, 1.1], number=2),
+    ),
+    "no bath": lambda: lt.QuantumSystem(
+        random_hermitian(3), lt.ThermalJumps([(FULL, RATE), (np.diag([1, 2, 4]), 0.3)])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_generator_is_the_force_at_the_gradients(name):
+    """The form without the entropy, for Hamiltonians and couplings of no special form."""
+    q = SYSTEMS[name]()
+    for x in map(jnp.asarray, q.samples(2, 3)):
+        wanted = q.field(x, q.energy.gradient(x), q.entropy.gradient(x))
+        assert np.abs(q.generated(x) - wanted).max() <= 1e-12 * np.abs(wanted).max()  # measured: at most 2e-14
+
+
+def test_the_entropy_has_a_discrete_gradient_in_closed_form():
+    """What it changes by is right to rounding relative to the step, however short that is."""
+    S = lt.VonNeumann()
+    structure = mf.DensityMatrices(3)
+    x, other = (structure.vector(random_density(3, seed)) for seed in (1, 2))
+    for share in (1.0, 1e-3, 1e-9):
+        d = share * (other - x)
+        found = S.discrete_gradient(None, x, d, jnp.zeros_like(x))
+        if share > 1e-4:
+            assert float(found @ d) == pytest.approx(float(S.value(x + d) - S.value(x)), rel=1e-11)
+        else:  # the difference of the values has no digit of the second order left
+            middle = S.gradient(x + 0.5 * d)
+            assert float(found @ d) == pytest.approx(float(middle @ d), rel=1e-12)
+    assert np.abs(S.discrete_gradient(None, x, 0.0 * x, 0.0 * x) - S.gradient(x)).max() <= 1e-13
+
+
 METHODS = {
     "midpoint": (lt.MetriplecticMidpoint(), 2, (0.4, 0.2, 0.1)),
     "Gauss 2": (lt.MetriplecticGauss(2), 4, (0.8, 0.4, 0.2)),
     "Gauss 3": (lt.MetriplecticGauss(3), 6, (1.2, 0.6, 0.3)),
     "explicit 4": (lt.MetriplecticRungeKutta(4), 4, (0.4, 0.2, 0.1)),
     "explicit 6": (lt.MetriplecticRungeKutta(6), 6, (0.8, 0.4, 0.2)),
+    "explicit 8": (lt.MetriplecticRungeKutta(8), 8, (0.6, 0.3)),
+    "Taylor 5": (lt.MetriplecticTaylor(5), 5, (0.4, 0.2, 0.1)),
 }
+
+
+def by_scipy(rho, capacity, t):
+    """A qubit in a finite bath, by a program of its own: the last state, as the matrix and the entropy of the bath."""
+
+    def field(_, y):
+        r, warm = (y[:4] + 1j * y[4:8]).reshape(2, 2), T * np.exp(y[8] / capacity)
+        omega = QUBIT[1, 1].real
+        jumps = [(LOWER, RATE * np.exp(omega / (2 * warm))), (LOWER.T, RATE * np.exp(-omega / (2 * warm)))]
+        d = lindblad(r, QUBIT, jumps)
+        return np.concatenate([d.ravel().real, d.ravel().imag, [-np.trace(QUBIT @ d).real / warm]])
+
+    y0 = np.concatenate([rho.ravel().real, rho.ravel().imag, [0.0]])
+    y = scipy.integrate.solve_ivp(field, (0.0, t), y0, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    return (y[:4] + 1j * y[4:8]).reshape(2, 2), y[8]
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", METHODS)
 def test_orders(name):
-    """With a bath of finite heat capacity, so that nothing is linear."""
+    """With a bath of finite heat capacity, so that nothing is linear, beside SciPy."""
     method, order, steps = METHODS[name]
     q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=lt.HeatBaths(capacity=0.8, temperature=T))
     x0 = q.state(RHO)
-    exact = lt.integrate(q, x0, (0.0, 2.4), 2.4, lt.Reference()).x[-1]
+    rho, y = by_scipy(np.asarray(RHO, complex), 0.8, 2.4)
+    exact = q.state(rho / np.trace(rho), entropies=[y])
     errors = [np.abs(lt.integrate(q, x0, (0.0, 2.4), h, method).x[-1] - exact).max() for h in steps]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(steps))
     assert np.abs(slopes - order).max() <= 0.35
@@ -231,6 +297,45 @@ def test_a_step_that_leaves_the_cone_is_refused():
     shortened = lt.integrate(q, x, span, lt.Adaptive(1e-8, first=0.01), method)
     assert shortened.status.ok
     assert np.linalg.eigvalsh(q.density(shortened.x)).min() > 0.0
+
+
+def test_taylor_steps_need_a_motion_without_the_entropy():
+    """Lindblad's equation has series of every order; steepest ascent has a logarithm of the matrix in it."""
+    q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4))
+    with pytest.raises(lt.InputError, match=r"'matrix_chain' has no rule .* take lt.MetriplecticRungeKutta"):
+        lt.integrate(q, q.state(RHO), (0.0, 1.0), 0.1, lt.MetriplecticTaylor(12))
+
+
+def test_long_taylor_steps_obey_both_laws():
+    q, t = qubit(), 100.0
+    solution = lt.integrate(q, q.state(RHO), (0.0, t), 4.0, lt.MetriplecticTaylor(24))
+    audit, rho = solution.audit(), np.asarray(q.density(solution.x[-1]))
+    assert audit.passed
+    assert audit.energy_drift <= 1e-15
+    assert np.diff(solution.entropy).min() >= -1e-15
+    fast, rest = RATE * 2 * np.cosh(1.3 / (2 * T)), np.tanh(1.3 / (2 * T))
+    assert abs((rho[0, 0] - rho[1, 1]).real - rest - ((RHO[0, 0] - RHO[1, 1]).real - rest) * np.exp(-fast * t)) <= 1e-13
+
+
+def test_a_study_over_quantum_systems():
+    """A point is a system of its own, made by a function."""
+
+    def system(point):
+        return lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, point["rate"])]), infinite(point["temperature"]))
+
+    study = lt.Study(
+        system,
+        {"rate": [0.1, 0.3], "temperature": [0.5, 0.7]},
+        x0=qubit().state(RHO),
+        t_span=(0.0, 2.0),
+        step=0.1,
+        method=lt.MetriplecticGauss(2),
+        measure={"final": "final"},
+    )
+    study.run(progress=False)
+    q = system({"rate": 0.3, "temperature": 0.7})
+    alone = lt.integrate(q, q.state(RHO), (0.0, 2.0), 0.1, lt.MetriplecticGauss(2)).x[-1]
+    assert np.abs(study.results.final.sel(rate=0.3, temperature=0.7).values - alone).max() <= 1e-15
 
 
 def test_a_pure_state_is_refused_with_what_to_do():

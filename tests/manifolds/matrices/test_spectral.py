@@ -39,6 +39,25 @@ def test_divided_differences(name, points):
     assert got == pytest.approx(wanted, rel=3e-14)  # at most 5e-15
 
 
+def test_what_a_trace_changes_by():
+    """Its product with the step is the difference, to rounding relative to the step."""
+    A, B = hermitian(3, 1) @ hermitian(3, 1) + np.eye(3), hermitian(3, 2)
+
+    @jax.jit
+    def along(b):
+        return mf.spectral_difference(jnp.log, A, b)
+
+    for h in (0.5, 1e-3, 1e-10, 0.0):
+        found = np.asarray(along(A + h * B))
+        assert np.abs(found - found.conj().T).max() == 0.0
+        change = np.trace(found @ B).real
+        if h > 1e-4:
+            exact = (np.log(np.linalg.eigvalsh(A + h * B)).sum() - np.log(np.linalg.eigvalsh(A)).sum()) / h
+            assert change == pytest.approx(exact, rel=1e-12)
+        else:
+            assert change == pytest.approx(np.trace(np.linalg.inv(A + 0.5 * h * B) @ B).real, rel=1e-13)
+
+
 def test_divided_differences_of_a_function_of_ones_own():
     f = Plain(jnp.tanh)
     for x, y in ((0.3, 0.3), (0.3, 0.3 + 1e-8), (0.0, 1e-9), (0.3, 2.5)):
