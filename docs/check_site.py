@@ -274,10 +274,11 @@ def check_search(chromium: Browser, html: Path) -> list[str]:
     for query, expected in WORDS.items():
         chromium.open((html / "search.html").as_uri() + "?q=" + urllib.parse.quote(query))
         found = chromium.evaluate(
-            """new Promise((done) => { let tries = 0; const look = () => {
+            """new Promise((done) => { let tries = 0, before = -1, alike = 0; const look = () => {
                  const results = [...document.querySelectorAll('#search-results li')].map((e) => e.textContent);
-                 const over = document.querySelector('#search-results .search-summary, #search-results p');
-                 if ((results.length && over) || ++tries > 100) done(results); else setTimeout(look, 50); };
+                 alike = results.length && results.length === before ? alike + 1 : 0; // results come one by one
+                 before = results.length;
+                 if (alike > 10 || ++tries > 100) done(results); else setTimeout(look, 50); };
                look(); })"""
         )
         if not any(expected.casefold() in text.casefold() for text in found):

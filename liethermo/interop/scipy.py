@@ -94,7 +94,7 @@ def solve_ivp(
         Keep the states there, and no others. Steps end there, so the laws hold there.
     dense_output : bool
         Give ``sol``, the state at any time.
-    events : function of (t, y, *args), or several, optional
+    events : function of t, y and the ``args``, or several, optional
         Their zeros are located, all of them, by steps that end there. The attributes ``terminal`` (True, or the number
         of zeros after which to stop) and ``direction`` mean what they mean in SciPy. A change of sign counts, as in
         SciPy, even where the function jumps; one across states where it is not a number does not.
