@@ -175,7 +175,8 @@ def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -
 
         def goes_on(carry):
             inner, found, used = carry
-            fresh = (used == 0) | ((used < rules.reuse) & ~inner.slower(rules.stale))
+            # by the last update alone: a matrix that is stale leads astray before two updates show it
+            fresh = (used == 0) | ((used < rules.reuse) & ~(inner.update > rules.stale * inner.previous))
             return fresh & unsolved(inner, found) & ~lost(inner, damped)
 
         s, found, _ = jax.lax.while_loop(goes_on, reuse, (s, found, jnp.zeros_like(s.iterations)))

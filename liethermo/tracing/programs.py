@@ -46,6 +46,8 @@ def _program(function: Function, options: dict | None) -> Function:
         shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
         key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
         whole = _Whole(function, structure, static)
+        if options and any(isinstance(leaf, jax.core.Tracer) for leaf in dynamic):
+            return whole(dynamic)  # a part of another program, which is compiled in its own way
         return _programs.find(key, lambda: jax.jit(whole, compiler_options=options))(dynamic)
 
     return call  # type: ignore[return-value]

@@ -108,7 +108,7 @@ class SparseEngine:
             renew = found is None
             if found is not None:
                 s, misfit, scale = found
-                renew = bool(s.slower(PATIENT.stale)) and float(s.update) > PATIENT.plateau * float(scale)
+                renew = bool(s.update > PATIENT.stale * s.previous) and float(s.update) > PATIENT.plateau * float(scale)
             if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale, PATIENT)):
                 noise = _noise(self.system, self.method, state.x)
         defined = bool(jnp.isfinite(misfit).all())

@@ -350,7 +350,7 @@ REFUSED = [
     (lambda: lt.LandauLifshitz([0.1, -0.2]), "must be >= 0, not -0.2"),
     (lambda: small(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1"),
     (lambda: small(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
-    (lambda: lt.HeatBaths(-1.0), "must be positive, not -1"),
+    (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
     (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
     (lambda: small(baths=2.0), "baths are lt.HeatBaths, True"),
     (

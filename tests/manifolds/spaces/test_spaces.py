@@ -193,6 +193,7 @@ def lengths(space):
 @pytest.mark.sampled(1)
 @given(seed=seeds)
 def test_exp_and_log(S, seed):
+    needs_geodesics(S)
     x = points(S, seed)
     direction = unit(S, seed + 1, x)
     for length in lengths(S):
