@@ -162,6 +162,7 @@ def test_forces_and_heat_from_outside(method, order):
         assert runs[0].audit().energy_drift < 1e-14
 
 
+@pytest.mark.slow
 def test_su3_by_the_exponential():
     """SU(3) is none of the Cayley map's; by exp the Casimir functions stay, the order is 2, and the group is kept."""
     weights, x0 = np.linspace(1.0, 2.0, 8), np.append(np.linspace(0.1, 0.5, 8), 0.1)
