@@ -14,7 +14,7 @@ import liethermo as lt
 from liethermo.models.gas_piston import gas_piston_state
 
 piston = lt.models.gas_piston(friction=5.0, conductance=(2.0, 2.0))
-x0, end = gas_piston_state(0.35, (300.0, 320.0, 290.0)), 0.4
+x0, end = gas_piston_state(0.35, (300.0, 320.0, 290.0)), 0.1
 reference = lt.integrate(piston, x0, (0.0, end), end / 6400, lt.MetriplecticGauss(3)).x[-1]
 size = np.abs(reference)
 
@@ -25,7 +25,7 @@ routes = {
     "metriplectic midpoint": lt.MetriplecticMidpoint(),
     "metriplectic Gauss, order 4": lt.MetriplecticGauss(2),
 }
-counts = np.array([200, 400, 800, 1600])
+counts = np.array([400, 800, 1600, 3200])  # in longer steps the two leading errors of scheme 1 cancel in part
 _, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), layout="constrained")
 for name, method in routes.items():
     runs = [lt.integrate(piston, x0, (0.0, end), end / n, method) for n in counts]
@@ -37,8 +37,8 @@ for name, method in routes.items():
     )
     left.loglog(end / counts, errors, "o-", label=name, markersize=3, linewidth=1.0)
     right.semilogy(runs[0].t, drift + 1e-17, linewidth=0.8)
-left.set(xlabel="step (s)", ylabel="relative error at 0.4 s")
+left.set(xlabel="step (s)", ylabel="relative error at 0.1 s")
 left.legend(frameon=False, fontsize="small")
-right.set(xlabel="time (s)", ylabel="relative error of the energy, step 2 ms")
+right.set(xlabel="time (s)", ylabel="relative error of the energy, step 0.25 ms")
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
