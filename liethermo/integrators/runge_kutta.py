@@ -86,14 +86,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
     def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
         t = self.tableau
-        s = len(t.b)
-
-        def stage(slopes, row):
-            i, weights = row
-            found, rates = self.rates(system, laws, x + (compensation + h * (weights @ slopes)))
-            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
-
-        slopes, rates = jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
+        slopes, rates = self._stages(system, laws, x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
         return Unlawful(h * (t.b @ slopes), h * (t.b @ rates), jnp.asarray(t.d) @ slopes, ends)
 
@@ -104,19 +97,25 @@ class MetriplecticRungeKutta(ExplicitMethod):
         fit notices. Its program is short, and so are those of its derivatives.
         """
         laws, t = self._laws(system), self.tableau
-
-        def stage(slopes, row):
-            i, weights = row
-            found, rates = self.rates(system, laws, x + h * (weights @ slopes))
-            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
-
-        slopes, rates = jax.lax.scan(stage, jnp.zeros((len(t.b), x.shape[0])), (np.arange(len(t.b)), t.A))
+        slopes, rates = self._stages(system, laws, x, 0.0, h)
         end = x + h * (t.b @ slopes)
         if not laws:
             return end
         functions = [law.function for law in laws]
         missed = h * (t.b @ rates) - jnp.stack([f.value(end) - f.value(x) for f in functions])
         return end + towards([system.raised(end, f.gradient(end)) for f in functions], missed)
+
+    def _stages(self, system: System, laws: list[Law], x, compensation, h) -> tuple[jax.Array, jax.Array]:
+        """The field at the stages, shape (s, n), and the rates of the functions of the laws there, shape (s, laws)."""
+        t = self.tableau
+        s = len(t.b)
+
+        def stage(slopes, row):
+            i, weights = row
+            found, rates = self.rates(system, laws, x + (compensation + h * (weights @ slopes)))
+            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
+
+        return jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
 
     def weights(self, theta) -> np.ndarray:
         """Weights of the cubic through both ends with the slopes there; its error between them is O(h^4)."""

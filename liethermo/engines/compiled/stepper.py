@@ -196,7 +196,7 @@ class Stepper:
     kept: tuple[str, ...] = ("x", "energy", "entropy")
     """The fields that are written down at each save."""
 
-    @functools.cached_property
+    @property
     def operations(self) -> int:
         """Scalar operations of a step with one iteration."""
         return self._pieces["step"].program.size
