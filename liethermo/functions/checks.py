@@ -23,7 +23,7 @@ def recognised(energy: Energy, dim: int) -> Energy:
     if isinstance(energy, WithTime):
         return WithTime(recognised(energy.energy, dim))
     if isinstance(energy, Pullback):
-        (inner,) = jax.eval_shape(energy.of, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
     if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
         return Function(energy.function, quadratic=True)

@@ -2,42 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
+from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import at_points
+from .indices import Indices
 
 COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
 
-class Coordinates(Protocol):
-    """A term that depends on the state through coordinates: some of its components, or a function of it."""
+class Choice(Module):
+    """A linear map from a state to some of its components, in another order or in units that are powers of two."""
 
-    indices: tuple[int, ...]
-    function: Callable | None
-
-    def of(self, x) -> jax.Array: ...
+    @abstractmethod
+    def __call__(self, x) -> jax.Array: ...
 
 
-def check_coordinates(term: Coordinates, dim: int, role: str) -> None:
-    """Raise unless the coordinates of a term are components of the state, or a map at most quadratic in it."""
-    if term.function is None:
-        outside = [i for i in term.indices if not -dim <= i < dim]
+class Components(Choice):
+    """Components by their numbers; a range of them is read without gathering."""
+
+    places: range | Indices = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, numbers: Sequence[int] | np.ndarray) -> Components:
+        if isinstance(numbers, range) and numbers.step == 1 and numbers.start >= 0:
+            return cls(numbers)
+        return cls(Indices(np.asarray(numbers, dtype=np.int64)))
+
+    def __call__(self, x):
+        places = self.places
+        return x[places.start : places.stop] if isinstance(places, range) else x[np.asarray(places)]
+
+
+def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
+    """Raise unless coordinates are components of the state, or a map at most quadratic in it."""
+    if isinstance(coordinates, Components):
+        outside = [i for i in np.asarray(coordinates.places).tolist() if not -dim <= i < dim]
         if outside:  # JAX would read the last component instead
             raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
-        return
-    if is_traced(term):
+    if isinstance(coordinates, Choice) or is_traced(coordinates):
         return
     try:
-        start, end, step = at_points(_chord, term, np.random.default_rng(0).standard_normal((1, 2 * dim)))
+        start, end, step = at_points(_chord, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim)))
     except (TypeError, ValueError, IndexError) as error:
         raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
     if start.ndim != 2:
@@ -54,7 +70,7 @@ def check_coordinates(term: Coordinates, dim: int, role: str) -> None:
         )
 
 
-def _chord(term: Coordinates, ends):
+def _chord(coordinates: Callable, ends):
     """The coordinates of two random states, and their difference as a quadratic map would have it."""
     x, d = jnp.split(ends, 2)
-    return term.of(x), term.of(x + d), jax.jvp(term.of, (x + 0.5 * d,), (d,))[1]
+    return coordinates(x), coordinates(x + d), jax.jvp(coordinates, (x + 0.5 * d,), (d,))[1]

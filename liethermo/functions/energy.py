@@ -23,7 +23,7 @@ from manifolds._precision import by_own_settings
 
 from ..errors import FunctionError, InputError
 from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
-from .coordinates import check_coordinates
+from .coordinates import Choice, Components, check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
 from .rounding import with_rounding
@@ -348,56 +348,60 @@ class Pullback(Energy):
     """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
 
     For such a map ``y' - y = Dpi(z) d`` with z the midpoint, exactly, so ``Dpi(z)^T`` takes discrete gradients in y to
-    discrete gradients in x [Gonzalez 1996].
+    discrete gradients in x [Gonzalez 1996]. A choice of components leaves what is known of the term as it is.
     """
 
     term: Energy
-    indices: tuple[int, ...] = eqx.field(static=True)
-    function: Callable | None
+    coordinates: Callable
 
     def __init__(self, term: Energy, coordinates: Sequence[int] | np.ndarray | Callable):
-        self.term = term
-        self.function = coordinates if callable(coordinates) else None
-        self.indices = () if callable(coordinates) else tuple(map(int, coordinates))
+        self.term, self.coordinates = term, coordinates if callable(coordinates) else Components.of(coordinates)
+
+    @property
+    def _chooses(self) -> bool:
+        return isinstance(self.coordinates, Choice)
 
     @property
     def is_quadratic(self) -> bool:
-        return self.function is None and self.term.is_quadratic
-
-    def of(self, x) -> jax.Array:
-        """The coordinates y of a state, shape (m,)."""
-        return x[np.array(self.indices, dtype=int)] if self.function is None else self.function(x)
+        return self._chooses and self.term.is_quadratic
 
     def value(self, x) -> jax.Array:
-        return self.term.value(self.of(x))
+        return self.term.value(self.coordinates(x))
 
     def gradient(self, x) -> jax.Array:
-        y, back = jax.vjp(self.of, x)
+        y, back = jax.vjp(self.coordinates, x)
         return back(self.term.gradient(y))[0]  # in its own way, where it has one
 
     def sensitivity(self, x) -> jax.Array:
-        chosen = getattr(self.function, "in_other_units", False) or isinstance(self.term, WithTime)
-        own = self.function is None or chosen  # no more than a choice of components, in units
-        return self.term.sensitivity(self.of(x)) if own else super().sensitivity(x)
+        own = self._chooses or isinstance(self.term, WithTime)
+        return self.term.sensitivity(self.coordinates(x)) if own else super().sensitivity(x)
+
+    def rounded(self, x) -> jax.Array:
+        return self.term.rounded(self.coordinates(x)) if self._chooses else super().rounded(x)
+
+    def hidden(self, x) -> jax.Array:
+        return self.term.hidden(self.coordinates(x)) if self._chooses else super().hidden(x)
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        compensation = jnp.zeros_like(x) + compensation
-        middle, kept = x + (compensation + 0.5 * d), jax.jvp(self.of, (x + 0.5 * compensation,), (compensation,))[1]
-        step = jax.jvp(self.of, (middle,), (d,))[1]
-        (back,) = jax.vjp(self.of, middle)[1](self.term.discrete_gradient(scheme, self.of(x), step, kept))
+        if self.is_quadratic:  # at points of whole states, which others look at too
+            return scheme.quadratic(self, x, d, compensation)
+        of, compensation = self.coordinates, jnp.zeros_like(x) + compensation
+        middle, kept = x + (compensation + 0.5 * d), jax.jvp(of, (x + 0.5 * compensation,), (compensation,))[1]
+        step = jax.jvp(of, (middle,), (d,))[1]
+        (back,) = jax.vjp(of, middle)[1](self.term.discrete_gradient(scheme, of(x), step, kept))
         return back
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        path, back = path.through(self.of)
+        path, back = path.through(self.coordinates)
         return back(self.term.stage_gradients(scheme, path))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        if self.function is not None or len(self.indices) > LARGEST_CLIQUE:
+        if not isinstance(self.coordinates, Components) or len(self.coordinates.places) > LARGEST_CLIQUE:
             return None
-        return cliques([np.array(self.indices) % dim], dim)
+        return cliques([np.asarray(self.coordinates.places) % dim], dim)
 
     def check_places(self, dim: int, role: str) -> None:
-        check_coordinates(self, dim, role)
+        check_coordinates(self.coordinates, dim, role)
 
     @property
     def depends_on_time(self) -> bool:
@@ -407,10 +411,10 @@ class Pullback(Energy):
         return eqx.tree_at(lambda e: e.term, self, self.term.at_time(t)) if self.depends_on_time else self
 
     def with_time(self) -> Energy:
-        return Pullback(self.term.with_time(), BesideTime(self.of))
+        return Pullback(self.term.with_time(), BesideTime(self.coordinates))
 
     def __neg__(self) -> Energy:
-        return Pullback(-self.term, self.indices if self.function is None else self.function)
+        return Pullback(-self.term, self.coordinates)
 
 
 class Negative(Energy):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -47,11 +47,11 @@ class Frame(NamedTuple):
 
     def coefficients(self, v) -> jax.Array:
         """Those w for which ``sum_l w_l vectors[l]`` is the component of v in the span, shape (m,)."""
-        return _total(jnp.dot(e, v) * c for e, c in zip(self.units, self.combinations, strict=True))
+        return total(jnp.dot(e, v) * c for e, c in zip(self.units, self.combinations, strict=True))
 
     def with_products(self, products) -> jax.Array:
         """The vector in the span whose inner products with the given ones are these, shape (n,)."""
-        return _total(jnp.dot(c, products) * e for e, c in zip(self.units, self.combinations, strict=True))
+        return total(jnp.dot(c, products) * e for e, c in zip(self.units, self.combinations, strict=True))
 
     def _split(self, v) -> tuple[jax.Array, list[jax.Array]]:
         taken: list[jax.Array] = [jnp.zeros(())] * len(self.units)
@@ -119,6 +119,7 @@ def _inverse_root(square, usable):
     return jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)
 
 
-def _total(parts) -> jax.Array:
+def total(parts: Iterable[jax.Array]) -> jax.Array:
+    """The sum, without a zero to begin with."""
     first, *others = parts
     return sum(others, first)

@@ -27,7 +27,7 @@ from manifolds._module import Module
 
 from ..errors import InputError
 from .energy import Energy
-from .frames import frame
+from .frames import frame, total
 from .path import Finer, Path
 
 EPS = float(np.finfo(np.float64).eps)
@@ -69,8 +69,7 @@ class DiscreteGradient(Module):
         return False
 
     def __call__(self, energy: Energy, x, d, compensation=0.0) -> jax.Array:
-        parts = [term.discrete_gradient(self, x, d, compensation) for term in energy.terms]
-        return sum(parts[1:], parts[0])
+        return total(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
 
     def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
         """The midpoint gradient: exact for quadratic functions."""
@@ -229,8 +228,7 @@ def stage_gradients(
     u = x + (compensation + h * (A @ k))
     further = None if finer is None else (x + (compensation + h * (finer.A @ k)), finer.slopes @ k)
     path = Path(x, compensation, h * (b @ k), u, k, further, symmetries, h, b, finer)
-    parts = [term.stage_gradients(_stage_gradients, path) for term in energy.terms]
-    return sum(parts[1:], parts[0])
+    return total(term.stage_gradients(_stage_gradients, path) for term in energy.terms)
 
 
 def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:

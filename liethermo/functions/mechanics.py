@@ -152,7 +152,7 @@ def _by_momenta(term: Energy, x):
 
 
 def _jacobian(term: Pullback, x):
-    return jax.jacfwd(term.of)(x)
+    return jax.jacfwd(term.coordinates)(x)
 
 
 def _halves(x):

@@ -53,19 +53,6 @@ class Path(NamedTuple):
     b: np.ndarray
     finer: Finer | None
 
-    def part(self, components: slice) -> Path:
-        """The path of some components."""
-        further = self.further
-        return self._replace(
-            start=self.start[components],
-            compensation=(jnp.zeros_like(self.start) + self.compensation)[components],
-            step=self.step[components],
-            points=self.points[:, components],
-            slopes=self.slopes[:, components],
-            further=None if further is None else (further[0][:, components], further[1][:, components]),
-            symmetries=None if self.symmetries is None else self.symmetries[:, :, components],
-        )
-
     def through(self, coordinates: Callable) -> tuple[Path, Callable]:
         """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from manifolds.structures.spins import Padded, added, reshaped, summed
 
-from .energy import Energy, Negative, Sum
+from .coordinates import Choice
+from .energy import Energy, Negative, Pullback, Sum
 from .magnetism import SpinEnergy, off_lattice, on_lattice
 from .with_baths import WithBaths
 
@@ -30,8 +31,9 @@ def to_sites(x, count: int) -> jax.Array:
 
 def _exchanged(x, shape: tuple[int, int]) -> jax.Array:
     front, size = x.shape[:-1], shape[0] * shape[1]
-    spins = jnp.swapaxes(x[..., :size].reshape(*front, *shape), -1, -2).reshape(*front, size)
-    return jnp.concatenate([spins, x[..., size:]], axis=-1)
+    spins = x if size == x.shape[-1] else x[..., :size]
+    spins = jnp.swapaxes(spins.reshape(*front, *shape), -1, -2).reshape(*front, size)
+    return spins if size == x.shape[-1] else jnp.concatenate([spins, x[..., size:]], axis=-1)
 
 
 def by_planes(energy: Energy, count: int) -> Energy:
@@ -53,7 +55,7 @@ def _by_planes(term: Energy, count: int) -> Energy:
         return WithBaths(by_planes(term.body, count), term.baths, term.size, term.dim)
     if isinstance(term, Negative):
         return Negative(by_planes(term.term, count))
-    return Rearranged(term, count)
+    return Pullback(term, BySites(count))
 
 
 class InPlanes(Energy):
@@ -100,35 +102,10 @@ def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(max(along) for along in zip(*found, strict=True))
 
 
-class Rearranged(Energy):
-    """Any function of states that are site by site."""
+class BySites(Choice):
+    """A state that is component by component, site by site."""
 
-    term: Energy
     count: int = eqx.field(static=True)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return self.term.is_quadratic
-
-    def value(self, x) -> jax.Array:
-        return self.term.value(self._of(x))
-
-    def gradient(self, x) -> jax.Array:
-        return to_planes(self.term.gradient(self._of(x)), self.count)
-
-    def sensitivity(self, x) -> jax.Array:
-        return self.term.sensitivity(self._of(x))
-
-    def rounded(self, x) -> jax.Array:
-        return self.term.rounded(self._of(x))
-
-    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        ends = (self._of(v) for v in (x, d, jnp.zeros_like(x) + compensation))
-        return to_planes(self.term.discrete_gradient(scheme, *ends), self.count)
-
-    def stage_gradients(self, scheme, path) -> jax.Array:
-        path, back = path.through(self._of)
-        return back(self.term.stage_gradients(scheme, path))
-
-    def _of(self, x) -> jax.Array:
+    def __call__(self, x):
         return to_sites(x, self.count)

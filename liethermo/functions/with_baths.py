@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import scipy
 
-from .energy import Energy
+from .coordinates import Components
+from .energy import Energy, Pullback
+from .frames import total
 from .indices import as_pattern
-from .of_first import OfFirst
 from .path import Path
 
 
@@ -53,42 +52,41 @@ class WithBaths(Energy):
     def at_time(self, t) -> Energy:
         return WithBaths(self.body.at_time(t), self.baths, self.size, self.dim)
 
+    @property
+    def _parts(self) -> tuple[tuple[Energy, Components], ...]:
+        return (self.body, Components(range(self.size))), (self.baths, Components(range(self.size, self.dim)))
+
     def value(self, x) -> jax.Array:
-        return self.body.value(x[: self.size]) + self.baths.value(x[self.size :])
+        return total(energy.value(of(x)) for energy, of in self._parts)
 
     def gradient(self, x) -> jax.Array:
-        return jnp.concatenate([self.body.gradient(x[: self.size]), self.baths.gradient(x[self.size :])])
+        return jnp.concatenate([energy.gradient(of(x)) for energy, of in self._parts])
 
     def sensitivity(self, x) -> jax.Array:
-        return self.body.sensitivity(x[: self.size]) + self.baths.sensitivity(x[self.size :])
+        return total(energy.sensitivity(of(x)) for energy, of in self._parts)
 
     def rounded(self, x) -> jax.Array:
-        return self.body.rounded(x[: self.size]) + self.baths.rounded(x[self.size :])
+        return total(energy.rounded(of(x)) for energy, of in self._parts)
 
     def hidden(self, x) -> jax.Array:
-        def of(energy: Energy, part) -> jax.Array:
-            return sum((term.hidden(part) for term in energy.terms), jnp.zeros(()))
-
-        return of(self.body, x[: self.size]) + of(self.baths, x[self.size :])
+        return total(term.hidden(of(x)) for energy, of in self._parts for term in energy.terms)
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        compensation, n = jnp.zeros_like(x) + compensation, self.size
+        ends = x, d, jnp.zeros_like(x) + compensation
 
-        def of(energy: Energy, *ends) -> jax.Array:
-            return _total(term.discrete_gradient(scheme, *ends) for term in energy.terms)
+        def part(energy: Energy, of: Components) -> jax.Array:
+            if energy is self.body and energy.is_quadratic:  # at points of whole states, which others look at too
+                return of(scheme.quadratic(Pullback(energy, of), *ends))
+            return total(term.discrete_gradient(scheme, *map(of, ends)) for term in energy.terms)
 
-        if self.body.is_quadratic:  # at points of whole states, which others look at too
-            by_body = scheme.quadratic(OfFirst(self.body, n), x, d, compensation)[:n]
-        else:
-            by_body = of(self.body, x[:n], d[:n], compensation[:n])
-        return jnp.concatenate([by_body, of(self.baths, x[n:], d[n:], compensation[n:])])
+        return jnp.concatenate([part(*one) for one in self._parts])
 
     def stage_gradients(self, scheme, path: Path) -> jax.Array:
-        def of(energy: Energy, components: slice) -> jax.Array:
-            part = path.part(components)
-            return _total(term.stage_gradients(scheme, part) for term in energy.terms)
+        def part(energy: Energy, of: Components) -> jax.Array:
+            seen, _ = path.through(of)
+            return total(term.stage_gradients(scheme, seen) for term in energy.terms)
 
-        return jnp.concatenate([of(self.body, slice(None, self.size)), of(self.baths, slice(self.size, None))], axis=1)
+        return jnp.concatenate([part(*one) for one in self._parts], axis=1)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         body, baths = self.body.couplings(self.size), self.baths.couplings(dim - self.size)
@@ -103,8 +101,3 @@ class WithBaths(Energy):
 
     def __neg__(self) -> Energy:
         return WithBaths(-self.body, -self.baths, self.size, self.dim)
-
-
-def _total(parts: Iterable[jax.Array]) -> jax.Array:
-    first, *others = parts
-    return sum(others, first)

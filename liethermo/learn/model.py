@@ -162,7 +162,7 @@ def _filled(tree: Any, x: jax.Array, unit) -> Any:
 
     def change(part):
         if isinstance(part, Pullback):
-            inner = _filled(part.term, jax.vmap(part.of)(x), unit)
+            inner = _filled(part.term, jax.vmap(part.coordinates)(x), unit)
             return eqx.tree_at(lambda p: p.term, part, inner)
         if not isinstance(part, Network) or not part.is_new:
             return part

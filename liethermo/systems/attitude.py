@@ -16,8 +16,7 @@ from manifolds.groups import maps
 
 from ..dissipation.base import Carried
 from ..errors import InputError
-from ..functions.energy import Energy, Sum
-from ..functions.of_first import OfFirst
+from ..functions.energy import Energy, Linear
 from ..tracing.interpret import at_points
 from .base import System
 from .driven import DrivenSystem
@@ -207,7 +206,7 @@ class AttitudeSystem(System):
     @property
     def ledger(self):
         found = {name: self._of_momentum(f) for name, f in self.body.ledger.items()}
-        return found | {name: Component(i - self.group.dim) for i, name in enumerate(self.impulses)}
+        return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulses)}
 
     @property
     def balance(self):
@@ -229,8 +228,7 @@ class AttitudeSystem(System):
         return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
 
     def _of_momentum(self, energy: Energy) -> Energy:
-        terms = tuple(OfFirst(term, self.body.dim) for term in energy.terms)
-        return terms[0] if len(terms) == 1 else Sum(terms)
+        return energy.on(range(self.body.dim))
 
     @property
     def _parts(self) -> int:
@@ -246,19 +244,6 @@ def _at_states(function: Callable, system: AttitudeSystem, x):
     """The values of ``function(system, x)`` at states, shape (m, n)."""
     rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
     return at_points(function, system, np.asarray(x)[rows])
-
-
-class Component(Energy):
-    """One component of a state."""
-
-    place: int = eqx.field(static=True)
-
-    @property
-    def is_quadratic(self) -> bool:
-        return True
-
-    def value(self, x) -> jax.Array:
-        return x[self.place]
 
 
 def momenta_of(body: System) -> LiePoissonSystem:

@@ -20,9 +20,8 @@ from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
 from ..errors import AxiomError, CasimirError, FunctionError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, Sum, as_energy
+from ..functions.energy import Energy, as_energy
 from ..functions.frames import frame
-from ..functions.of_first import OfFirst
 from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
@@ -156,8 +155,7 @@ class System(Kind):
 
     def _of_body(self, energy: Energy) -> Energy:
         """A function of the state of the body, as one of that with baths."""
-        terms = tuple(OfFirst(term, self.body_dim) for term in energy.terms)
-        return terms[0] if len(terms) == 1 else Sum(terms)
+        return energy.on(range(self.body_dim))
 
     @by_own_settings
     def temperatures(self, x) -> jax.Array:

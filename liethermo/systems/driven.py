@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from copy import copy
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
 
 from ..dissipation.base import Carried, Law, SkewFriction
 from ..errors import InputError
 from ..functions.checks import recognised
-from ..functions.energy import Energy, InChart, Pullback, Quadratic, Sum, WithTime
+from ..functions.coordinates import Choice
+from ..functions.energy import Energy, InChart, Linear, Pullback, Quadratic, Sum, WithTime
 from .base import System
 
 UNIT = 2.0**-100
@@ -62,7 +61,7 @@ class DrivenSystem(System):
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
         self.poisson = _WithClock(body.poisson, unit)
-        energy = Sum((*map(self._term, body.energy.terms), _MinusWork(self.dim, unit)))
+        energy = Sum((*map(self._term, body.energy.terms), _MinusWork(unit)))
         self.energy = energy if self.space is not None else recognised(energy, self.dim)
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
@@ -186,11 +185,8 @@ class DrivenSystem(System):
         return energy.on(range(self.body.dim))
 
     def _term(self, term: Energy) -> Energy:
-        if not term.depends_on_time:
-            return self._of_body(term)
-        if self.space is not None:
-            return _OnSpaceAndTime(term.with_time(), self.unit)
-        return term.with_time().on(_Clock(self.body.dim, self.unit))
+        clock = _Clock(self.body.dim, self.unit)
+        return _OfTime(term.with_time(), clock) if term.depends_on_time else self._of_body(term)
 
     def casimirs(self):
         return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
@@ -302,59 +298,35 @@ class _OnBody(Carried):
         return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, 2)))
 
 
-class _Clock(Module):
+class _Clock(Choice):
     """From a state with clock and work to x and t."""
 
-    in_other_units: ClassVar[bool] = True
     dim: int = eqx.field(static=True)
     unit: float = eqx.field(static=True)
 
-    def __call__(self, y):
-        return jnp.append(y[: self.dim], y[self.dim] / self.unit)
+    def __call__(self, x):
+        return jnp.append(x[: self.dim], x[self.dim] / self.unit)
 
 
-class _MinusWork(Energy):
+class _MinusWork(Pullback):
     """``-W``, the last component of a state."""
 
-    dim: int = eqx.field(static=True)
-    unit: float = eqx.field(static=True)
-
-    @property
-    def is_quadratic(self) -> bool:
-        return True
-
-    def value(self, x) -> jax.Array:
-        return -x[-1] / self.unit
-
-    def gradient(self, x) -> jax.Array:
-        return jnp.zeros_like(x).at[-1].set(-1.0 / self.unit)
-
-    def sensitivity(self, x) -> jax.Array:
-        return jax.lax.stop_gradient(jnp.abs(self.value(x)))
+    def __init__(self, unit: float):
+        super().__init__(Linear(jnp.array([-1.0 / unit])), [-1])
 
     def in_chart(self, coordinates, space, start=None):
-        slope = jnp.zeros(space.dim).at[-1].set(-1.0 / self.unit)
-        return Quadratic(jnp.zeros(space.dim), slope, self.value(space.to_vector(coordinates.centre().point)))
+        value = self.value(space.to_vector(coordinates.centre().point))
+        return Quadratic(jnp.zeros(space.dim), self.gradient(jnp.zeros(space.dim)), value)
 
 
-class _OnSpaceAndTime(Energy):
-    """A function of (x, t), shape (n + 1,), x a point of a space, on its product with clock and work."""
+class _OfTime(Pullback):
+    """A function of (x, t), shape (n + 1,), as one of a state with clock and work."""
 
-    energy: Energy
-    unit: float = eqx.field(static=True)
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(self._joined(x))
-
-    def sensitivity(self, x) -> jax.Array:
-        return self.energy.sensitivity(self._joined(x))
-
-    def _joined(self, x):
-        return jnp.append(x[:-2], x[-2] / self.unit)
+    coordinates: _Clock
 
     def in_chart(self, coordinates, space, start=None):
-        local = WithTime(_InChartAndTime(InChart(self, coordinates, space, start), self.unit))
-        return Pullback(local, _Clock(space.dim - 2, self.unit))
+        clock = _Clock(space.dim - 2, self.coordinates.unit)
+        return Pullback(WithTime(_InChartAndTime(InChart(self, coordinates, space, start), clock.unit)), clock)
 
 
 class _InChartAndTime(Energy):

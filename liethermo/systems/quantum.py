@@ -18,7 +18,6 @@ from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, checked_h
 from ..errors import InputError
 from ..functions.density import Expectation, VonNeumann
 from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
-from ..functions.of_first import OfFirst
 from ..functions.warmth import Reservoir, Warmth
 from ..functions.with_baths import WithBaths
 from .base import TIMES, System
@@ -100,7 +99,7 @@ class QuantumSystem(System):
         if baths is not None:
             self.baths = baths
             poisson, energy = BesideBaths(structure, m), WithBaths(energy, baths.energy, n, n + m)
-            whole = Sum((OfFirst(entropy, n), EntropyOfBaths(m)))
+            whole = Sum((entropy.on(range(n)), EntropyOfBaths(m)))
         self._build(poisson, n + m, energy, whole, terms or None, {}, validate)
         if not self.preserved:  # whether an observable is kept by the motion is found out
             self.decided = Decided(frozenset(self.casimirs()), frozenset())
@@ -264,7 +263,7 @@ class QuantumSystem(System):
         trace = Quadratic(np.zeros(n), np.where(np.arange(n) < self.structure.size, 1.0, 0.0))
         if self.dissipation is None:
             return {"tr(rho)": trace, "tr(rho^2)": Quadratic(np.full(n, 2.0))}
-        return {"tr(rho)": trace if self.baths is None else OfFirst(trace, n)}
+        return {"tr(rho)": trace if self.baths is None else trace.on(range(n))}
 
     # -- products -----------------------------------------------------------------------------------------------------
 
