@@ -12,7 +12,7 @@ import functools
 import operator
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -262,6 +262,32 @@ def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple
         start = end
 
 
+class There(NamedTuple):
+    """Where a dissipation acts that is carried to other states: the system and the state there, and the way to and fro.
+
+    Attributes
+    ----------
+    system : Geometry
+    x : array, shape (m,)
+    lift : function
+        From a gradient here, shape (n,), to that there, shape (m,).
+    lower : function
+        From a velocity there to that here.
+    volume : bool
+        Whether a field of divergence zero there has none here.
+    """
+
+    system: Geometry
+    x: jax.Array
+    lift: Callable
+    lower: Callable
+    volume: bool = False
+
+    def lifted(self, dH, dS, dL) -> tuple:
+        """The gradients there; dS may be None."""
+        return self.lift(dH), None if dS is None else self.lift(dS), tuple(map(self.lift, dL))
+
+
 class Carried(Dissipation):
     """A dissipation in other coordinates or on a larger state: it obeys the laws of the one that it is made from.
 
@@ -274,6 +300,33 @@ class Carried(Dissipation):
 
     part: Dissipation
     functions: tuple[Energy, ...]
+
+    @abstractmethod
+    def there(self, system: Geometry, x) -> There:
+        """Where it acts when it is asked for at x."""
+
+    def force(self, system, x, dH, dS, dL):
+        at = self.there(system, x)
+        return at.lower(self.part.force(at.system, at.x, *at.lifted(dH, dS, dL)))
+
+    @property
+    def has_generator(self) -> bool:
+        return self.part.has_generator
+
+    def generated(self, system, x, dH):
+        at = self.there(system, x)
+        return at.lower(self.part.generated(at.system, at.x, at.lift(dH)))
+
+    def factor(self, system, x, dH, dL):
+        at = self.there(system, x)
+        B = self.part.factor(at.system, at.x, at.lift(dH), tuple(map(at.lift, dL)))
+        if B is None:
+            return None
+        return B._replace(times=lambda w: at.lower(B.times(w)), solenoidal=at.volume and B.solenoidal)
+
+    def own_residuals(self, system, x):
+        at = self.there(system, x)
+        return self.part.own_residuals(at.system, at.x)
 
     @classmethod
     def of(cls, dissipation: Dissipation | None, pulled: Callable[[Energy], Energy], *more) -> Dissipation | None:
@@ -311,10 +364,5 @@ class Carried(Dissipation):
 class SkewFriction(Dissipation):
     """A skew bracket with the energy alone, so that the energy is conserved: friction that heats [SML 6]."""
 
-    @property
-    def needs_entropy(self) -> bool:
-        return False
-
-    @property
-    def symmetric(self) -> bool:
-        return False
+    needs_entropy = False
+    symmetric = False

@@ -54,21 +54,10 @@ class DoubleBracket(Dissipation):
         self.bath = checked_bath(bath)
         self.metric = None if metric is None else _form(metric)
 
-    @property
-    def energy_law(self):
-        return "nonincreasing"
-
-    @property
-    def entropy_law(self):
-        return "conserved"
-
-    @property
-    def keeps_casimirs(self):
-        return True
-
-    @property
-    def needs_entropy(self):
-        return False
+    energy_law = "nonincreasing"
+    entropy_law = "conserved"
+    keeps_casimirs = True
+    needs_entropy = False
 
     def prepared(self, system):
         if self.metric is None:

@@ -29,13 +29,8 @@ class EulerPoincareForce(Dissipation):
 
     F: Callable
 
-    @property
-    def entropy_law(self):
-        return None
-
-    @property
-    def needs_entropy(self):
-        return False
+    entropy_law = None
+    needs_entropy = False
 
     def prepared(self, system):
         needed_algebra(system, "EulerPoincareForce")

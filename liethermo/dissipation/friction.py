@@ -47,17 +47,9 @@ class Friction(Dissipation):
         self.rate = checked_rate(rate)
         self.bath = checked_bath(bath)
 
-    @property
-    def energy_law(self):
-        return "nonincreasing"
-
-    @property
-    def entropy_law(self):
-        return None
-
-    @property
-    def needs_entropy(self):
-        return False
+    energy_law = "nonincreasing"
+    entropy_law = None
+    needs_entropy = False
 
     def prepared(self, system):
         if self.D is not None:

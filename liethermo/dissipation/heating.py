@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.indices import Indices
-from .base import Carried, Dissipation, Several
+from .base import Carried, Dissipation, Several, There
 from .geometry import Geometry
 
 
@@ -40,21 +40,11 @@ class Heating(Carried):
     bath: Indices = eqx.field(static=True)
     positive: bool = eqx.field(static=True)
 
-    @property
-    def energy_law(self):
-        return "conserved"
-
-    @property
-    def entropy_law(self):
-        return "nondecreasing"
-
-    @property
-    def symmetric(self) -> bool:
-        return True
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
+    energy_law = "conserved"
+    entropy_law = "nondecreasing"
+    symmetric = True
+    needs_entropy = False
+    has_generator = False
 
     def force(self, system, x, dH, dS, dL):
         body, n = system.without_baths(), system.body_dim
@@ -95,8 +85,8 @@ class Heating(Carried):
         found = B.transposed(body.at_sites(share, dH[:n]))
         return found if B.solenoidal else found + jnp.sqrt(T) * self.part.divergence(body, x[:n])
 
-    def own_residuals(self, system, x):
-        return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
+    def there(self, system, x) -> There:
+        return _of_body(system, x)
 
     @property
     def by_site(self) -> bool:
@@ -136,22 +126,19 @@ class Heating(Carried):
 class BesideBaths(Carried):
     """A dissipation of a body that makes no heat, beside baths."""
 
-    def force(self, system, x, dH, dS, dL):
-        body, n = system.without_baths(), system.body_dim
-        force = self.part.force(body, x[:n], dH[:n], dS[:n], tuple(L[:n] for L in dL))
-        return jnp.pad(force, (0, len(x) - n))
+    def there(self, system, x) -> There:
+        return _of_body(system, x)
 
     def velocity(self, system, x, dH, dS, dL):
-        n = system.body_dim
-        return self.part.velocity(system.without_baths(), x[:n], dH[:n], dS[:n], tuple(L[:n] for L in dL))
+        at = _of_body(system, x)
+        return self.part.velocity(at.system, at.x, *at.lifted(dH, dS, dL))
 
-    def factor(self, system, x, dH, dL):
-        n = system.body_dim
-        B = self.part.factor(system.without_baths(), x[:n], dH[:n], tuple(L[:n] for L in dL))
-        return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, len(x) - n)))
 
-    def own_residuals(self, system, x):
-        return self.part.own_residuals(system.without_baths(), x[: system.body_dim])
+def _of_body(system: Geometry, x) -> There:
+    n = system.body_dim
+    return There(
+        system.without_baths(), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)), volume=True
+    )
 
 
 def heated(

@@ -53,21 +53,10 @@ class LandauLifshitz(Dissipation):
         alpha, ratio = real_array(alpha), real_array(ratio)
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
-    @property
-    def energy_law(self):
-        return "nonincreasing"
-
-    @property
-    def entropy_law(self):
-        return "conserved"
-
-    @property
-    def keeps_casimirs(self) -> bool:
-        return True
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
+    energy_law = "nonincreasing"
+    entropy_law = "conserved"
+    keeps_casimirs = True
+    needs_entropy = False
 
     def prepared(self, system):
         spins = system.poisson

@@ -70,9 +70,7 @@ class DissipationPotential(Dissipation):
             raise InputError(f"a potential composed with {type(of).__name__} would not keep the energy")
         self.psi, self.of, self.of_state = psi, of, needed_arguments(psi) == 2
 
-    @property
-    def symmetric(self):
-        return False
+    symmetric = False
 
     @property
     def keeps_casimirs(self):

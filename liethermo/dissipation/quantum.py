@@ -178,9 +178,7 @@ class ThermalJumps(Dissipation):
         lost = jnp.sum(turned.conj() * image).real
         return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-lost / T)])
 
-    @property
-    def has_generator(self) -> bool:
-        return True
+    has_generator = True
 
     def generated(self, system, x, dH):
         """Lindblad's equation, and the heat that the bath takes."""

@@ -116,8 +116,11 @@ class Energy(Module):
         coordinates : sequence of int, or function from x, shape (n,), to y, shape (m,)
             Indices into the state, or a map at most quadratic in x (checked where a system is built).
         """
-        pulled = tuple(Pullback(term, coordinates) for term in self.terms)
-        return pulled[0] if len(pulled) == 1 else Sum(pulled)
+        return self.mapped(lambda term: Pullback(term, coordinates))
+
+    def mapped(self, change: Callable[[Energy], Energy]) -> Energy:
+        """The sum of what its terms become."""
+        return Sum.of([change(term) for term in self.terms])
 
     @property
     def depends_on_time(self) -> bool:
@@ -194,9 +197,7 @@ class Quadratic(Energy):
             if asymmetry > 0.0:  # the gradient A x of the value x A x / 2 has to be exact
                 self.A = real_array((matrix + matrix.T) / 2)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def linear_part(self, x) -> jax.Array:
         """``A x``."""
@@ -229,9 +230,7 @@ class Linear(Energy):
 
     b: jax.Array
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def value(self, x) -> jax.Array:
         return jnp.dot(self.b, x)
@@ -279,9 +278,7 @@ class TimeDependent(Energy):
 
     function: Callable
 
-    @property
-    def depends_on_time(self) -> bool:
-        return True
+    depends_on_time = True
 
     def at_time(self, t) -> Energy:
         return Function(AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
@@ -455,6 +452,11 @@ class Sum(Energy):
     """A sum of energies."""
 
     summands: tuple[Energy, ...]
+
+    @classmethod
+    def of(cls, terms: Sequence[Energy]) -> Energy:
+        """A sum of some, which is the one where there is no other."""
+        return terms[0] if len(terms) == 1 else cls(tuple(terms))
 
     @property
     def terms(self) -> tuple[Energy, ...]:

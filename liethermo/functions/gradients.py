@@ -92,9 +92,7 @@ class Gonzalez(DiscreteGradient):
 
     noisy: float = eqx.field(static=True, default=NOISY)
 
-    @property
-    def orderless(self) -> bool:
-        return True
+    orderless = True
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
         left, middle, right = jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(_NODES_3)
@@ -116,9 +114,7 @@ class MeanValue(DiscreteGradient):
 
     nodes: int = eqx.field(static=True, default=5)
 
-    @property
-    def orderless(self) -> bool:
-        return True
+    orderless = True
 
     def __check_init__(self):
         if not isinstance(self.nodes, int) or self.nodes < 1:

@@ -151,9 +151,7 @@ class SpinEnergy(Energy):
     def gradients(self, spins: Lattice) -> Planes:
         """The gradients by the spins."""
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def value(self, x) -> jax.Array:
         return self.of(Lattice(on_lattice(x, self.sites)))
@@ -300,7 +298,7 @@ def _lattice(shape, strength, vectors, neighbours, periodic, what: str) -> Energ
         terms.append(
             Bonds(shape, tuple(offset), value, None) if vectors is None else Bonds(shape, tuple(offset), None, value)
         )
-    return terms[0] if len(terms) == 1 else Sum(tuple(terms))
+    return Sum.of(terms)
 
 
 def _checked_offset(offset, axes: int) -> list[int]:

@@ -28,8 +28,7 @@ def on_points(energy: Energy, space: mf.Space | None) -> Energy:
     """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
     if space is None or space.shape == (space.size,):
         return energy
-    terms = tuple(_on_points(term, space) for term in energy.terms)
-    return terms[0] if len(terms) == 1 else Sum(terms)
+    return energy.mapped(lambda term: _on_points(term, space))
 
 
 def _on_points(term: Energy, space: mf.Space) -> Energy:

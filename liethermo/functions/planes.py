@@ -47,7 +47,7 @@ def by_planes(energy: Energy, count: int) -> Energy:
             terms.append(_by_planes(term, count))
     if lattice:
         terms.append(InPlanes(tuple(lattice)))
-    return terms[0] if len(terms) == 1 else Sum(tuple(terms))
+    return Sum.of(terms)
 
 
 def _by_planes(term: Energy, count: int) -> Energy:
@@ -63,9 +63,7 @@ class InPlanes(Energy):
 
     parts: tuple[SpinEnergy, ...]
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def value(self, x) -> jax.Array:
         spins = self._spins(x)

@@ -72,9 +72,7 @@ class Squares(Energy):
 
     count: int = eqx.field(static=True)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def value(self, x) -> jax.Array:
         return 0.5 * jnp.sum(x[: 3 * self.count] ** 2)

@@ -107,9 +107,7 @@ class ExplicitMethod(TransportingMethod):
         assert self.number is not None
         return self.number
 
-    @property
-    def explicit(self) -> bool:
-        return True
+    explicit = True
 
     @property
     def preserves(self) -> frozenset[str]:

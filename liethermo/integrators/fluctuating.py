@@ -56,9 +56,7 @@ class Fluctuating(Wrapping, TransportingMethod):
     density: Energy | None
     dW: jax.Array
 
-    @property
-    def order(self) -> int:
-        return 1
+    order = 1
 
     @property
     def preserves(self) -> frozenset[str]:

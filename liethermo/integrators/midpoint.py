@@ -55,9 +55,7 @@ class MetriplecticMidpoint(TransportingMethod):
         del tolerance
         return in_charts(self, system, self.retraction, "midpoint")
 
-    @property
-    def stages(self) -> int:
-        return 1
+    stages = 1
 
     @property
     def order(self) -> int:

@@ -17,7 +17,7 @@ from ..dissipation.factor import Factor
 from ..errors import InputError
 from ..functions.energy import Energy as AnyEnergy
 from ..functions.energy import Function
-from ..systems.baths import BesideBaths
+from ..systems.baths import beside_baths
 from .networks import Learned, Network
 
 
@@ -140,7 +140,7 @@ def behind(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonStructure
         return poisson
     if dim < poisson.dim:
         raise InputError(f"the Poisson structure has {poisson.dim} coordinates, more than the {dim} of a state")
-    return BesideBaths(poisson, dim - poisson.dim)
+    return beside_baths(poisson, dim - poisson.dim)
 
 
 class Friction(Dissipation):

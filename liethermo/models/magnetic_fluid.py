@@ -22,9 +22,7 @@ class MagneticEnergy(Energy):
 
     sphere: QuantisedSphere = eqx.field(static=True)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def gradient(self, x) -> jax.Array:
         sphere, n = self.sphere, self.sphere.algebra.dim

@@ -37,17 +37,9 @@ class InBearing(Dissipation):
     friction: jax.Array
     bath: Indices = eqx.field(static=True)
 
-    @property
-    def energy_law(self):
-        return "nonincreasing"
-
-    @property
-    def entropy_law(self):
-        return None
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
+    energy_law = "nonincreasing"
+    entropy_law = None
+    needs_entropy = False
 
     def force(self, system, x, dH, dS, dL):
         return jnp.zeros_like(x).at[3].set(-self.friction * dH[3])
@@ -78,17 +70,9 @@ class InRotor(Dissipation):
     axis: jax.Array
     bath: Indices = eqx.field(static=True)
 
-    @property
-    def energy_law(self):
-        return "nonincreasing"
-
-    @property
-    def entropy_law(self):
-        return None
-
-    @property
-    def needs_entropy(self) -> bool:
-        return False
+    energy_law = "nonincreasing"
+    entropy_law = None
+    needs_entropy = False
 
     def _moved(self, x, sigma) -> jax.Array:
         turned = jnp.cross(x[:3], sigma)

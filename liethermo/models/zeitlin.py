@@ -24,9 +24,7 @@ class KineticEnergy(Energy):
 
     sphere: QuantisedSphere = eqx.field(static=True)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def gradient(self, x) -> jax.Array:
         psi = self.sphere.inverse_laplacian(x)

@@ -14,7 +14,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds.groups import maps
 
-from ..dissipation.base import Carried
+from ..dissipation.base import Carried, There
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
 from ..tracing.interpret import at_points
@@ -365,7 +365,6 @@ class _OnMomentum(Carried):
     def noiseless(self) -> bool:
         return self.part.noiseless
 
-    def force(self, system, x, dH, dS, dL):
+    def there(self, system, x) -> There:
         n = system.whole.body.dim
-        dS, dL = None if dS is None else dS[:n], tuple(L[:n] for L in dL)
-        return jnp.pad(self.part.force(system.body_at(x), x[:n], dH[:n], dS, dL), (0, len(x) - n))
+        return There(system.body_at(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)))

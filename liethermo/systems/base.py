@@ -15,6 +15,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 from manifolds._precision import by_own_settings
+from manifolds.structures.poisson import Beside
 
 from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
@@ -26,7 +27,7 @@ from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
 from ..tracing.traced import settled
-from .baths import BesideBaths, EntropyOfBaths, HeatBaths
+from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 from .kinds import Decided, Kind
 
@@ -131,7 +132,7 @@ class System(Kind):
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
-        self.poisson = BesideBaths(body.poisson, m)
+        self.poisson = beside_baths(body.poisson, m)
         self.energy = WithBaths(body.energy, baths.energy, n, self.dim)
         heat = EntropyOfBaths(m)
         self.entropy = heat if body.entropy is None else self._of_body(body.entropy) + heat
@@ -140,12 +141,12 @@ class System(Kind):
     def without_baths(self) -> System:
         if self.baths is None:
             return self
-        assert isinstance(self.poisson, BesideBaths)
+        assert isinstance(self.poisson, Beside)
         body = copy(self)
         parts = {
             "dim": self.body_dim,
             "space": None if self.space is None else _first_factors(self.space),
-            "poisson": self.poisson.body,
+            "poisson": self.poisson.first,
             "energy": self.energy.body if isinstance(self.energy, WithBaths) else self.energy,
             "baths": None,
         }

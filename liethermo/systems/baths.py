@@ -13,6 +13,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 from manifolds._module import Module
+from manifolds.structures.poisson import Beside
 
 from ..errors import InputError
 from ..functions.each import Each
@@ -102,22 +103,9 @@ class _OfEntropy(Module):
         return self.energy(y[0])
 
 
-class BesideBaths(mf.PoissonStructure):
+def beside_baths(body: mf.PoissonStructure, number: int) -> Beside:
     """The Poisson structure of a body, with entropies behind its state that nothing is conjugate to."""
-
-    body: mf.PoissonStructure
-    number: int = eqx.field(static=True)
-
-    @property
-    def dim(self) -> int:
-        assert self.body.dim is not None
-        return self.body.dim + self.number
-
-    def tensor(self, x) -> jax.Array:
-        return jnp.pad(self.body.tensor(x[: -self.number]), ((0, self.number), (0, self.number)))
-
-    def sharp(self, x, alpha) -> jax.Array:
-        return jnp.pad(self.body.sharp(x[: -self.number], alpha[: -self.number]), (0, self.number))
+    return Beside(body, mf.NoPoisson(number))
 
 
 class EntropyOfBaths(Energy):
@@ -125,9 +113,7 @@ class EntropyOfBaths(Energy):
 
     number: int = eqx.field(static=True)
 
-    @property
-    def is_quadratic(self) -> bool:
-        return True
+    is_quadratic = True
 
     def value(self, x) -> jax.Array:
         return jnp.sum(x[-self.number :])

@@ -8,12 +8,12 @@ the gradients of the functions. So every law that a method keeps in R^dim it kee
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 
 import manifolds as mf
+from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import Carried
-from ..functions.energy import Energy, Sum
+from ..dissipation.base import Carried, There
+from ..functions.energy import Energy
 from .base import System
 
 
@@ -50,9 +50,9 @@ class ChartSystem(System):
 
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
-        assert self.manifold.space is not None
-        terms = tuple(term.in_chart(self.coordinates, self.manifold.space, self.start) for term in energy.terms)
-        return terms[0] if len(terms) == 1 else Sum(terms)
+        space = self.manifold.space
+        assert space is not None
+        return energy.mapped(lambda term: term.in_chart(self.coordinates, space, self.start))
 
     @property
     def smooth(self) -> bool:
@@ -86,7 +86,7 @@ class _Place:
         return self._place.lower(self._space.from_vector(v))
 
 
-class _Poisson(mf.PoissonStructure):
+class _Poisson(PoissonBySharp):
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
@@ -95,9 +95,6 @@ class _Poisson(mf.PoissonStructure):
     def dim(self) -> int:
         assert self.system.space is not None
         return self.system.space.dim
-
-    def tensor(self, x):
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
 
     def sharp(self, x, alpha):
         place = _Place(self.system, self.coordinates, self.place, x)
@@ -109,15 +106,9 @@ class _Force(Carried):
     coordinates: mf.Coordinates
     place: mf.Place | None
 
-    def force(self, system, x, dH, dS, dL):
+    def there(self, system, x) -> There:
         place = _Place(self.system, self.coordinates, self.place, x)
-        dL = tuple(map(place.lift, dL))
-        return place.lower(self.part.force(self.system, place.state, place.lift(dH), place.lift(dS), dL))
-
-    def factor(self, system, x, dH, dL):
-        place = _Place(self.system, self.coordinates, self.place, x)
-        B = self.part.factor(self.system, place.state, place.lift(dH), tuple(map(place.lift, dL)))
-        return None if B is None else B._replace(times=lambda w: place.lower(B.times(w)), solenoidal=False)
+        return There(self.system, place.state, place.lift, place.lower)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.structures.poisson import Beside, PoissonBySharp
 
-from ..dissipation.base import Carried, Law, SkewFriction
+from ..dissipation.base import Carried, Law, SkewFriction, There
 from ..errors import InputError
 from ..functions.checks import recognised
 from ..functions.coordinates import Choice
@@ -60,7 +61,7 @@ class DrivenSystem(System):
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
-        self.poisson = _WithClock(body.poisson, unit)
+        self.poisson = Beside(body.poisson, _OfClock(unit))
         energy = Sum((*map(self._term, body.energy.terms), _MinusWork(unit)))
         self.energy = energy if self.space is not None else recognised(energy, self.dim)
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
@@ -204,9 +205,7 @@ class DrivenSystem(System):
     def ledger(self):
         return {"work": Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
 
-    @property
-    def balance(self):
-        return ("work",)
+    balance = ("work",)
 
     def presented(self, solution):
         dense, body = solution.dense, self.body
@@ -233,24 +232,15 @@ class _WithoutClock(Energy):
         return self.energy.value(jnp.concatenate([x, jnp.zeros(2)]))
 
 
-class _WithClock(mf.PoissonStructure):
-    """``Pi + [[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
+class _OfClock(PoissonBySharp):
+    """``[[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
 
-    inner: mf.PoissonStructure
     unit: float = eqx.field(static=True)
 
-    @property
-    def dim(self) -> int:
-        assert self.inner.dim is not None
-        return self.inner.dim + 2
-
-    def tensor(self, x) -> jax.Array:
-        square = self.unit**2
-        padded = jnp.pad(self.inner.tensor(x[:-2]), ((0, 2), (0, 2)))
-        return padded.at[-2, -1].set(-square).at[-1, -2].set(square)
+    dim = 2
 
     def sharp(self, x, alpha) -> jax.Array:
-        return jnp.concatenate([self.inner.sharp(x[:-2], alpha[:-2]), _clock(alpha, self.unit)])
+        return _clock(alpha, self.unit)
 
 
 def _clock(dH, unit: float) -> jax.Array:
@@ -272,9 +262,7 @@ class _Push(SkewFriction):
     def entropy_law(self):
         return self.law
 
-    @property
-    def noiseless(self) -> bool:
-        return True
+    noiseless = True
 
     def force(self, system, x, dH, dS, dL):
         return system.pushed(x, dH)
@@ -283,19 +271,8 @@ class _Push(SkewFriction):
 class _OnBody(Carried):
     """A dissipation of the body, as it is at the time of the state."""
 
-    def force(self, system, x, dH, dS, dL):
-        return jnp.pad(self.part.force(system._now(x), *_part_of_body(x, dH, dS, dL)), (0, 2))
-
-    @property
-    def has_generator(self) -> bool:
-        return self.part.has_generator
-
-    def generated(self, system, x, dH):
-        return jnp.pad(self.part.generated(system._now(x), x[:-2], dH[:-2]), (0, 2))
-
-    def factor(self, system, x, dH, dL):
-        B = self.part.factor(system._now(x), x[:-2], dH[:-2], tuple(L[:-2] for L in dL))
-        return None if B is None else B._replace(times=lambda w: jnp.pad(B.times(w), (0, 2)))
+    def there(self, system, x) -> There:
+        return There(system._now(x), x[:-2], lambda alpha: alpha[:-2], lambda v: jnp.pad(v, (0, 2)), volume=True)
 
 
 class _Clock(Choice):

@@ -16,8 +16,9 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import Carried
+from ..dissipation.base import Carried, There
 from ..functions.checks import recognised
 from ..functions.energy import Energy
 from ..functions.surface import OnLevels
@@ -125,7 +126,7 @@ class EmbeddedSystem(System):
         return self.manifold.smooth
 
 
-class _Tangent(mf.PoissonStructure):
+class _Tangent(PoissonBySharp):
     """``P Pi P``, P the projector to the level sets."""
 
     manifold: System
@@ -133,9 +134,6 @@ class _Tangent(mf.PoissonStructure):
     @property
     def dim(self) -> int:
         return self.manifold.dim
-
-    def tensor(self, x):
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
 
     def sharp(self, x, alpha):
         motion = self.manifold.poisson.sharp(x, _along(self.manifold, x, alpha))
@@ -151,22 +149,14 @@ class _Force(Carried):
 
     manifold: System
 
-    def force(self, system, x, dH, dS, dL):
+    def there(self, system, x) -> There:
         """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
-        along = lambda v: None if v is None else _along(self.manifold, x, v)  # noqa: E731
-        return along(self.part.force(self.manifold, x, along(dH), along(dS), tuple(map(along, dL))))
-
-    def factor(self, system, x, dH, dL):
-        along = lambda v: _along(self.manifold, x, v)  # noqa: E731
-        B = self.part.factor(self.manifold, x, along(dH), tuple(map(along, dL)))
-        return None if B is None else B._replace(times=lambda w: along(B.times(w)), solenoidal=False)
+        along = functools.partial(_along, self.manifold, x)
+        return There(self.manifold, x, along, along)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""
         return self.part.divergence(self.manifold, system.surface.returned(x))
-
-    def own_residuals(self, system, x):
-        return self.part.own_residuals(self.manifold, x)
 
 
 def embedded(system: System) -> System:

@@ -13,6 +13,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
+from manifolds.structures.poisson import PoissonBySharp
 
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
@@ -170,7 +171,7 @@ class ReducedEnergy(Energy):
         return jnp.dot(x[:-1], momentum) - value
 
 
-class OnAlgebra(mf.PoissonStructure):
+class OnAlgebra(PoissonBySharp):
     """The Lie-Poisson structure on g* x R in the chart ``(xi, S) -> (l_xi, S)``; S is a Casimir function."""
 
     algebra: mf.LieAlgebra
@@ -185,9 +186,6 @@ class OnAlgebra(mf.PoissonStructure):
         momentum = jax.grad(self.lagrangian)
         by_xi, by_S = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
         return momentum(x[:-1], x[-1]), by_xi, by_S
-
-    def tensor(self, x) -> jax.Array:
-        return jax.vmap(lambda alpha: self.sharp(x, alpha), out_axes=1)(jnp.eye(self.dim))
 
     def sharp(self, x, alpha) -> jax.Array:
         mu, W, _ = self.rates(x)

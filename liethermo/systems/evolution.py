@@ -43,9 +43,7 @@ class LiouvilleFriction(SkewFriction):
 class ReebDrift(LiouvilleFriction):
     """What makes an evolution field the contact field ``X_H = E_H - H R``: along it ``H' = -R(H) H`` [SML §2.2]."""
 
-    @property
-    def energy_law(self) -> Law | None:
-        return None
+    energy_law = None
 
     def force(self, system, x, dH, dS, dL):
         return system.contact.liouville_sharp(x, dH) - system.energy.value(x) * system.contact.reeb(x)

@@ -21,7 +21,7 @@ from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
 from ..functions.warmth import Reservoir, Warmth
 from ..functions.with_baths import WithBaths
 from .base import TIMES, System
-from .baths import BesideBaths, EntropyOfBaths, HeatBaths
+from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .kinds import Decided
 
 WITHIN = 1e-12
@@ -98,7 +98,7 @@ class QuantumSystem(System):
         whole: Energy = entropy
         if baths is not None:
             self.baths = baths
-            poisson, energy = BesideBaths(structure, m), WithBaths(energy, baths.energy, n, n + m)
+            poisson, energy = beside_baths(structure, m), WithBaths(energy, baths.energy, n, n + m)
             whole = Sum((entropy.on(range(n)), EntropyOfBaths(m)))
         self._build(poisson, n + m, energy, whole, terms or None, {}, validate)
         if not self.preserved:  # whether an observable is kept by the motion is found out
@@ -245,9 +245,7 @@ class QuantumSystem(System):
             )
         return ""
 
-    @property
-    def spectral(self) -> bool:
-        return True
+    spectral = True
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.structures.poisson import Beside
 from manifolds.structures.spins import added, dotted, scaled
 
 from ..dissipation.base import Dissipation
@@ -24,7 +25,7 @@ from ..functions.on_spaces import on_sites
 from ..functions.planes import by_planes, reach, to_planes, to_sites
 from ..functions.spheres import Spheres, Squares
 from .base import Arranged, System
-from .baths import BesideBaths, HeatBaths
+from .baths import HeatBaths, beside_baths
 
 LENGTHS = "sum |s|^2 / 2"
 
@@ -135,7 +136,7 @@ class SpinSystem(System):
             return None
         count = spins.count
         planar = mf.Spins(spins.sites, 0, spins.ratio, reach(self.energy, spins.sites))
-        poisson = planar if self.baths is None else BesideBaths(planar, self.baths.number)
+        poisson = planar if self.baths is None else beside_baths(planar, self.baths.number)
         there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, by_planes))
         functions = [pulled(f) for f in (self.energy, *self.momentum_maps.values())]
         system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])
@@ -144,7 +145,7 @@ class SpinSystem(System):
     @property
     def _spins(self) -> mf.Spins | None:
         """The structure of the spins; None of a system that is run in other coordinates."""
-        poisson = self.poisson.body if isinstance(self.poisson, BesideBaths) else self.poisson
+        poisson = self.poisson.first if isinstance(self.poisson, Beside) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
 
 

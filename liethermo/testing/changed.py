@@ -13,8 +13,9 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._module import Module
+from manifolds.structures.poisson import Beside, PoissonBySharp
 
-from ..dissipation.base import Carried, Dissipation, Several
+from ..dissipation.base import Carried, Dissipation, Several, There
 from ..functions.energy import Energy, Function, Pullback, Quadratic, Sum
 from ..systems import LiePoissonSystem, MetriplecticSystem, System
 
@@ -62,7 +63,7 @@ class _Through(Module):
         return self.factor * self.energy.value(self.matrix @ y)
 
 
-class _Poisson(mf.PoissonStructure):
+class _Poisson(PoissonBySharp):
     """``A Pi(B y) A^T / (e tau)``, B the inverse of A."""
 
     part: mf.PoissonStructure
@@ -73,9 +74,6 @@ class _Poisson(mf.PoissonStructure):
     @property
     def dim(self) -> int:
         return self.matrix.shape[0]
-
-    def tensor(self, x):
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
 
     def sharp(self, x, alpha):
         return self.factor * (self.matrix @ self.part.sharp(self.inverse @ x, self.matrix.T @ alpha))
@@ -89,28 +87,24 @@ class _Force(Carried):
     inverse: jax.Array
     units: jax.Array  # of time, energy, entropy
 
-    def force(self, system, x, dH, dS, dL):
-        return self.matrix @ self.part.force(self.system, *self._old(x, dH, dS, dL)) / self.units[0]
+    def there(self, system, x) -> There:
+        A = self.matrix
+        return There(self.system, self.inverse @ x, lambda alpha: A.T @ alpha, lambda v: A @ v / self.units[0])
 
-    @property
-    def has_generator(self) -> bool:
-        return self.part.has_generator
+    def force(self, system, x, dH, dS, dL):
+        return super().force(system, x, dH / self.units[1], None if dS is None else dS / self.units[2], dL)
 
     def generated(self, system, x, dH):
-        old = self._old(x, dH, None, ())[:2]
-        return self.matrix @ self.part.generated(self.system, *old) / self.units[0]
+        return super().generated(system, x, dH / self.units[1])
 
     def velocity(self, system, x, dH, dS, dL):
-        found = self.part.velocity(self.system, *self._old(x, dH, dS, dL))
-        return None if found is None else self.units[1] * (self.inverse.T @ found)
+        at, (_, energy, entropy) = self.there(system, x), self.units
+        given = at.lifted(dH / energy, None if dS is None else dS / entropy, dL)
+        found = self.part.velocity(at.system, at.x, *given)
+        return None if found is None else energy * (self.inverse.T @ found)
 
-    def _old(self, x, dH, dS, dL) -> tuple:
-        _, energy, entropy = self.units
-
-        def old(gradient, unit):
-            return None if gradient is None else self.matrix.T @ gradient / unit
-
-        return self.inverse @ x, old(dH, energy), old(dS, entropy), tuple(old(L, 1.0) for L in dL)
+    def factor(self, system, x, dH, dL):
+        return None  # noise has units of its own
 
 
 def changed(system: System, change: Change) -> System:
@@ -123,8 +117,7 @@ def changed(system: System, change: Change) -> System:
     time, energy, entropy = (jnp.asarray(unit) for unit in (change.time, change.energy, change.entropy))
 
     def moved(function: Energy, factor=1.0) -> Energy:
-        terms = tuple(Function(_Through(term, B, jnp.asarray(factor))) for term in function.terms)
-        return terms[0] if len(terms) == 1 else Sum(terms)
+        return function.mapped(lambda term: Function(_Through(term, B, jnp.asarray(factor))))
 
     units = jnp.stack([time, energy, entropy])
     H, S = moved(system.energy, energy), None if system.entropy is None else moved(system.entropy, entropy)
@@ -190,10 +183,7 @@ def inside(energy: Energy, states, radius: float) -> Energy:
 
 def closed_over(energy: Energy) -> Energy:
     """A plain function whose parameters are numbers that it closes over."""
-    terms = tuple(
-        term if isinstance(term, Pullback) else Function(lambda x, f=term: f.value(x)) for term in energy.terms
-    )
-    return terms[0] if len(terms) == 1 else Sum(terms)
+    return energy.mapped(lambda term: term if isinstance(term, Pullback) else Function(lambda x: term.value(x)))
 
 
 def replaced(system: System, **parts: Any) -> System:
@@ -215,15 +205,12 @@ class _Share(Carried):
 
     share: jax.Array
 
-    def force(self, system, x, dH, dS, dL):
-        return self.share * self.part.force(system, x, dH, dS, dL)
+    def there(self, system, x) -> There:
+        return There(system, x, lambda alpha: alpha, lambda v: self.share * v)
 
-    @property
-    def has_generator(self) -> bool:
-        return self.part.has_generator
-
-    def generated(self, system, x, dH):
-        return self.share * self.part.generated(system, x, dH)
+    def factor(self, system, x, dH, dL):
+        B = self.part.factor(system, x, dH, dL)
+        return None if B is None else B.scaled(self.share)
 
     def velocity(self, system, x, dH, dS, dL):
         found = self.part.velocity(system, x, dH, dS, dL)
@@ -244,39 +231,14 @@ def halved(dissipation: Dissipation) -> Dissipation:
 # -- two of them ------------------------------------------------------------------------------------------------------
 
 
-class _Both(mf.PoissonStructure):
-    part: mf.PoissonStructure
-    size: int = eqx.field(static=True)
-
-    @property
-    def dim(self) -> int:
-        return 2 * self.size
-
-    def tensor(self, x):
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
-
-    def sharp(self, x, alpha):
-        n = self.size
-        return jnp.concatenate([self.part.sharp(x[:n], alpha[:n]), self.part.sharp(x[n:], alpha[n:])])
-
-
 class _OnOne(Carried):
     system: System
     start: int = eqx.field(static=True)
 
-    def force(self, system, x, dH, dS, dL):
+    def there(self, system, x) -> There:
         n, i = self.system.dim, self.start
         own = slice(i, i + n)
-        dS, dL = None if dS is None else dS[own], tuple(L[own] for L in dL)
-        return jnp.pad(self.part.force(self.system, x[own], dH[own], dS, dL), (i, n - i))
-
-    @property
-    def has_generator(self) -> bool:
-        return self.part.has_generator
-
-    def generated(self, system, x, dH):
-        n, i = self.system.dim, self.start
-        return jnp.pad(self.part.generated(self.system, x[i : i + n], dH[i : i + n]), (i, n - i))
+        return There(self.system, x[own], lambda alpha: alpha[own], lambda v: jnp.pad(v, (i, n - i)))
 
 
 class Pair(System):
@@ -293,7 +255,7 @@ class Pair(System):
         for i, pulled in ((0, first), (n, second)):
             own = _OnOne.of(system.dissipation, pulled, system, i)
             parts += () if own is None else own.terms
-        self.dim, self.space, self.poisson = 2 * n, None, _Both(system.poisson, n)
+        self.dim, self.space, self.poisson = 2 * n, None, Beside(system.poisson, system.poisson)
         self.energy = first(system.energy) + second(system.energy)
         self.entropy = None if system.entropy is None else first(system.entropy) + second(system.entropy)
         self.dissipation = Several(tuple(parts)) if parts else None

@@ -89,9 +89,7 @@ class ProjectionRetraction(Chart):
 
     space: Space
 
-    @property
-    def order(self):
-        return 1
+    order = 1
 
     def _point(self, z, v):
         return self.space._project(z + v)

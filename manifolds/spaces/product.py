@@ -118,9 +118,7 @@ class Product(Space):
     def surrounded(self):
         return all(factor.surrounded for factor in self.factors)
 
-    @property
-    def _has_equations(self):
-        return True
+    _has_equations = True
 
     def _constraints(self, x):
         return self._rows_of("_constraints", x)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .poisson import PoissonStructure
+from .poisson import PoissonBySharp
 
 
-class DensityMatrices(PoissonStructure):
+class DensityMatrices(PoissonBySharp):
     """The Lie-Poisson structure of u(N)* on Hermitian matrices: ``Pi dE = -i [dE, rho]``, in units where hbar is 1.
 
     A matrix has N^2 real coordinates in a basis that is orthonormal for ``tr(A B)``: its diagonal, then for each pair
@@ -44,9 +44,6 @@ class DensityMatrices(PoissonStructure):
         real, imaginary = (part.reshape(*part.shape[:-2], -1) for part in (a.real, a.imag))
         first, second = _tables(self.size)
         return real @ first.T + imaginary @ second.T
-
-    def tensor(self, x) -> jax.Array:
-        return jax.vmap(lambda alpha: self.sharp(x, alpha), out_axes=1)(jnp.eye(self.dim))
 
     def sharp(self, x, alpha) -> jax.Array:
         product = self.matrix(alpha) @ self.matrix(x)

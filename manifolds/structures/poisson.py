@@ -136,7 +136,17 @@ class PoissonTensor(PoissonStructure):
         return jnp.asarray(self.matrix(x)) if callable(self.matrix) else self.matrix
 
 
-class PoissonMap(PoissonStructure):
+class PoissonBySharp(PoissonStructure):
+    """A structure of which :meth:`sharp` is what is known."""
+
+    @abstractmethod
+    def sharp(self, x, alpha) -> jax.Array: ...
+
+    def tensor(self, x) -> jax.Array:
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self._dimension(x)))
+
+
+class PoissonMap(PoissonBySharp):
     """A structure given by what it does: a function from x and a covector alpha, shapes (n,), to ``Pi(x) alpha``.
 
     For large n, where the matrix would be mostly zeros. Nothing is checked, as in :class:`PoissonTensor`.
@@ -149,11 +159,29 @@ class PoissonMap(PoissonStructure):
     def dim(self) -> int:
         return self.size
 
-    def tensor(self, x) -> jax.Array:
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.size))
-
     def sharp(self, x, alpha) -> jax.Array:
         return jnp.asarray(self.function(x, alpha))
+
+
+class Beside(PoissonStructure):
+    """Two structures on states (x, y), neither of which has to do with the components of the other."""
+
+    first: PoissonStructure
+    second: PoissonStructure
+
+    @property
+    def dim(self) -> int:
+        assert self.first.dim is not None
+        assert self.second.dim is not None
+        return self.first.dim + self.second.dim
+
+    def tensor(self, x) -> jax.Array:
+        n = self.first.dim
+        return jax.scipy.linalg.block_diag(self.first.tensor(x[:n]), self.second.tensor(x[n:]))
+
+    def sharp(self, x, alpha) -> jax.Array:
+        n = self.first.dim
+        return jnp.concatenate([self.first.sharp(x[:n], alpha[:n]), self.second.sharp(x[n:], alpha[n:])])
 
 
 class NoPoisson(PoissonStructure):

@@ -13,13 +13,13 @@ import numpy as np
 from .._arrays import real_array
 from .._sizes import checked_size
 from ..errors import ParameterError
-from .poisson import PoissonStructure
+from .poisson import PoissonBySharp
 
 Planes = tuple[jax.Array, jax.Array, jax.Array]
 """Vectors in space by components: three arrays of one shape. What is computed from these is put together once."""
 
 
-class Spins(PoissonStructure):
+class Spins(PoissonBySharp):
     """``Pi(x) alpha = (gamma_i s_i x alpha_i, 0)`` for states ``x = (s_1, s_2, …, y)``, s_i in R^3 at each site.
 
     That of ``so(3)`` at every site, times gyromagnetic ratios, beside ``others`` components y that commute with all.

@@ -62,9 +62,7 @@ class LieVariational(OneStepMethod):
     def stages(self) -> int:
         return 2  # the second row of slopes holds the velocity between the nodes
 
-    @property
-    def order(self) -> int:
-        return 2
+    order = 2
 
     @property
     def preserves(self) -> frozenset[str]:

@@ -121,9 +121,7 @@ class VariationalIntegrator(OneStepMethod):
         """
         return cls("symmetrised", retraction=retraction)
 
-    @property
-    def stages(self) -> int:
-        return 1
+    stages = 1
 
     @property
     def order(self) -> int:
@@ -134,9 +132,7 @@ class VariationalIntegrator(OneStepMethod):
         """Whether curves on a manifold are the same seen from both ends."""
         return self.retraction in SYMMETRIC or isinstance(self.retraction, LINES)
 
-    @property
-    def in_charts(self) -> bool:
-        return False
+    in_charts = False
 
     @property
     def preserves(self) -> frozenset[str]:
