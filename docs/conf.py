@@ -129,7 +129,7 @@ INTERNALS = frozenset(
     """
     arranged at_midpoint at_sites at_some_times balance begin blocks body_at body_dim by_constants check_places
     constants couplings decided decided_near displaced entries evaluated explain general heating_sites
-    held_functions here hidden impulses in_chart isotropic isotropic_size kind leaves ledger left_alone
+    here hidden impulses in_chart isotropic isotropic_size kind leaves ledger left_alone
     linearised local lowered needs_attitude noiseless noisy numbers on on_density on_sites on_states orderless
     outside over_sites own_energy own_residuals own_size place predict prepared presented preserved_as
     preserved_by_name preserved_names production_name pulled push pushed pushed_by quotient raised receives

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
+import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from .results.solution import Solution
     from .spec import Spec
     from .systems import System
+    from .systems.check import CheckReport
 
 FAILED = 1
 """Exit status where a law or an axiom fails, or the run stopped early."""
@@ -142,7 +144,7 @@ def study(
     with _client(cluster, spec.resolve().parent) as client:
         reached = found.run(client)
     typer.echo(str(reached))
-    passed = _print_rows(found.audit())
+    passed = _print_table(found.audit())
     if plan.study is not None and reached.done:
         _draw_study(store, plan.study.figure, store.with_suffix(f".{plan.outputs.figure_format}"))
     raise typer.Exit(0 if passed and reached.ok else FAILED)
@@ -181,9 +183,7 @@ def check(spec: SpecFile, change: Changes = None, allow: Allowed = None) -> None
         study_of(plan, "unused.zarr")
     report = plan.system().check()
     typer.echo(f"{spec}: the spec is valid")
-    rows = [(row.axiom, row.residual, row.tolerance, row.passed, row.note) for row in report.rows]
-    _print_verdicts(("axiom", "residual", "tolerance"), rows)
-    typer.echo(str(report).splitlines()[-1])
+    _print_table(report)
     raise typer.Exit(0 if report.passed else FAILED)
 
 
@@ -275,15 +275,14 @@ def _print_audit(result: Solution | Ensemble) -> bool:
         typer.echo(f"{result.status} ({result.stats.wall_time:.1f} s)")
     else:
         typer.echo(f"{result} ({result.wall_time:.1f} s)")
-    return _print_rows(audit)
+    return _print_table(audit)
 
 
-def _print_rows(audit: Audit) -> bool:
-    """Print an audit; returns whether the laws held."""
-    rows = [(row.law, row.value, row.tolerance, row.passed, row.note) for row in audit.rows]
-    _print_verdicts(("law", "measured", "allowed"), rows)
-    typer.echo(audit.verdict)
-    return audit.passed
+def _print_table(table: Audit | CheckReport) -> bool:
+    """Print an audit, or a check, its verdicts in colours; returns whether all holds."""
+    text = str(table).replace(" FAILS", " " + typer.style("FAILS", fg="red", bold=True))
+    typer.echo(re.sub(r" ok(?= |$)", " " + typer.style("ok", fg="green"), text, flags=re.MULTILINE))
+    return table.passed
 
 
 @contextlib.contextmanager
@@ -319,26 +318,6 @@ def _draw_study(store: Path, measure: str | None, file: Path) -> None:
         if measure is not None:
             raise
         typer.echo(f"In {store}; nothing is drawn: {error}")
-
-
-def _print_verdicts(
-    head: tuple[str, str, str], rows: Sequence[tuple[str, float, float | None, bool | None, str]]
-) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    table.add_column(head[0])
-    for column in head[1:]:
-        table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("")
-    table.add_column("", overflow="fold")
-    verdict = {True: "[green]ok[/]", False: "[bold red]FAILS[/]", None: "-"}
-    for name, value, tolerance, passed, note in rows:
-        allowed = "" if tolerance is None or passed is None else f"{tolerance:.1e}"
-        table.add_row(escape(name), f"{value:.2e}", allowed, verdict[passed], escape(note))
-    Console().print(table)
 
 
 if __name__ == "__main__":

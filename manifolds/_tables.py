@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
@@ -21,6 +22,20 @@ class Row:
     note: str = ""
 
 
+class Tabular(ABC):
+    """What prints as a table, and shows as one in a notebook."""
+
+    @abstractmethod
+    def _table(self) -> tuple[Iterable[Row], tuple[str, str, str], str]:
+        """The rows, their headings, and a last line."""
+
+    def __str__(self) -> str:
+        return table(*self._table())
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._table())
+
+
 WIDTH = 80
 """Columns of a terminal, and of a page."""
 
@@ -35,7 +50,7 @@ def table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
         *above, name = wrapped(row.name, width, "  ")
-        allowed = " " * 9 if row.allowed is None else f"{row.allowed:9.1e}"
+        allowed = " " * 9 if row.allowed is None or row.passed is None else f"{row.allowed:9.1e}"
         line = f"{name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT[row.passed]:<5}"
         short = f"{line} {row.note}".rstrip()
         fits = len(short) <= WIDTH
@@ -62,7 +77,7 @@ def html_table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -
         (
             row.name,
             f"{row.value:.2e}",
-            "" if row.allowed is None else f"{row.allowed:.1e}",
+            "" if row.allowed is None or row.passed is None else f"{row.allowed:.1e}",
             VERDICT[row.passed],
             row.note,
         )

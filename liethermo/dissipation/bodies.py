@@ -108,29 +108,26 @@ class LinearFriction(Dissipation):
     body: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
-        p, S, R = self._here(system, x)
-        v, T = dH[p], _positive(dH[S])
-        flux = _apply(R, (v * dS[S] - T * dS[p]) / T)
-        return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
+        p, S, R, v, T = self._here(system, x, dH)
+        return self._spread(x, p, S, v, T, _apply(R, (v * dS[S] - T * dS[p]) / T))
 
     def factor(self, system, x, dH, dL):
-        p, S, R = self._here(system, x)
-        v, T = dH[p], _positive(dH[S])
+        p, S, R, v, T = self._here(system, x, dH)
         full = semidefinite_root if callable(self.R) else semidefinite_factor
         root = jnp.sqrt(R) if jnp.ndim(R) < 2 else full(R)
+        return Factor(len(p), lambda w: self._spread(x, p, S, v, T, _apply(root, w) / jnp.sqrt(T)))
 
-        def times(w):
-            flux = _apply(root, w) / jnp.sqrt(T)
-            return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
+    @staticmethod
+    def _spread(x, p, S, v, T, flux) -> jax.Array:
+        return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
-        return Factor(len(p), times)
-
-    def _here(self, system, x):
-        """Where the momenta and the entropies are, and R."""
+    def _here(self, system, x, dH):
+        """Where the momenta and the entropies are, R, the velocities and the temperatures."""
         places = _places(system)
         mine = np.arange(len(places.p)) if self.body is None else np.flatnonzero(places.owner == self.body)
         R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
-        return places.p[mine], places.S[places.owner[mine]], R
+        p, S = places.p[mine], places.S[places.owner[mine]]
+        return p, S, R, dH[p], _positive(dH[S])
 
     def couplings(self, system):
         return _within(_places(system), system.dim)
@@ -158,28 +155,27 @@ class Drag(Dissipation):
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread = self._edges(system, x, dH)
+        along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
+        return spread(weight * along)
+
+    def factor(self, system, x, dH, dL):
+        _, _, weight, spread = self._edges(system, x, dH)
+        return Factor(len(weight), lambda w: spread(jnp.sqrt(weight) * w))
+
+    def _edges(self, system, x, dH):
+        """Where momenta and entropies are, the temperatures and the velocity between, ``c / theta``, and ``flux z``."""
         places = _places(system)
         i, j, edge = _pairs(self.first, self.second, places)
         S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
         T_i, T_j, w = _positive(dH[S_i]), _positive(dH[S_j]), dH[p_i] - dH[p_j]
-        along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
-        flux = self.coefficient[edge] * along * (2.0 * T_i * T_j / (T_i + T_j))
-        made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
-        return made.at[p_i].add(-flux).at[p_j].add(flux)
 
-    def factor(self, system, x, dH, dL):
-        places = _places(system)
-        i, j, edge = _pairs(self.first, self.second, places)
-        S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
-        T_i, T_j, w_ij = _positive(dH[S_i]), _positive(dH[S_j]), dH[p_i] - dH[p_j]
-        root = jnp.sqrt(self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j)))
-
-        def times(w):
-            flux = root * w
-            made = jnp.zeros_like(x).at[S_i].add(0.5 * w_ij * flux / T_i).at[S_j].add(0.5 * w_ij * flux / T_j)
+        def spread(flux):
+            made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
             return made.at[p_i].add(-flux).at[p_j].add(flux)
 
-        return Factor(len(edge), times)
+        weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
+        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread
 
     def couplings(self, system):
         places = _places(system)

@@ -58,18 +58,13 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        numbers, directions = self._directions(system, dH)
-        N, S = system.poisson.matter.N, system.poisson.places.S
-        flux = self._coefficients(x) * (numbers @ dS[N] + directions @ dS[S])
-        return jnp.zeros_like(x).at[N].add(flux @ numbers).at[S].add(flux @ directions)
+        along, spread = self._directions(system, x, dH)
+        return spread(self._coefficients(x) * along(dS))
 
     def factor(self, system, x, dH, dL):
-        numbers, directions = self._directions(system, dH)
-        N, S, root = system.poisson.matter.N, system.poisson.places.S, jnp.sqrt(self._coefficients(x))
-        return Factor(
-            len(self.processes),
-            lambda w: jnp.zeros_like(x).at[N].add((root * w) @ numbers).at[S].add((root * w) @ directions),
-        )
+        _, spread = self._directions(system, x, dH)
+        root = jnp.sqrt(self._coefficients(x))
+        return Factor(len(self.processes), lambda w: spread(root * w))
 
     def _coefficients(self, x) -> jax.Array:
         """L of each process; NaN where it is negative: the step is then refused."""
@@ -77,17 +72,22 @@ class MatterExchange(Dissipation):
         L = jnp.stack([jnp.asarray(value) for value in found])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
-    def _directions(self, system, dH) -> tuple[np.ndarray, jax.Array]:
-        """The components of each z along the particle numbers, and along the entropies."""
+    def _directions(self, system, x, dH) -> tuple[Callable, Callable]:
+        """``z . dS`` of each process, and the sum of fluxes times z."""
         numbers, heated, carried = (
             np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
         )
-        mu, T = dH[system.poisson.matter.N], dH[system.poisson.places.S]
+        N, S = system.poisson.matter.N, system.poisson.places.S
+        mu, T = dH[N], dH[S]
         T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
         affinity = -(numbers @ mu)
         mean = touched @ T / np.maximum(touched.sum(axis=1), 1.0)
         heat = jnp.stack([e.entropy for e in self.processes]) * mean
-        return numbers, (heated * affinity[:, None] + carried * heat[:, None]) / T
+        entropies = (heated * affinity[:, None] + carried * heat[:, None]) / T
+        return (
+            lambda dS: numbers @ dS[N] + entropies @ dS[S],
+            lambda flux: jnp.zeros_like(x).at[N].add(flux @ numbers).at[S].add(flux @ entropies),
+        )
 
 
 def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:

@@ -89,17 +89,7 @@ class OneStepMethod(Module):
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         """The state at the end of the step and its compensation: the increment added, its rounding error caught."""
-        d, surface = self.increment(h, k), system.surface
-        if surface is None:
-            return compensated(x, compensation + d)
-        if not (self.explicit or surface.collocated):
-            d = ended(system, surface, self.held_functions(system), x, compensation, d)
-        return surface.settled(*compensated(x, compensation + d))
-
-    def held_functions(self, system: System) -> tuple[Energy, ...]:
-        """The functions besides energy and entropy that an implicit step keeps."""
-        del system
-        return ()
+        return moved(self, system, x, compensation, self.increment(h, k))
 
     def displaced(self, system: System, x, v) -> jax.Array:
         """The state that a displacement v leads to from x: where the step is on its way, outside of the laws."""
@@ -251,6 +241,21 @@ ONE_SIZE = (
     "let it drift. Take a smaller fixed step, or lt.MetriplecticGauss where laws are to hold in long steps too"
 )
 """Why variational schemes have steps of one size."""
+
+
+def moved(
+    method: OneStepMethod, system: System, x, compensation, d, held: tuple[Energy, ...] = ()
+) -> tuple[jax.Array, jax.Array]:
+    """x + compensation + d, on the surface that the system has; of an implicit step, on which also ``held`` are kept.
+
+    These are functions besides energy and entropy.
+    """
+    surface = system.surface
+    if surface is None:
+        return compensated(x, compensation + d)
+    if not (method.explicit or surface.collocated):
+        d = ended(system, surface, held, x, compensation, d)
+    return surface.settled(*compensated(x, compensation + d))
 
 
 def event_shares(order: int) -> np.ndarray:

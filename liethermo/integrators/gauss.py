@@ -23,7 +23,7 @@ from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
 from ..systems import System
 from ..tracing.interpret import at_points
-from .base import GaussMethod, OneStepMethod, TransportingMethod, checked_stages, collocation_error, register
+from .base import GaussMethod, OneStepMethod, TransportingMethod, checked_stages, collocation_error, moved, register
 from .charts import in_charts
 from .composed_entropy import composed_gradients
 from .preserved import check_preserved, preserved_functions, seen_on
@@ -251,8 +251,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | given
 
-    def held_functions(self, system: System) -> tuple[Energy, ...]:
-        return tuple(self._kept(system).values())
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
+        return moved(self, system, x, compensation, self.increment(h, k), tuple(self._kept(system).values()))
 
     def _casimirs(self, system: System) -> set[str]:
         """Names of the Casimirs among what is held."""

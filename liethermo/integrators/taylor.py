@@ -56,12 +56,8 @@ class MetriplecticTaylor(ExplicitMethod):
     order : int or None
         From 2 to 24. None: what the tolerance of adaptive steps asks for, ``1 - log(rtol) / 2`` [Jorba & Zou 2005], and
         13, which 1e-10 asks for, where there is no tolerance.
-    preserve : sequence of functions or energies
-        Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
-    retraction : str or manifolds.Retraction, optional
-        On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
-    held : tuple of str
-        Names of the functions of the system to hold. A run fills it in with what the system conserves.
+    preserve, retraction, held
+        As of :class:`MetriplecticRungeKutta`.
 
     Examples
     --------

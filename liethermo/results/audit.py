@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from manifolds._tables import Row, html_table, table
+from manifolds._tables import Row, Tabular
 
 from ..engines.codes import Code
 from ..errors import InputError
@@ -93,19 +93,16 @@ class Tolerances:
         return cls(**given)
 
 
-@dataclass(frozen=True)
-class AuditRow:
+class AuditRow(Row):
     """One law: what was measured, what is allowed, and the verdict (None where nothing is promised)."""
 
-    law: str
-    value: float
-    tolerance: float | None
-    passed: bool | None
-    note: str = ""
+    @property
+    def law(self) -> str:
+        return self.name
 
-    def as_row(self, label: str = "") -> Row:
-        """The row of a table, its name after a label."""
-        return Row(f"{label}{self.law}", self.value, self.tolerance, self.passed, self.note)
+    @property
+    def tolerance(self) -> float | None:
+        return self.allowed
 
 
 ACCURACY, CONSISTENCY, TAKEN, FAILED = "accuracy", "consistency", "steps taken", "trajectories that failed"
@@ -115,7 +112,7 @@ LAW_FAILS = "A LAW FAILS"
 
 
 @dataclass(frozen=True)
-class Audit:
+class Audit(Tabular):
     """The laws of a run, how accurate it is, and whether it is one of its system. Printing it gives a table.
 
     Attributes
@@ -183,17 +180,11 @@ class Audit:
             return f"the laws hold, and the steps resolve the motion{self.coverage and f' ({self.coverage})'}"
         return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
-    def __str__(self) -> str:
-        return table(*self._table())
-
     def __repr__(self) -> str:
         return f"<Audit of {len(self.rows)} rows: {self.verdict}>"
 
-    def _repr_html_(self) -> str:
-        return html_table(*self._table())
-
-    def _table(self) -> tuple[list[Row], tuple[str, str, str], str]:
-        return [row.as_row() for row in self.rows], ("law", "measured", "allowed"), self.verdict
+    def _table(self) -> tuple[tuple[AuditRow, ...], tuple[str, str, str], str]:
+        return self.rows, ("law", "measured", "allowed"), self.verdict
 
 
 @dataclass(frozen=True)

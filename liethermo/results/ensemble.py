@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -16,8 +15,8 @@ from manifolds._tables import html_grid
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import FAILED, Audit, AuditRow, Tolerances, accuracy_row, coverage_of
-from .evidence import Evidence
-from .files import ENSEMBLE_FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
+from .evidence import Evidence, Recorded
+from .files import ENSEMBLE_FORMAT, as_parts, checked, described, from_parts, places, series_of
 from .many import laws_of_many
 from .solution import Solution
 from .status import Laws, Stats, Status
@@ -44,7 +43,7 @@ SENTENCES = {
 
 
 @dataclass(frozen=True)
-class Ensemble(Saved):
+class Ensemble(Recorded):
     """What :func:`ensemble` returns; trajectories come first in every array, and B is their number.
 
     ``e[i]`` is one trajectory as a :class:`Solution`, and a loop over an ensemble is one over these.
@@ -140,13 +139,8 @@ class Ensemble(Saved):
     witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
     alone: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
-    @functools.cached_property
-    def evidence(self) -> Evidence:
-        """What an audit needs besides the series: found when first asked for."""
-        return Evidence() if self.witness is None else self.witness()
-
-    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
-        return {**vars(self), "evidence": self.evidence, "witness": None, "alone": None}
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "alone": None}
 
     def __len__(self) -> int:
         return len(self.status)

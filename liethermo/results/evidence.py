@@ -22,6 +22,7 @@ from ..integrators.fluctuating import noise_dimension
 from ..systems import System
 from ..tracing.interpret import at_points
 from ..tracing.scalarize import UnsupportedPrimitive
+from .files import Saved
 from .looking import Steps, field_at, looked_at, misfit
 
 MEASURED = 256
@@ -90,6 +91,20 @@ class Evidence:
     def __post_init__(self):
         if (self.local_error is None) != (self.error_time is None):
             raise InputError("the largest local error of a step is known with its time, or not at all")
+
+
+class Recorded(Saved):
+    """A result with the evidence for its audit, or what finds that."""
+
+    witness: Callable[[], Evidence] | None
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        """What an audit needs besides the series: found when first asked for."""
+        return Evidence() if self.witness is None else self.witness()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
+        return {**vars(self), "evidence": self.evidence, "witness": None}
 
 
 class Replay(Protocol):

@@ -3,39 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from .audit import AuditRow, Rounding, Tolerances
 from .status import Laws
-
-
-class ManyRecords(Protocol):
-    """What is known of each trajectory, all of shape (B,): see :class:`liethermo.Ensemble`."""
-
-    @property
-    def ok(self) -> np.ndarray: ...
-    @property
-    def steps(self) -> np.ndarray: ...
-    @property
-    def residual(self) -> np.ndarray: ...
-    @property
-    def first_energy(self) -> np.ndarray: ...
-    @property
-    def energy_drift(self) -> np.ndarray: ...
-    @property
-    def largest_energy_increment(self) -> np.ndarray: ...
-    @property
-    def energy_sensitivity(self) -> np.ndarray: ...
-    @property
-    def least_entropy_increment(self) -> np.ndarray: ...
-    @property
-    def entropy_change(self) -> np.ndarray: ...
-    @property
-    def entropy_scale(self) -> np.ndarray: ...
-    @property
-    def entropy_sensitivity(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -69,13 +42,13 @@ class LawOfMany:
 
 
 def laws_of_many(
-    many: ManyRecords, laws: Laws, accepted: Tolerances, energy_terms: Any = 0.0, entropy_terms: Any = 0.0
+    many: Any, laws: Laws, accepted: Tolerances, energy_terms: Any = 0.0, entropy_terms: Any = 0.0
 ) -> list[LawOfMany]:
     """How each law was kept; a trajectory that took no step has kept them all.
 
     Parameters
     ----------
-    many : ManyRecords
+    many : Ensemble, or what has its arrays of numbers
     laws : Laws
         What is promised of each.
     accepted : Tolerances

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -15,20 +14,20 @@ from manifolds._tables import html_grid
 
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit
-from .evidence import Evidence
+from .evidence import Evidence, Recorded
 
 if TYPE_CHECKING:
     import xarray
 
     from .dense import Dense
-from .files import FORMAT, Saved, as_parts, checked, described, from_parts, places, series_of
+from .files import FORMAT, as_parts, checked, described, from_parts, places, series_of
 from .orientation import angles
 from .sketch import sketch
 from .status import Laws, Stats, Status
 
 
 @dataclass(frozen=True)
-class Solution(Saved):
+class Solution(Recorded):
     """A trajectory with its laws.
 
     Attributes
@@ -76,13 +75,6 @@ class Solution(Saved):
     dense: Dense | None = None
     attitude: np.ndarray | None = None
     witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
-
-    @functools.cached_property
-    def evidence(self) -> Evidence:
-        return Evidence() if self.witness is None else self.witness()
-
-    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
-        return {**vars(self), "evidence": self.evidence, "witness": None}
 
     @by_own_settings
     def __call__(self, t) -> np.ndarray:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
@@ -117,9 +115,3 @@ class Laws:
         for law in (self.energy, self.entropy):
             if law not in (None, "conserved", "nondecreasing", "nonincreasing"):
                 raise InputError(f"there is no law {law!r:.60}")
-
-    @classmethod
-    def of(cls, stored: Mapping[str, Any]) -> Laws:
-        """From what is stored in a file, where tuples are lists; what an earlier version did not know is empty."""
-        names = {f.name for f in fields(cls) if f.name not in ("energy", "entropy")}
-        return cls(**{**stored, **{name: tuple(stored.get(name, ())) for name in names}})

@@ -13,6 +13,7 @@ import numpy as np
 
 from manifolds.errors import warn
 
+from ..results.files import checked
 from ..results.status import Laws
 from .axes import MOST, is_name
 from .files import Array
@@ -100,7 +101,7 @@ def _check_arrays(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) ->
 
 def _check_study(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> None:
     """It says what study it is of."""
-    Laws.of(attributes["laws"])
+    checked(Laws, attributes["laws"])
     study = attributes["study"]
     if list(study["measures"]) != attributes["measures"]:
         raise ValueError("its measures are not those of its study")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ..runs.progress import Progress
 from .solve import STATUSES
 
 
@@ -77,31 +77,20 @@ def seconds_left(points: int, done: int, running: Mapping[str, Any]) -> float | 
     return (time.time() - running["started"]) * (points - done) / since if since > 0 else None
 
 
-class Bar:
+class Bar(Progress):
     """A bar of the points that are done, with the time left, on a terminal or in a notebook."""
 
     def __init__(self, total: int, done: int, wanted: bool | None):
-        self._bar: Any = None
-        if wanted is False:
-            return
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        console = Console(stderr=True, force_terminal=True if wanted else None)
-        if wanted or console.is_jupyter or sys.stderr.isatty():
-            columns = MofNCompleteColumn(), TextColumn("points"), BarColumn(), TimeRemainingColumn()
-            self._bar = Progress(*columns, console=console, transient=True)
-            self._task = self._bar.add_task("", total=total, completed=done)
+        self.done = done
+        super().__init__((0, total), Console().is_jupyter or None if wanted is None else wanted, f"{{}}/{total} points")
 
     def __enter__(self) -> Bar:
-        if self._bar is not None:
-            self._bar.start()
+        super().__enter__()
+        self.advance(0)
         return self
 
     def advance(self, points: int) -> None:
-        if self._bar is not None:
-            self._bar.advance(self._task, points)
-
-    def __exit__(self, *_) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        self.done += points
+        self.update(self.done)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import FileError
 from ..results.audit import Audit, AuditRow, Tolerances
+from ..results.files import checked
 from ..results.many import laws_of_many
 from ..results.status import Laws
 from . import files
@@ -65,7 +66,7 @@ def audit(path: Any, **tolerances: float) -> Audit:
     """The laws over the points of a store."""
     accepted = Tolerances.of(**tolerances)
     store = Store.open(Path(path))
-    axes, laws = store.axes(), Laws.of(store.attributes["laws"])
+    axes, laws = store.axes(), checked(Laws, store.attributes["laws"])
     worst: dict[str, AuditRow] = {}
     least, drift, residual = math.inf, 0.0, 0.0
     counts: dict[int, int] = {}

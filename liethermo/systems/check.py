@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._tables import Row, html_table, table
+from manifolds._tables import Row, Tabular
 
 from ..dissipation.base import Dissipation, Law
 from ..dissipation.friction_operator import KERNEL
@@ -29,23 +29,25 @@ MATRIX_DIM = 200
 at."""
 
 
-@dataclass(frozen=True)
-class CheckRow:
+class CheckRow(Row):
     """One axiom: its worst relative residual over the points. ``passed`` is None for a report without a verdict."""
 
-    axiom: str
-    residual: float
-    tolerance: float
-    passed: bool | None
-    note: str = ""
+    @property
+    def axiom(self) -> str:
+        return self.name
 
-    def as_row(self) -> Row:
-        """The row of a table."""
-        return Row(self.axiom, self.residual, None if self.passed is None else self.tolerance, self.passed, self.note)
+    @property
+    def residual(self) -> float:
+        return self.value
+
+    @property
+    def tolerance(self) -> float:
+        assert self.allowed is not None
+        return self.allowed
 
 
 @dataclass(frozen=True)
-class CheckReport:
+class CheckReport(Tabular):
     """The axioms of a system and how far each is from holding. Printing it gives a table."""
 
     rows: tuple[CheckRow, ...]
@@ -55,18 +57,11 @@ class CheckReport:
     def passed(self) -> bool:
         return all(row.passed is not False for row in self.rows)
 
-    def __str__(self) -> str:
-        return table(*self._table())
-
     def __repr__(self) -> str:
         return f"<CheckReport of {len(self.rows)} axioms: {self._total}>"
 
-    def _repr_html_(self) -> str:
-        return html_table(*self._table())
-
-    def _table(self) -> tuple[list[Row], tuple[str, str, str], str]:
-        rows = [row.as_row() for row in self.rows]
-        return rows, ("axiom", "residual", "tolerance"), f"{self._total} (at {self.points} points)"
+    def _table(self) -> tuple[tuple[CheckRow, ...], tuple[str, str, str], str]:
+        return self.rows, ("axiom", "residual", "tolerance"), f"{self._total} (at {self.points} points)"
 
     @property
     def _total(self) -> str:

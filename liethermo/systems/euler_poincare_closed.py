@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
-from manifolds.structures.poisson import PoissonBySharp
+from manifolds.structures.poisson import Beside, PoissonBySharp
 
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
@@ -22,7 +22,7 @@ from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component
-from .ledger import BesideLedger, ForcesAndHeat, WithLedger, field
+from .ledger import ForcesAndHeat, WithLedger, field
 
 
 class EulerPoincareClosedSystem(WithLedger):
@@ -108,7 +108,7 @@ class EulerPoincareClosedSystem(WithLedger):
     @property
     def structure(self) -> OnAlgebra:
         """The Poisson structure of (xi, S)."""
-        return cast(OnAlgebra, self.poisson.inner if isinstance(self.poisson, BesideLedger) else self.poisson)
+        return cast(OnAlgebra, self.poisson.first if isinstance(self.poisson, Beside) else self.poisson)
 
     def momentum(self, xi, S) -> jax.Array:
         """``l_xi`` at one point, shape (dim,)."""

@@ -10,6 +10,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds.matrices.linear import solve
+from manifolds.structures.poisson import Beside
 
 from ..dissipation.base import Law, SkewFriction
 from ..functions.arguments import Constant, Steady, needed_arguments
@@ -46,7 +47,7 @@ class WithLedger(System):
             return structure, size, energy
         total = size + LEDGER
         received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
-        return BesideLedger(structure), total, energy.on(range(size)) + received
+        return Beside(structure, mf.NoPoisson(LEDGER)), total, energy.on(range(size)) + received
 
     def numbers(self, x, batch: bool = False):
         if self.receives and np.ndim(x) > 0 and np.shape(x)[-1] == self.own_size:
@@ -66,24 +67,6 @@ class WithLedger(System):
         names = ("work received", "heat received") if self.receives else ()
         rows = jnp.eye(self.dim)
         return {name: Quadratic(jnp.zeros(self.dim), rows[self.own_size + i]) for i, name in enumerate(names)}
-
-
-class BesideLedger(mf.PoissonStructure):
-    """A structure beside the components of a ledger, which it does not move."""
-
-    inner: mf.PoissonStructure
-
-    @property
-    def dim(self) -> int:
-        size = self.inner.dim
-        assert size is not None
-        return size + LEDGER
-
-    def tensor(self, x) -> jax.Array:
-        return jnp.pad(self.inner.tensor(x[:-LEDGER]), ((0, LEDGER), (0, LEDGER)))
-
-    def sharp(self, x, alpha) -> jax.Array:
-        return jnp.pad(self.inner.sharp(x[:-LEDGER], alpha[:-LEDGER]), (0, LEDGER))
 
 
 class ForcesAndHeat(SkewFriction):

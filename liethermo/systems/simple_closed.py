@@ -14,6 +14,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
+from manifolds.structures.poisson import Beside
 
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
@@ -23,7 +24,7 @@ from ..functions.energy import Energy
 from ..tracing.interpret import at_points
 from .evolution import configurations, entropy_component, in_one_array, states_on
 from .herglotz import OnVelocities
-from .ledger import BesideLedger, ForcesAndHeat, WithLedger, field
+from .ledger import ForcesAndHeat, WithLedger, field
 
 
 class Forces(ForcesAndHeat):
@@ -136,7 +137,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     @property
     def contact(self) -> mf.LagrangianContact:
-        structure = self.poisson.inner if isinstance(self.poisson, BesideLedger) else self.poisson
+        structure = self.poisson.first if isinstance(self.poisson, Beside) else self.poisson
         return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
 
     @property

@@ -53,8 +53,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     if acting.entropy_law == "nondecreasing" and acting.energy_law == "conserved" and system.space is None:
         suite.small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
     suite.true("it acts", size > 0.0)
-    for row in system.check(seed=seed).rows:
-        suite.rows.append(row.as_row())
+    suite.rows += system.check(seed=seed).rows
     x0 = start_of(system, seed)
     h = step_of(system, x0)
     for method in METHODS:

@@ -85,16 +85,14 @@ def check_equilibrium(
     suite = Suite(f"the equilibrium of a {system.kind}")
     report = noise.check(system)
     for check in report.rows:
-        suite.rows.append(check.as_row())
+        suite.rows.append(check)
         if check.axiom == MEASURE and check.residual > check.tolerance and samples is None:
             raise ValueError(f"the motion does not keep volume, so the measure is not known: give a density\n{report}")
     starts = np.broadcast_to(np.atleast_2d(np.asarray(x0, dtype=float)), (paths, system.dim))
     every = max(1, round(time / step / (2 * SAVES)))
     many = ensemble(system, starts, (0.0, time), step, noise=noise, outputs="trajectory", save_every=every)
     suite.true("all paths end", many.ok.all(), f"{(~many.ok).sum()} do not" if not many.ok.all() else "")
-    for row in many.audit().rows:
-        if row.passed is not None:
-            suite.rows.append(row.as_row())
+    suite.rows += [row for row in many.audit().rows if row.passed is not None]
     assert many.x is not None
     late = many.x[:, many.t >= 0.5 * time]
     exact = Samples(*samples) if samples is not None else exact_samples(system, noise, starts[0], late, seed)

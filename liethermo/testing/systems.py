@@ -38,8 +38,7 @@ def check_system(
         If one of the properties does not hold.
     """
     suite = Suite(system.kind)
-    for row in system.check(seed=seed).rows:
-        suite.rows.append(row.as_row())
+    suite.rows += system.check(seed=seed).rows
     points = system.samples(3, seed)
     field, again = (at_points(_field, s, points) for s in (system, rebuilt(system)))
     suite.true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._tables import Row, html_table, table
+from .._tables import Row, Tabular
 from ..errors import ManifoldsError
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Tabular):
     """The properties of an object and how far each is from holding. Printing it gives a table."""
 
     of: str
@@ -20,12 +20,6 @@ class Report:
     @property
     def passed(self) -> bool:
         return all(row.passed is not False for row in self.rows)
-
-    def __str__(self) -> str:
-        return table(*self._table())
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._table())
 
     def _table(self) -> tuple[tuple[Row, ...], tuple[str, str, str], str]:
         last = "all of them hold" if self.passed else "NOT ALL OF THEM HOLD"
