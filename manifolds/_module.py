@@ -34,3 +34,21 @@ def _is_of_module(leaf: Any) -> bool:
 
 def _as_pytree(leaf: Any) -> Any:
     return eqx.Partial(leaf.__func__, leaf.__self__) if _is_of_module(leaf) else leaf
+
+
+class _Forwarded:
+    """See :func:`forwarded`."""
+
+    def __init__(self, inside: str):
+        self.inside = inside
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        return self if instance is None else getattr(getattr(instance, self.inside), self.name)
+
+
+def forwarded(inside: str) -> Any:
+    """In the body of a class that wraps an object: the member of that object, which the attribute ``inside`` holds."""
+    return _Forwarded(inside)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import scipy
 
-from manifolds._module import Module
+from manifolds._module import Module, forwarded
 
 from ..errors import InputError
 from ..functions.energy import Energy
@@ -309,9 +309,7 @@ class Carried(Dissipation):
         at = self.there(system, x)
         return at.lower(self.part.force(at.system, at.x, *at.lifted(dH, dS, dL)))
 
-    @property
-    def has_generator(self) -> bool:
-        return self.part.has_generator
+    has_generator = forwarded("part")
 
     def generated(self, system, x, dH):
         at = self.there(system, x)
@@ -336,25 +334,11 @@ class Carried(Dissipation):
         parts = tuple(cls(part, tuple(map(pulled, part.preserve)), *more) for part in dissipation.terms)
         return parts[0] if len(parts) == 1 else Several(parts)
 
-    @property
-    def energy_law(self):
-        return self.part.energy_law
-
-    @property
-    def entropy_law(self):
-        return self.part.entropy_law
-
-    @property
-    def keeps_casimirs(self):
-        return self.part.keeps_casimirs
-
-    @property
-    def symmetric(self):
-        return self.part.symmetric
-
-    @property
-    def needs_entropy(self):
-        return self.part.needs_entropy
+    energy_law = forwarded("part")
+    entropy_law = forwarded("part")
+    keeps_casimirs = forwarded("part")
+    symmetric = forwarded("part")
+    needs_entropy = forwarded("part")
 
     @property
     def preserve(self):

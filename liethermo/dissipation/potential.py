@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import real_array
-from manifolds._module import Module
+from manifolds._module import Module, forwarded
 from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
@@ -72,16 +72,9 @@ class DissipationPotential(Dissipation):
 
     symmetric = False
 
-    @property
-    def keeps_casimirs(self):
-        return self.of.keeps_casimirs
-
-    @property
-    def preserve(self):
-        return self.of.preserve
-
-    def couplings(self, system):
-        return self.of.couplings(system)
+    keeps_casimirs = forwarded("of")
+    preserve = forwarded("of")
+    couplings = forwarded("of")
 
     def prepared(self, system):
         found = eqx.tree_at(lambda d: d.of, self, self.of.prepared(system))

@@ -18,7 +18,7 @@ import scipy
 
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
-from manifolds._module import Module
+from manifolds._module import Module, forwarded
 from manifolds._precision import by_own_settings
 
 from ..errors import FunctionError, InputError
@@ -304,12 +304,8 @@ class WithTime(Energy):
 
     energy: Energy
 
-    @property
-    def is_quadratic(self) -> bool:
-        return self.energy.is_quadratic
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(x)
+    is_quadratic = forwarded("energy")
+    value = forwarded("energy")
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         if self.is_quadratic:
@@ -400,9 +396,7 @@ class Pullback(Energy):
     def check_places(self, dim: int, role: str) -> None:
         check_coordinates(self.coordinates, dim, role)
 
-    @property
-    def depends_on_time(self) -> bool:
-        return self.term.depends_on_time
+    depends_on_time = forwarded("term")
 
     def at_time(self, t) -> Energy:
         return eqx.tree_at(lambda e: e.term, self, self.term.at_time(t)) if self.depends_on_time else self
@@ -419,9 +413,7 @@ class Negative(Energy):
 
     term: Energy
 
-    @property
-    def is_quadratic(self) -> bool:
-        return self.term.is_quadratic
+    is_quadratic = forwarded("term")
 
     def value(self, x) -> jax.Array:
         return -self.term.value(x)
@@ -429,8 +421,7 @@ class Negative(Energy):
     def gradient(self, x) -> jax.Array:
         return -self.term.gradient(x)
 
-    def sensitivity(self, x) -> jax.Array:
-        return self.term.sensitivity(x)
+    sensitivity = forwarded("term")
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         return -self.term.discrete_gradient(scheme, x, d, compensation)
@@ -438,11 +429,8 @@ class Negative(Energy):
     def stage_gradients(self, scheme, path) -> jax.Array:
         return -self.term.stage_gradients(scheme, path)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        return self.term.couplings(dim)
-
-    def check_places(self, dim: int, role: str) -> None:
-        self.term.check_places(dim, role)
+    couplings = forwarded("term")
+    check_places = forwarded("term")
 
     def __neg__(self) -> Energy:
         return self.term

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import scipy
 
+from manifolds._module import forwarded
+
 from .coordinates import Components
 from .energy import Energy, Pullback
 from .frames import total
@@ -45,9 +47,7 @@ class WithBaths(Energy):
     def is_quadratic(self) -> bool:
         return self.body.is_quadratic and self.baths.is_quadratic
 
-    @property
-    def depends_on_time(self) -> bool:
-        return self.body.depends_on_time
+    depends_on_time = forwarded("body")
 
     def at_time(self, t) -> Energy:
         return WithBaths(self.body.at_time(t), self.baths, self.size, self.dim)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._module import Module, forwarded
 
 from ..errors import InputError
 from ..functions.energy import Energy
@@ -163,37 +163,15 @@ class Wrapping(OneStepMethod):
 
     method: OneStepMethod
 
-    @property
-    def stages(self) -> int:
-        return self.method.stages
-
-    @property
-    def order(self) -> int:
-        return self.method.order
-
-    @property
-    def preserves(self) -> frozenset[str]:
-        return self.method.preserves
-
-    @property
-    def explicit(self) -> bool:
-        return self.method.explicit
-
-    @property
-    def evaluations(self) -> int:
-        return self.method.evaluations
-
-    def increment(self, h, k) -> jax.Array:
-        return self.method.increment(h, k)
-
-    def weights(self, theta) -> np.ndarray:
-        return self.method.weights(theta)
-
-    def predict(self, k, before) -> jax.Array:
-        return self.method.predict(k, before)
-
-    def check(self, system: System) -> None:
-        self.method.check(system)
+    stages = forwarded("method")
+    order = forwarded("method")
+    preserves = forwarded("method")
+    explicit = forwarded("method")
+    evaluations = forwarded("method")
+    increment = forwarded("method")
+    weights = forwarded("method")
+    predict = forwarded("method")
+    check = forwarded("method")
 
 
 class TransportingMethod(OneStepMethod):

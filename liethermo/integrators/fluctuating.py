@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._module import forwarded
+
 from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor, beside
 from ..dissipation.noise import SQUARE, divergence, elsewhere, factors, factors_at, residuals
@@ -62,9 +64,7 @@ class Fluctuating(Wrapping, TransportingMethod):
     def preserves(self) -> frozenset[str]:
         return self.method.preserves - {"entropy_law_quadratic"}
 
-    @property
-    def retraction(self):
-        return self.method.retraction
+    retraction = forwarded("method")
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         del tolerance

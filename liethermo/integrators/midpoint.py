@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 
 import manifolds as mf
+from manifolds._module import forwarded
 
 from ..functions.gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
@@ -57,9 +58,7 @@ class MetriplecticMidpoint(TransportingMethod):
 
     stages = 1
 
-    @property
-    def order(self) -> int:
-        return self.gradient.order
+    order = forwarded("gradient")
 
     @property
     def preserves(self) -> frozenset[str]:

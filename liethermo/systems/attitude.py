@@ -12,6 +12,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._module import forwarded
 from manifolds.groups import maps
 
 from ..dissipation.base import Carried, There
@@ -75,9 +76,7 @@ class AttitudeSystem(System):
         """The system of mu and of baths alone."""
         return momenta_of(self.body)
 
-    @property
-    def pushed_by(self) -> str:
-        return self.body.pushed_by
+    pushed_by = forwarded("body")
 
     def split(self, x) -> tuple[jax.Array, jax.Array]:
         """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
@@ -188,9 +187,7 @@ class AttitudeSystem(System):
         size = float(np.max(sizes))
         return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
 
-    @property
-    def inertia(self):
-        return self.momenta.inertia
+    inertia = forwarded("momenta")
 
     @property
     def constants(self):
@@ -208,9 +205,7 @@ class AttitudeSystem(System):
         found = {name: self._of_momentum(f) for name, f in self.body.ledger.items()}
         return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulses)}
 
-    @property
-    def balance(self):
-        return self.body.balance
+    balance = forwarded("body")
 
     @property
     def blocks(self):
@@ -308,18 +303,13 @@ class TurningSystem(System):
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
 
-    @property
-    def pushed_by(self) -> str:
-        return self.whole.pushed_by
+    pushed_by = forwarded("whole")
 
     def casimirs(self):
         return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
 
-    def raised(self, x, alpha):
-        return self.whole.raised(x, alpha)
-
-    def lowered(self, x, v):
-        return self.whole.lowered(x, v)
+    raised = forwarded("whole")
+    lowered = forwarded("whole")
 
     def field(self, x, dH, dS, dL=()):
         body, n = self.body_at(x), self.whole.body.dim
@@ -361,9 +351,7 @@ class TurningSystem(System):
 class _OnMomentum(Carried):
     """A dissipation of the momentum."""
 
-    @property
-    def noiseless(self) -> bool:
-        return self.part.noiseless
+    noiseless = forwarded("part")
 
     def there(self, system, x) -> There:
         n = system.whole.body.dim

@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax
 
 import manifolds as mf
+from manifolds._module import forwarded
 from manifolds.structures.poisson import PoissonBySharp
 
 from ..dissipation.base import Carried, There
@@ -54,9 +55,7 @@ class ChartSystem(System):
         assert space is not None
         return energy.mapped(lambda term: term.in_chart(self.coordinates, space, self.start))
 
-    @property
-    def smooth(self) -> bool:
-        return self.manifold.smooth
+    smooth = forwarded("manifold")
 
     def here(self, x) -> System:
         return (

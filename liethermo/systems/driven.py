@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import forwarded
 from manifolds.structures.poisson import Beside, PoissonBySharp
 
 from ..dissipation.base import Carried, Law, SkewFriction, There
@@ -108,13 +109,8 @@ class DrivenSystem(System):
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
-    @property
-    def unrollable(self) -> bool:
-        return self.body.unrollable
-
-    @property
-    def spectral(self) -> bool:
-        return self.body.spectral
+    unrollable = forwarded("body")
+    spectral = forwarded("body")
 
     def field(self, x, dH, dS, dL=()):
         motion = self._now(x).left_alone().field(*_part_of_body(x, dH, dS, dL))
@@ -124,21 +120,10 @@ class DrivenSystem(System):
     def transport(self, x, dH, dS, dL=()):
         return self._now(x).transport(*_part_of_body(x, dH, dS, dL))
 
-    @property
-    def torque_free(self) -> bool:
-        return self.body.torque_free
-
-    @property
-    def body_dim(self) -> int:
-        return self.body.body_dim
-
-    @property
-    def pushed_by(self) -> str:
-        return self.body.pushed_by
-
-    @property
-    def needs_attitude(self) -> bool:
-        return self.body.needs_attitude
+    torque_free = forwarded("body")
+    body_dim = forwarded("body")
+    pushed_by = forwarded("body")
+    needs_attitude = forwarded("body")
 
     def push(self, x):
         return self._now(x).push(x[:-2]) if self.torque is None else self.torque
@@ -162,9 +147,7 @@ class DrivenSystem(System):
         object.__setattr__(found, "torque", torque)
         return found
 
-    @property
-    def surface(self):
-        return self.body.surface
+    surface = forwarded("body")
 
     def raised(self, x, alpha):
         """What is moved to correct something is moved in the body: never the clock, nor the work done."""
@@ -192,9 +175,7 @@ class DrivenSystem(System):
     def casimirs(self):
         return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
 
-    @property
-    def has_all_casimirs(self) -> bool:
-        return self.body.has_all_casimirs
+    has_all_casimirs = forwarded("body")
 
     def conserves(self, functions, near=None):
         """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""
@@ -219,8 +200,7 @@ class DrivenSystem(System):
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.presented(found)
 
-    def on_sites(self, found):
-        return self.body.on_sites(found)
+    on_sites = forwarded("body")
 
 
 class _WithoutClock(Energy):

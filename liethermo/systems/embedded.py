@@ -16,6 +16,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._module import forwarded
 from manifolds.structures.poisson import PoissonBySharp
 
 from ..dissipation.base import Carried, There
@@ -59,17 +60,13 @@ class EmbeddedSystem(System):
     def _recognised(self, energy: Energy) -> Energy:
         return recognised(energy, self.dim)
 
-    @property
-    def kind(self) -> str:
-        return self.manifold.kind
+    kind = forwarded("manifold")
 
     @property
     def domain(self) -> str:  # type: ignore[override]
         return f"a point of {_space(self.manifold).name}"
 
-    @property
-    def ledger(self) -> dict[str, Energy]:
-        return self.manifold.ledger
+    ledger = forwarded("manifold")
 
     @property
     def surface(self) -> OnLevels:
@@ -85,23 +82,12 @@ class EmbeddedSystem(System):
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    def points(self, x):
-        return self.manifold.points(x)
-
-    def numbers(self, x, batch: bool = False):
-        return self.manifold.numbers(x, batch)
-
-    def on_states(self, energy: Energy) -> Energy:
-        return self.manifold.on_states(energy)
-
-    def samples(self, count, seed=0, scale=1.0):
-        return self.manifold.samples(count, seed, scale)
-
-    def without_baths(self) -> System:
-        return self.manifold.without_baths()
-
-    def _around(self, x) -> np.ndarray:
-        return self.manifold._around(x)
+    points = forwarded("manifold")
+    numbers = forwarded("manifold")
+    on_states = forwarded("manifold")
+    samples = forwarded("manifold")
+    without_baths = forwarded("manifold")
+    _around = forwarded("manifold")
 
     def presented(self, solution):
         given = self.manifold.dissipation
@@ -121,9 +107,7 @@ class EmbeddedSystem(System):
     def unrollable(self) -> bool:
         return self.manifold.smooth
 
-    @property
-    def smooth(self) -> bool:
-        return self.manifold.smooth
+    smooth = forwarded("manifold")
 
 
 class _Tangent(PoissonBySharp):
@@ -131,9 +115,7 @@ class _Tangent(PoissonBySharp):
 
     manifold: System
 
-    @property
-    def dim(self) -> int:
-        return self.manifold.dim
+    dim = forwarded("manifold")
 
     def sharp(self, x, alpha):
         motion = self.manifold.poisson.sharp(x, _along(self.manifold, x, alpha))

@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 
 from .._arrays import as_numeric, real_components
+from .._module import forwarded
 from .._sizes import check_memory, checked_size
 from ..errors import LieAlgebraError, ParameterError, ShapeError
 from ..matrices.blocks import BlockDiagonal
@@ -305,9 +306,7 @@ class Total:
 
     part: SiteCasimirs
 
-    @property
-    def dim(self) -> int:
-        return self.part.dim
+    dim = forwarded("part")
 
     def __call__(self, mu) -> jax.Array:
         return jnp.sum(self.part(real_components(mu, self.dim, "mu")).reshape(*jnp.shape(mu)[:-1], -1), axis=-1)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import is_traced, real_components, square_matrices
+from .._module import forwarded
 from .._sizes import check_memory
 from ..errors import LieAlgebraError, ParameterError
 from ..matrices.blocks import Diagonal
@@ -277,9 +278,7 @@ class MatrixTrace:
     algebra: MatrixAlgebra
     degree: int
 
-    @property
-    def dim(self) -> int:
-        return self.algebra.dim
+    dim = forwarded("algebra")
 
     def __call__(self, mu) -> jax.Array:
         g = self.algebra

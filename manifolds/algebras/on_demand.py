@@ -7,11 +7,10 @@ from functools import cached_property
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from .._module import forwarded
 from .._names import checked_names
 from .._sizes import check_memory
-from ._exact import RationalArray
 from .lie_algebra import LieAlgebra
 
 
@@ -52,21 +51,10 @@ class OnDemand(LieAlgebra):
     @abstractmethod
     def _key(self): ...
 
-    @property
-    def structure_constants(self) -> np.ndarray:
-        return self.by_constants.structure_constants
-
-    @property
-    def rational_constants(self) -> RationalArray | None:
-        return self.by_constants.rational_constants
-
-    @property
-    def basis(self) -> np.ndarray | None:
-        return self.by_constants.basis
-
-    @property
-    def _balanced(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.by_constants._balanced
+    structure_constants = forwarded("by_constants")
+    rational_constants = forwarded("by_constants")
+    basis = forwarded("by_constants")
+    _balanced = forwarded("by_constants")
 
     def _check_square(self, what: str) -> None:
         """Raise SizeError where a dim by dim matrix would not fit."""

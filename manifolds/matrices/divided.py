@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
+from .._module import forwarded
+
 CLOSE = 1 / 16
 """Spread of points, relative to the width of a function, up to which divided differences are means of derivatives.
 
@@ -165,8 +167,7 @@ class Derivative(ScalarFunction):
     def derivative(self, x, order):
         return self.of.derivative(x, order + 1)
 
-    def width(self, x):
-        return self.of.width(x)
+    width = forwarded("of")
 
 
 @dataclass(frozen=True)

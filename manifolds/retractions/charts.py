@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from .._module import forwarded
 from ..errors import ParameterError, SpaceError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup
 from ..matrices.linear import solve
@@ -196,13 +197,8 @@ class MidpointRetraction(Retraction):
                 f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
             )
 
-    @property
-    def space(self) -> Space:  # type: ignore[override]
-        return self.chart.space
-
-    @property
-    def order(self):
-        return self.chart.order
+    space = forwarded("chart")
+    order = forwarded("chart")
 
     def _ends(self, z, v):
         return self.chart._point(z, -0.5 * v), self.chart._point(z, 0.5 * v)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import at, first, is_traced
+from .._module import forwarded
 from ..errors import DomainError, SpaceError
 from ..spaces.base import Space
 from ..spaces.maps import run
@@ -191,8 +192,7 @@ class Chart(Retraction):
             "which has it at the start"
         )
 
-    def _reach(self, z, v):
-        return self.space._reach(z, v)
+    _reach = forwarded("space")
 
     def _midpoint_reach(self, z, v):
         """Reach of the step v with z in its middle."""

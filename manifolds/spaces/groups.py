@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import as_numeric
+from .._module import forwarded
 from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
@@ -83,13 +84,8 @@ class GroupSpace(Space):
     def dtype(self):  # type: ignore[override]
         return self.group.algebra._known_basis().dtype
 
-    @property
-    def name(self):
-        return self.group.name
-
-    @property
-    def dim(self):
-        return self.group.dim
+    name = forwarded("group")
+    dim = forwarded("group")
 
     @property
     def shape(self):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import as_numeric
+from .._module import forwarded
 from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
 from ..groups.matrix_group import MatrixGroup
@@ -75,13 +76,8 @@ class Homogeneous(Space):
     def dim(self):
         return len(self.horizontal)
 
-    @property
-    def shape(self):
-        return self.upstairs.shape
-
-    @property
-    def dtype(self):  # type: ignore[override]
-        return self.upstairs.dtype
+    shape = forwarded("upstairs")
+    dtype = forwarded("upstairs")
 
     def injectivity_radius(self, x=None):
         """Curvatures are at most ``|[X, Y]|^2`` for unit X, Y [Bloch & Iserles 2005]: 2 in SO(n) with n > 3, else 1."""
@@ -100,33 +96,15 @@ class Homogeneous(Space):
 
     # -- points: those of the group -----------------------------------------------------------------------------------
 
-    def _residual(self, x):
-        return self.upstairs._residual(x)
-
-    def _project(self, x):
-        return self.upstairs._project(x)
-
-    def _constraints(self, x):
-        return self.upstairs._constraints(x)
-
-    def _correction(self, x, c):
-        return self.upstairs._correction(x, c)
-
-    def _along(self, x, w):
-        return self.upstairs._along(x, w)
-
-    def _rounded(self, x):
-        return self.upstairs._rounded(x)
-
-    def _inside(self, x):
-        return self.upstairs._inside(x)
-
-    @property
-    def _normals(self):
-        return self.upstairs._normals
-
-    def _from_normals(self, w):
-        return self.upstairs._from_normals(w)
+    _residual = forwarded("upstairs")
+    _project = forwarded("upstairs")
+    _constraints = forwarded("upstairs")
+    _correction = forwarded("upstairs")
+    _along = forwarded("upstairs")
+    _rounded = forwarded("upstairs")
+    _inside = forwarded("upstairs")
+    _normals = forwarded("upstairs")
+    _from_normals = forwarded("upstairs")
 
     # -- horizontal vectors -------------------------------------------------------------------------------------------
 
@@ -148,8 +126,7 @@ class Homogeneous(Space):
     def _flat(self, x, v):
         return self.upstairs._flat(x, self._project_tangent(x, v))
 
-    def _exp(self, x, v):
-        return self.upstairs._exp(x, v)
+    _exp = forwarded("upstairs")
 
     def _transport(self, x, v, u):
         brackets = self._m @ self.upstairs.group.algebra.ad(self.upstairs._velocity(x, v)) @ self._m.T

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._module import forwarded
 from .._sizes import checked_size
 from ..errors import SpaceError
 from .base import Space, makes, random_key, register
@@ -272,9 +273,7 @@ class Power(Space):
     def shape(self):
         return (self.count, *self.base.shape)
 
-    @property
-    def dtype(self):  # type: ignore[override]
-        return self.base.dtype
+    dtype = forwarded("base")
 
     def injectivity_radius(self, x=None):
         if x is None:
@@ -284,8 +283,7 @@ class Power(Space):
     def _residual(self, x):
         return self.base._residual(x).max(axis=-1)
 
-    def _project(self, x):
-        return self.base._project(x)
+    _project = forwarded("base")
 
     def random(self, key_or_seed, size=()):
         return self.base.random(key_or_seed, (*size, self.count))
@@ -300,19 +298,10 @@ class Power(Space):
     def _from_normals(self, w):
         return self.base._from_normals(w.reshape(*w.shape[:-1], self.count, -1))
 
-    def _returned(self, x):
-        return self.base._returned(x)
-
-    def _project_tangent(self, x, w):
-        return self.base._project_tangent(x, w)
-
-    @property
-    def surrounded(self):
-        return self.base.surrounded
-
-    @property
-    def _has_equations(self):
-        return self.base._has_equations
+    _returned = forwarded("base")
+    _project_tangent = forwarded("base")
+    surrounded = forwarded("base")
+    _has_equations = forwarded("base")
 
     def _constraints(self, x):
         return self._joined(self.base._constraints(x))
@@ -333,8 +322,7 @@ class Power(Space):
     def _of_each(self, c):
         return c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count)
 
-    def _along(self, x, w):
-        return self.base._along(x, w)
+    _along = forwarded("base")
 
     def _inside(self, x):
         return self.base._inside(x).all(axis=-1)
@@ -361,63 +349,33 @@ class Power(Space):
     def _inner(self, x, u, v):
         return self.base._inner(x, u, v).sum(axis=-1)
 
-    def _flat(self, x, v):
-        return self.base._flat(x, v)
-
-    def _sharp(self, x, alpha):
-        return self.base._sharp(x, alpha)
-
-    def _exp(self, x, v):
-        return self.base._exp(x, v)
-
-    def _log(self, x, y):
-        return self.base._log(x, y)
-
-    def _midpoint(self, x, y):
-        return self.base._midpoint(x, y)
+    _flat = forwarded("base")
+    _sharp = forwarded("base")
+    _exp = forwarded("base")
+    _log = forwarded("base")
+    _midpoint = forwarded("base")
 
     def _distance(self, x, y):
         return jnp.linalg.norm(self.base._distance(x, y), axis=-1)
 
-    def _transport(self, x, v, u):
-        return self.base._transport(x, v, u)
+    _transport = forwarded("base")
 
     def _reach(self, x, v):
         return self.base._reach(x, v).max(axis=-1)
 
-    @property
-    def bi_invariant(self):  # type: ignore[override]
-        return self.base.bi_invariant
-
-    @property
-    def exp_of_group(self):  # type: ignore[override]
-        return self.base.exp_of_group
-
-    @property
-    def geodesics(self):
-        return self.base.geodesics
-
-    @property
-    def smooth(self):  # type: ignore[override]
-        return self.base.smooth
+    bi_invariant = forwarded("base")
+    exp_of_group = forwarded("base")
+    geodesics = forwarded("base")
+    smooth = forwarded("base")
 
     def _straight_reach(self, x, v):
         return self.base._straight_reach(x, v).max(axis=-1)
 
-    def _group_exp(self, x, v):
-        return self.base._group_exp(x, v)
-
-    def _group_log(self, x, y):
-        return self.base._group_log(x, y)
-
-    def _left_carry(self, x, y, u):
-        return self.base._left_carry(x, y, u)
-
-    def _cayley(self, x, v):
-        return self.base._cayley(x, v)
-
-    def _inverse_cayley(self, x, y):
-        return self.base._inverse_cayley(x, y)
+    _group_exp = forwarded("base")
+    _group_log = forwarded("base")
+    _left_carry = forwarded("base")
+    _cayley = forwarded("base")
+    _inverse_cayley = forwarded("base")
 
     def _why_no_log(self, x, y):
         lost = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)

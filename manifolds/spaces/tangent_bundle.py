@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from .._module import forwarded
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import Space, random_key, register
@@ -49,17 +50,9 @@ class TangentBundle(Space):
     def shape(self):
         return (2, *self.base.shape)
 
-    @property
-    def surrounded(self):
-        return self.base.surrounded
-
-    @property
-    def smooth(self):  # type: ignore[override]
-        return self.base.smooth
-
-    @property
-    def _has_equations(self):
-        return self.base._has_equations
+    surrounded = forwarded("base")
+    smooth = forwarded("base")
+    _has_equations = forwarded("base")
 
     def along(self, q, w) -> jax.Array:
         """The part along Q of an array w at a point q of it, both in one row, shape (n,), with n their entries."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import real_components
-from .._module import Module
+from .._module import Module, forwarded
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ParameterError, ShapeError
 
@@ -75,9 +75,7 @@ class LiePoisson(PoissonStructure):
 
     algebra: LieAlgebra = eqx.field(static=True)
 
-    @property
-    def dim(self) -> int:
-        return self.algebra.dim
+    dim = forwarded("algebra")
 
     def tensor(self, x) -> jax.Array:
         return self.algebra.poisson_tensor(x)
