@@ -64,7 +64,6 @@ class Dissipation(Module):
 
         A pattern, shape (n, n), for systems too large for a full Jacobian matrix; None where it is not known.
         """
-        del system
         return None
 
     @property
@@ -87,12 +86,10 @@ class Dissipation(Module):
 
     def prepared(self, system: Geometry) -> Dissipation:
         """This dissipation, checked against the system it is used in and completed with what that determines."""
-        del system
         return self
 
     def own_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
         """Residuals at x of what it was given and would have to mend, relative to what cancels, by their names."""
-        del system, x
         return {}
 
     @abstractmethod
@@ -128,7 +125,6 @@ class Dissipation(Module):
         coadjoint orbit by a further velocity. An attitude that follows it too keeps the momentum in space. A force of
         another form is a torque from outside. Whether it is None depends on the construction alone.
         """
-        del system, x, dH, dS, dL
         return None
 
     def factor(self, system: Geometry, x, dH, dL) -> Factor | None:
@@ -137,7 +133,6 @@ class Dissipation(Module):
         Where a dissipation lowers the energy, the force is ``-K dH``. Noise is made with B, and so are potentials of
         forces; ``B^T dH = 0`` and ``B^T dL = 0`` for whatever gradients it is handed, where these are conserved.
         """
-        del system, x, dH, dL
         return None
 
     def divergence(self, system: Geometry, x) -> jax.Array:
@@ -163,7 +158,6 @@ class Dissipation(Module):
         ``turned`` is ``[dH, dS]``. Such an F joins the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
         action instead of two. None where the force is of another form.
         """
-        del dH, turned
         return None
 
     def change(self, system: Geometry, x, dH, dS, dL, gradient) -> jax.Array:

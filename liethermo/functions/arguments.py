@@ -54,7 +54,6 @@ class Constant(Module):
     value: jax.Array
 
     def __call__(self, *arguments):
-        del arguments
         return self.value
 
 

@@ -25,12 +25,13 @@ def recognised(energy: Energy, dim: int) -> Energy:
     if isinstance(energy, Pullback):
         (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
-    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(_value, energy, dim) <= 2:
+    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(value_of, energy, dim) <= 2:
         return Function(energy.function, quadratic=True)
     return energy
 
 
-def _value(energy: Energy, x):
+def value_of(energy: Energy, x) -> jax.Array:
+    """Its value at a state: of any energy one function, as what is compiled is kept by."""
     return energy.value(x)
 
 

@@ -46,12 +46,10 @@ class VonNeumann(Energy):
         return -structure.vector(mf.spectral(LogPlusOne(self.floor), structure.matrix(x)))
 
     def hidden(self, x) -> jax.Array:
-        del x
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """By divided differences between the eigenvalues at both ends, in place of any other: its rounding vanishes."""
-        del scheme
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
         ends = structure.matrix(x + compensation), structure.matrix(x + (compensation + d))
         return -structure.vector(mf.spectral_difference(Information(self.floor), *ends))

@@ -99,7 +99,6 @@ class Energy(Module):
 
         The discrete gradients have it too.
         """
-        del dim
         return None
 
     def check_places(self, dim: int, role: str) -> None:
@@ -129,7 +128,6 @@ class Energy(Module):
 
     def at_time(self, t) -> Energy:
         """The function of the state alone that it is at a time."""
-        del t
         return self
 
     def with_time(self) -> Energy:
@@ -236,7 +234,6 @@ class Linear(Energy):
         return jnp.dot(self.b, x)
 
     def gradient(self, x) -> jax.Array:
-        del x
         return self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:

@@ -41,7 +41,6 @@ class Warmth(Energy):
         return self.temperature * jnp.exp(x * self.rate)
 
     def hidden(self, x) -> jax.Array:
-        del x
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:

@@ -117,7 +117,6 @@ class OneStepMethod(Module):
 
     def explain(self, system: System, x, k, h) -> str:
         """Why the step from x is not finite, where the method knows; k are the slopes of the step before."""
-        del system, x, k, h
         return ""
 
     # -- and of what it runs on ---------------------------------------------------------------------------------------
@@ -141,7 +140,6 @@ class OneStepMethod(Module):
 
         With the relative tolerance of adaptive steps, where steps are not of given sizes.
         """
-        del tolerance
         return self
 
     @property

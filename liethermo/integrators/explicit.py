@@ -127,7 +127,6 @@ class ExplicitMethod(TransportingMethod):
         return system.has_all_casimirs and held and system.body_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        del tolerance
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))
         method = in_charts(seen, system, self.retraction, "exp")
         if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
@@ -236,11 +235,9 @@ class ExplicitMethod(TransportingMethod):
         return h * k[SLOPE]
 
     def predict(self, k, before) -> jax.Array:
-        del before
         return k
 
     def explain(self, system: System, x, k, h) -> str:
-        del k
         if not bool(jnp.isfinite(system.vector_field(jnp.asarray(x))).all()):
             return ""
         return (

@@ -67,7 +67,6 @@ class Fluctuating(Wrapping, TransportingMethod):
     retraction = forwarded("method")
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        del tolerance
         return in_charts(self, system, self.method.retraction, "midpoint")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
@@ -104,7 +103,6 @@ class Fluctuating(Wrapping, TransportingMethod):
 
     def predict(self, k, before) -> jax.Array:
         """The noise of a step has nothing to do with that of those before."""
-        del before
         return jnp.zeros_like(k)
 
     def keeps(self, system: System, name: str) -> bool:

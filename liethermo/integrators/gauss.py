@@ -22,6 +22,7 @@ from ..functions.energy import Energy
 from ..functions.frames import frame
 from ..functions.gradients import stage_gradients
 from ..systems import System
+from ..systems.base import gradients_of
 from ..tracing.interpret import at_points
 from .base import GaussMethod, OneStepMethod, TransportingMethod, checked_stages, collocation_error, moved, register
 from .charts import in_charts
@@ -106,7 +107,6 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         self.moving = moving
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        del tolerance
         held = tuple(sorted(name for name in system.first_integrals() if self._holds(system, name)))
         method = self._with(lambda C: seen_on(system, C), held)
         if self.functions and not is_traced((system, method)):
@@ -128,7 +128,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if not self.functions:
             return
         functions = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
-        gradients = np.nan_to_num(at_points(_gradients, tuple(functions), system.samples(8)))
+        gradients = np.nan_to_num(at_points(gradients_of, tuple(functions), system.samples(8)))
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
@@ -317,10 +317,6 @@ def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
         moved = jnp.linalg.norm(system.poisson.sharp(x, gradient))
         found.append(jnp.where(size > 0.0, moved / jnp.where(size > 0.0, size, 1.0), 0.0))
     return jnp.nan_to_num(jnp.stack(found))
-
-
-def _gradients(functions: tuple[Energy, ...], x):
-    return jnp.stack([f.gradient(x) for f in functions])
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

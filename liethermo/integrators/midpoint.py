@@ -53,7 +53,6 @@ class MetriplecticMidpoint(TransportingMethod):
         self.retraction = retraction
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        del tolerance
         return in_charts(self, system, self.retraction, "midpoint")
 
     stages = 1

@@ -128,7 +128,6 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """From weights that lower orders leave undetermined: see :class:`.lobatto.ExplicitTableau`."""
-        del system, x, compensation
         t = self.tableau
         found, length = h * jnp.max(jnp.abs(k[ERROR])), h * jnp.max(jnp.abs(k[SLOPE]))
         return t.scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.q)

@@ -141,7 +141,6 @@ class MetriplecticTaylor(ExplicitMethod):
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also sees where a test has been decided otherwise on the way.
         """
-        del system, x, compensation
         return h * jnp.max(jnp.abs(k[ERROR]))
 
 

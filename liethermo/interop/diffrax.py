@@ -36,7 +36,6 @@ class Term(diffrax.ODETerm):
 
     def vf(self, t, y, args):
         """The vector field at a state, shape (n,)."""
-        del args
         return self.system.vector_field(y, t if self.system.is_driven else None)
 
 
@@ -66,7 +65,6 @@ class Solver(diffrax.AbstractAdaptiveSolver):
 
     def order(self, terms) -> int:
         """That of the method."""
-        del terms
         return self.method.order
 
     def error_order(self, terms) -> int:
@@ -81,7 +79,6 @@ class Solver(diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step; a step whose equations are not solved is rejected, or ends the run, by diffrax's own rules."""
-        del args, made_jump
         system, method = self._on(terms)
         h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to turn time around
         compensation, k, before = solver_state

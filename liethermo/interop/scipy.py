@@ -116,7 +116,6 @@ def solve_ivp(
     InputError
         If an argument cannot be used. A step that fails does not raise: ``success`` is False, as in SciPy.
     """
-    del vectorized
     if not isinstance(fun, System):
         raise InputError(
             f"the first argument must be a system such as lt.LiePoissonSystem, not {type(fun).__name__}: "

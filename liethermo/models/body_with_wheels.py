@@ -31,7 +31,6 @@ class _InBearings(Module):
     friction: jax.Array
 
     def __call__(self, xi, S):
-        del S
         return jnp.concatenate([jnp.zeros(3), -self.friction * xi[3:]])
 
 

@@ -41,7 +41,6 @@ class ConstantInBody(Module):
         self.moment = _finite(moment, "moment")
 
     def __call__(self, t, mu):
-        del t, mu
         return self.moment
 
 
@@ -60,7 +59,6 @@ class ConstantInSpace(Module):
         self.moment = _finite(moment, "moment", 3)
 
     def __call__(self, t, mu, attitude):
-        del t, mu
         return attitude.T @ self.moment
 
 
@@ -98,7 +96,6 @@ class GravityGradient(Module):
                 raise InputError(f"towards lies in the plane of the orbit, normal to it: their cosine is {cosine:.3g}")
 
     def __call__(self, t, mu, attitude):
-        del mu
         n = attitude.T @ self.to_centre(t)
         turned = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
         return 3.0 * self.mean_motion**2 * jnp.cross(n, turned)
@@ -128,7 +125,6 @@ class Magnetic(Module):
         self.field = field if callable(field) else _finite(field, "field", 3)
 
     def __call__(self, t, mu, attitude):
-        del mu
         field = self.field(t) if callable(self.field) else self.field
         return jnp.cross(self.dipole, attitude.T @ field)
 
@@ -183,7 +179,6 @@ class Tabulated(Module):
         require(self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}")
 
     def __call__(self, t, mu):
-        del mu
         begun = jnp.where(t >= self.times, 1.0, 0.0)
         now = begun[:-1] - begun[1:]  # one in the interval that t is in, zero in the others: no search
         gone = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])

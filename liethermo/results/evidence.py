@@ -96,6 +96,11 @@ class Evidence:
 class Recorded(Saved):
     """A result with the evidence for its audit, or what finds that."""
 
+    t: np.ndarray
+    x: Any
+    energy: np.ndarray
+    attitude: np.ndarray | None
+    provenance: dict[str, Any]
     witness: Callable[[], Evidence] | None
 
     @functools.cached_property

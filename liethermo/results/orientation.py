@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-
-
-class Turned(Protocol):
-    """What is asked of a :class:`liethermo.Solution` or :class:`liethermo.Ensemble`."""
-
-    @property
-    def t(self) -> np.ndarray: ...
-    @property
-    def x(self) -> Any: ...
-    @property
-    def energy(self) -> np.ndarray: ...
-    @property
-    def attitude(self) -> np.ndarray | None: ...
-    @property
-    def provenance(self) -> dict[str, Any]: ...
-
+from .evidence import Recorded
 
 EQUAL = 1e-9
 """Difference of two moments of inertia, relative to them, up to which they count as equal."""
 
 
-def quaternions(solution: Turned) -> np.ndarray:
+def quaternions(solution: Recorded) -> np.ndarray:
     """The attitudes as unit quaternions (x, y, z, w), scalar last, that take body axes to those of space.
 
     The first one has ``w >= 0``, and each other one the sign that is nearer to the one before: so they are
@@ -61,7 +44,7 @@ def quaternions(solution: Turned) -> np.ndarray:
     return np.where(finite[..., 0], found, np.nan)
 
 
-def nutation(solution: Turned, axis=None) -> np.ndarray:
+def nutation(solution: Recorded, axis=None) -> np.ndarray:
     """The angle between an axis of the body and its angular momentum, ``arctan2(|e × mu|, e . mu)``, from 0 to pi.
 
     A body that is left to itself ends at 0, or at pi where it spins about the other end of the axis.
@@ -88,7 +71,7 @@ def nutation(solution: Turned, axis=None) -> np.ndarray:
     return np.arctan2(np.hypot(mu @ first, mu @ second), mu @ third)
 
 
-def spin(solution: Turned, axis=None) -> np.ndarray:
+def spin(solution: Recorded, axis=None) -> np.ndarray:
     """The angle by which the body has turned about its axis, the third of Euler's angles (z, x, z), continuous.
 
     With body axes (a, b, e), e the axis: ``arctan2(a . mu, b . mu)``. It is not defined while the nutation is 0 or
@@ -113,7 +96,7 @@ def spin(solution: Turned, axis=None) -> np.ndarray:
     return _continuous(solution, np.arctan2(mu @ first, mu @ second))
 
 
-def precession(solution: Turned, axis=None) -> np.ndarray:
+def precession(solution: Recorded, axis=None) -> np.ndarray:
     """The angle by which the axis of the body has turned about the angular momentum in space, continuous.
 
     The first of Euler's angles (z, x, z) in axes of space whose third has the direction of the angular momentum at the
@@ -144,7 +127,7 @@ def precession(solution: Turned, axis=None) -> np.ndarray:
     return _continuous(solution, across)
 
 
-def angles(solution: Turned) -> dict[str, np.ndarray]:
+def angles(solution: Recorded) -> dict[str, np.ndarray]:
     """All that is known of the orientation of a body, by name; empty where there is no body with attitudes."""
     if not _turns(solution):
         return {}
@@ -154,12 +137,12 @@ def angles(solution: Turned) -> dict[str, np.ndarray]:
     return found
 
 
-def _turns(solution: Turned) -> bool:
+def _turns(solution: Recorded) -> bool:
     """Whether there are attitudes in SO(3)."""
     return solution.attitude is not None and solution.provenance.get("group") == "SO(3)"
 
 
-def _attitudes(solution: Turned) -> np.ndarray:
+def _attitudes(solution: Recorded) -> np.ndarray:
     if solution.attitude is None:
         raise InputError("there are no attitudes: give the system a group, such as group=mf.SO(3), and keep states")
     if not _turns(solution):
@@ -167,7 +150,7 @@ def _attitudes(solution: Turned) -> np.ndarray:
     return solution.attitude
 
 
-def _momenta(solution: Turned) -> np.ndarray:
+def _momenta(solution: Recorded) -> np.ndarray:
     if solution.x is None:
         raise InputError('no states were kept: outputs="final" or "trajectory" keeps some')
     if not str(solution.provenance.get("algebra", "")).startswith("so(3)"):
@@ -178,12 +161,12 @@ def _momenta(solution: Turned) -> np.ndarray:
     return solution.x[..., :3]
 
 
-def _inertia(solution: Turned) -> np.ndarray | None:
+def _inertia(solution: Recorded) -> np.ndarray | None:
     given = solution.provenance.get("inertia")
     return None if given is None else np.array(given, dtype=float)
 
 
-def _frame(solution: Turned, axis) -> np.ndarray:
+def _frame(solution: Recorded, axis) -> np.ndarray:
     """Body axes, shape (3, 3), as rows, right-handed, of which the last is the one that angles are about."""
     if axis is None:
         inertia = _inertia(solution)
@@ -214,11 +197,11 @@ def _across(e) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(e, first)
 
 
-def _along_time(solution: Turned) -> bool:
+def _along_time(solution: Recorded) -> bool:
     """Whether the last axis of its series is that of time, and not that of trajectories of which the end is kept."""
     return solution.energy.shape[-1:] == np.shape(solution.t)
 
 
-def _continuous(solution: Turned, found) -> np.ndarray:
+def _continuous(solution: Recorded, found) -> np.ndarray:
     """Angles with whole turns counted along time."""
     return np.unwrap(found, axis=-1) if _along_time(solution) else found

@@ -345,7 +345,7 @@ class System(Kind):
         known = self.momentum_maps | self.casimirs()
         functions = (*known.values(), *self.preserved)
         points = np.concatenate([self.samples(2, seed, scale) for seed, scale in enumerate(SCALES)])
-        gradients = at_points(_gradients, functions, points)  # shape (points, functions, n)
+        gradients = at_points(gradients_of, functions, points)  # shape (points, functions, n)
         names, taken = list(known), {"energy", "entropy"}
         for i, (fallback, L) in enumerate(self.preserved_by_name().items(), start=len(known)):
             same = next((names[j] for j in range(i) if _proportional(gradients[:, i], gradients[:, j])), None)
@@ -613,7 +613,8 @@ def _spanned(gradients, vectors) -> jax.Array:
     return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
 
 
-def _gradients(functions: tuple[Energy, ...], x) -> jax.Array:
+def gradients_of(functions: tuple[Energy, ...], x) -> jax.Array:
+    """Of several functions at a state, shape (functions, n)."""
     return jnp.stack([f.gradient(x) for f in functions])
 
 

@@ -123,12 +123,10 @@ class Kind(Module):
 
     def outside(self, x) -> str:
         """Why a state lies outside the domain of the system, in words; empty where it does not."""
-        del x
         return ""
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
-        del x
         return {}
 
     # -- what acts from outside ---------------------------------------------------------------------------------------
@@ -145,7 +143,6 @@ class Kind(Module):
 
     def push(self, x) -> jax.Array | None:
         """The torque at a state, shape (n,), of a system at a time and an attitude; None where none acts."""
-        del x
         return None
 
     def left_alone(self) -> Self:

@@ -188,7 +188,6 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         """F_fr where a discretisation has the temperature T, shape (n,)."""
-        del T
         return self.friction_force(q, v, S, t)
 
     def external_force(self, q, v, S, t) -> jax.Array:
@@ -226,7 +225,6 @@ class _Linear(Module):
     R: jax.Array
 
     def __call__(self, q, v, S, t):
-        del q, S, t
         return -(self.R @ v if self.R.ndim == 2 else self.R * v)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from manifolds._tables import Row
 from manifolds.testing import Report, Suite
 
+from ..functions.checks import value_of
 from ..functions.energy import Energy, as_energy
 from ..integrators.fluctuating import undisturbed
 from ..runs.ensemble import ensemble
@@ -102,8 +103,8 @@ def check_equilibrium(
         raise ValueError(f"the points of the exact measure count as {effective:.0f} alone: give samples of it")
     for name, f in (_moments(system) if moments is None else moments).items():
         function = as_energy(f, f"moment {name!r}")
-        found = at_points(_value, function, late.reshape(-1, system.dim)).reshape(late.shape[:2]).mean(axis=1)
-        value = at_points(_value, function, np.asarray(exact.points))
+        found = at_points(value_of, function, late.reshape(-1, system.dim)).reshape(late.shape[:2]).mean(axis=1)
+        value = at_points(value_of, function, np.asarray(exact.points))
         mean = float(weights @ value)
         own = float(np.sqrt(weights**2 @ (value - mean) ** 2))
         error = float(np.hypot(own, found.std(ddof=1) / np.sqrt(paths)))
@@ -180,11 +181,11 @@ def _exponent(system: System, noise: Fluctuations, points: np.ndarray) -> np.nda
     """The logarithm of the density, up to a constant."""
     found = np.zeros(len(points))
     if noise.temperature is not None:
-        found = found - at_points(_value, system.energy, points) / (noise.boltzmann * noise.temperature)
+        found = found - at_points(value_of, system.energy, points) / (noise.boltzmann * noise.temperature)
     if system.entropy is not None:
-        found = found + at_points(_value, system.entropy, points) / noise.boltzmann
+        found = found + at_points(value_of, system.entropy, points) / noise.boltzmann
     if noise.density is not None:
-        found = found + at_points(_value, as_energy(noise.density, "the density"), points)
+        found = found + at_points(value_of, as_energy(noise.density, "the density"), points)
     return found
 
 
@@ -195,7 +196,3 @@ def _moments(system: System) -> dict[str, Callable]:
     if system.entropy is not None:
         return found | {"S": system.entropy}
     return found | {"H": system.energy}
-
-
-def _value(function: Energy, x):
-    return function.value(x)

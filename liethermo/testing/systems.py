@@ -9,8 +9,8 @@ import numpy as np
 from manifolds.testing import Report, Suite
 
 from ..integrators import OneStepMethod
+from ..results.looking import field_at
 from ..systems import System
-from ..tracing.interpret import at_points
 from .runs import METHODS, follow_laws, rebuilt, start_of, step_of
 
 
@@ -40,14 +40,10 @@ def check_system(
     suite = Suite(system.kind)
     suite.rows += system.check(seed=seed).rows
     points = system.samples(3, seed)
-    field, again = (at_points(_field, s, points) for s in (system, rebuilt(system)))
+    field, again = (field_at(s, points) for s in (system, rebuilt(system)))
     suite.true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))
     start = start_of(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
     h = step_of(system, start) if step is None else step
     for method in methods:
         follow_laws(suite, system, method, start, h, f"{method}: ")
     return suite.report()
-
-
-def _field(system: System, x):
-    return system.vector_field(x)

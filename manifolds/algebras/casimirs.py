@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -87,16 +86,7 @@ def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
     return found
 
 
-class Counted(Protocol):
-    """An algebra that says how many Casimirs it has, and which."""
-
-    @property
-    def dim(self) -> int: ...
-    def casimir_count(self) -> int: ...
-    def casimirs(self, degree: int) -> list: ...
-
-
-def leading_casimirs(g: Counted) -> list[tuple[str, Callable]]:
+def leading_casimirs(g: Structure) -> list[tuple[str, Callable]]:
     """The polynomial Casimirs of low degree with names, as many as there are; see the method of the algebra."""
     found: list[tuple[str, Callable]] = []
     count = g.casimir_count()

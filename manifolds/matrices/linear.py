@@ -101,8 +101,6 @@ def solve_near_identity(a, b) -> jax.Array:
         table = jnp.concatenate([rest, pivot_row], axis=-2)[..., 1:]
         return jnp.concatenate([table, jnp.zeros_like(table[..., :1])], axis=-1)
 
-    if a.shape[-1] == 1:
-        return b / a
     return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
 
 

@@ -156,7 +156,6 @@ class GroupSpace(Space):
 
     def injectivity_radius(self, x=None):
         """One that is sure: there eigenvalues of the velocity are smaller than pi."""
-        del x
         basis = self._orthonormal
         mixed = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
         if not np.abs(np.linalg.matrix_power(mixed, len(mixed))).max() > 1e-12 * np.abs(mixed).max() ** len(mixed):

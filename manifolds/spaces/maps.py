@@ -288,7 +288,6 @@ class Maps(ABC):
 
         The same at every point of a native space, which is then not needed.
         """
-        del x
         return math.inf
 
     # -- helpers --------------------------------------------------------------------------------------------------

@@ -103,7 +103,6 @@ class Canonical(PoissonStructure):
         return jnp.asarray(np.block([[zero, identity], [-identity, zero]]))
 
     def sharp(self, x, alpha) -> jax.Array:
-        del x
         position, momentum = jnp.split(alpha, 2)
         return jnp.concatenate([momentum, -position])
 
