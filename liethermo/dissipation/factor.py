@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 from manifolds.matrices.symmetric import semidefinite_factor
 
+from ..functions.frames import root
+
 
 class Factor(NamedTuple):
     """A matrix B, shape (n, size), with ``B B^T = K``, as what it does.
@@ -40,9 +42,9 @@ class Factor(NamedTuple):
 
     def scaled(self, rate) -> Factor:
         """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
-        root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)  # zero has a derivative too
-        velocity = None if (along := self.velocity) is None else lambda w: root * along(w)
-        return self._replace(times=lambda w: root * self.times(w), velocity=velocity)
+        scale = root(rate)
+        velocity = None if (along := self.velocity) is None else lambda w: scale * along(w)
+        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity)
 
 
 def root_of(form) -> Any:

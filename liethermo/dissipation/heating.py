@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.energy import Energy
+from ..functions.frames import root
 from ..functions.indices import Indices
 from .base import Carried, Dissipation, Several, There
 from .geometry import Geometry
@@ -61,14 +62,13 @@ class Heating(Carried):
         if B is None:
             return None
         T = self._of(dH[n:])
-        size = self.sign(dH[n:]) * T
-        root = jnp.where(size > 0.0, jnp.sqrt(jnp.where(size > 0.0, size, 1.0)), 0.0)
+        scale = root(self.sign(dH[n:]) * T)
 
         def times(w):
-            return self._joined(body, body.at_sites(root, B.times(w)), dH, n)
+            return self._joined(body, body.at_sites(scale, B.times(w)), dH, n)
 
         along = B.velocity
-        velocity = None if along is None else lambda w: body.at_sites(root, along(w))
+        velocity = None if along is None else lambda w: body.at_sites(scale, along(w))
         return B._replace(times=times, velocity=velocity, solenoidal=False)
 
     def divergence(self, system, x):

@@ -10,6 +10,7 @@ from manifolds._arrays import real_array
 from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled, summed
 
 from ..errors import InputError
+from ..functions.frames import root
 from ..functions.indices import Indices
 from .base import Dissipation
 from .checks import checked_bath, checked_rate, checked_rates
@@ -91,10 +92,9 @@ class LandauLifshitz(Dissipation):
     def factor(self, system, x, dH, dL):
         spins = system.poisson
         s, rate = spins.spins(x), self.rate.reshape(-1)
-        root = jnp.where(rate > 0.0, jnp.sqrt(jnp.where(rate > 0.0, rate, 1.0)), 0.0)
 
         def times(w):
             pull = planes(w.reshape(spins.count, 3))
-            return spins.joined(scaled(root, cross_planes(pull, s)), jnp.zeros(0))
+            return spins.joined(scaled(root(rate), cross_planes(pull, s)), jnp.zeros(0))
 
         return Factor(3 * spins.count, times, solenoidal=True)  # as w x s is, of any w that does not depend on s

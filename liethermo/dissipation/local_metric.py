@@ -11,6 +11,7 @@ from manifolds.matrices.linear import skew
 from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..errors import InputError
+from ..functions.frames import root
 from .base import Dissipation
 from .checks import checked_rates, semidefinite
 from .factor import Factor
@@ -59,13 +60,12 @@ class LocalProjectedMetric(Dissipation):
     def factor(self, system, x, dH, dL):
         """At each site all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, of the columns l of a root of G."""
         d, count = system.shape[-1], math.prod(system.sites)
-        root = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
+        L = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
         rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)
-        scale = jnp.where(rates > 0.0, jnp.sqrt(jnp.where(rates > 0.0, rates, 1.0)), 0.0)
-        gradients = dH.reshape(count, d) @ root
+        gradients = dH.reshape(count, d) @ L
 
         def turned(w):
             turns = skew(w.reshape(count, -1), d)
-            return (scale * (jnp.einsum("nij,nj->ni", turns, gradients) @ root.T)).ravel()
+            return (root(rates) * (jnp.einsum("nij,nj->ni", turns, gradients) @ L.T)).ravel()
 
         return Factor(count * math.comb(d, 2), turned, solenoidal=True)

@@ -114,6 +114,12 @@ def towards(directions: Sequence[jax.Array], products: jax.Array, passes: int = 
     return found
 
 
+def root(square) -> jax.Array:
+    """The square root, zero where there is none; that has a derivative at zero too."""
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
 def _inverse_root(square, usable):
     """``1 / |v|`` from ``|v|^2``, or 0 where that cannot be used; safe to differentiate."""
     return jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)

@@ -27,7 +27,7 @@ from manifolds._module import Module
 
 from ..errors import InputError
 from .energy import Energy
-from .frames import frame, total
+from .frames import frame, root, total
 from .path import Finer, Path
 
 EPS = float(np.finfo(np.float64).eps)
@@ -271,15 +271,12 @@ class Direction(NamedTuple):
     @classmethod
     def of(cls, k, b, weights=None, symmetries=None) -> Direction:
         """``d = W k``, W diagonal with the weights, but orthogonal to the symmetries, shape (s, r, m)."""
-        if weights is None:
-            root = jnp.ones(())
-        else:  # of zero too, whose root has no derivative
-            root = jnp.where(weights > 0.0, jnp.sqrt(jnp.where(weights > 0.0, weights, 1.0)), 0.0)
-        whole = left = root * k
+        scale = jnp.ones(()) if weights is None else root(weights)
+        whole = left = scale * k
         if symmetries is not None:
-            left = jax.vmap(lambda v, along: frame(list(along)).off(v))(whole, root * symmetries)
+            left = jax.vmap(lambda v, along: frame(list(along)).off(v))(whole, scale * symmetries)
         square, most = (jnp.dot(b, jnp.sum(v * v, axis=1)) for v in (left, whole))
-        return cls(root * left, square, _divide(jnp.sqrt(square), jnp.sqrt(most)))
+        return cls(scale * left, square, _divide(jnp.sqrt(square), jnp.sqrt(most)))
 
 
 class Change(NamedTuple):
