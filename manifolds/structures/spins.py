@@ -94,10 +94,6 @@ class Spins(PoissonBySharp):
     def sharp(self, x, alpha) -> jax.Array:
         return self.joined(self.turned(x, alpha), jnp.zeros(self.others))
 
-    def tensor(self, x) -> jax.Array:
-        """The matrix Pi(x), shape (n, n): for few spins alone."""
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self.dim))
-
 
 class Lattice:
     """Spins on a lattice, by their components."""
