@@ -109,9 +109,7 @@ class ExplicitMethod(TransportingMethod):
 
     explicit = True
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law", "casimirs"})
+    preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def keeps(self, system: System, name: str) -> bool:
         return name in system.first_integrals()

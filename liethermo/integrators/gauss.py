@@ -118,9 +118,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """The method with its preserved functions changed, holding these of the system."""
         return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law", "casimirs"})
+    preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system conserves what is to be preserved, and room is left for it to move."""

@@ -86,9 +86,7 @@ class DiscreteHerglotz(OneStepMethod):
     def order(self) -> int:
         return self.composed
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset()
+    preserves = frozenset()
 
     def __str__(self) -> str:
         return "DiscreteHerglotz" if self.composed == 1 else f"DiscreteHerglotz(order={self.composed})"

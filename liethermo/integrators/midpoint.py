@@ -59,9 +59,7 @@ class MetriplecticMidpoint(TransportingMethod):
 
     order = forwarded("gradient")
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
+    preserves = frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         return system.field(*self.at_midpoint(system, x, compensation, h, k))[None]

@@ -72,9 +72,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
             raise InputError(f"the order is 4, 6 or 8, not {order!r}")
         super().__init__(order, preserve, retraction, held)
 
-    @property
-    def stages(self) -> int:
-        return LAST + 1
+    stages = LAST + 1
 
     @property
     def evaluations(self) -> int:

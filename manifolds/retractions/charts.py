@@ -28,9 +28,7 @@ class RiemannianRetraction(Chart):
 
     space: Space
 
-    @property
-    def order(self):
-        return math.inf
+    order = math.inf
 
     def _point(self, z, v):
         return self.space._exp(z, v)

@@ -43,9 +43,7 @@ class VariationalGauss(GaussMethod):
     def __init__(self, stages: int = 2):
         self.number = checked_stages(stages)
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"entropy_law"})
+    preserves = frozenset({"entropy_law"})
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a variational principle of this kind."""

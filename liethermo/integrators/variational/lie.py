@@ -64,9 +64,7 @@ class LieVariational(OneStepMethod):
 
     order = 2
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"entropy_law"})
+    preserves = frozenset({"entropy_law"})
 
     def check(self, system: System) -> None:
         """Raise InputError where the Cayley map is to take an algebra to a group, and does not."""

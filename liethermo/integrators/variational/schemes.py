@@ -134,9 +134,7 @@ class VariationalIntegrator(OneStepMethod):
 
     in_charts = False
 
-    @property
-    def preserves(self) -> frozenset[str]:
-        return frozenset({"entropy_law"})
+    preserves = frozenset({"entropy_law"})
 
     def __str__(self) -> str:
         maps = ", ".join(
