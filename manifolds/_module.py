@@ -39,16 +39,19 @@ def _as_pytree(leaf: Any) -> Any:
 class _Forwarded:
     """See :func:`forwarded`."""
 
-    def __init__(self, inside: str):
-        self.inside = inside
+    def __init__(self, inside: str, name: str | None):
+        self.inside, self.name = inside, name
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
+        self.name = self.name or name
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        return self if instance is None else getattr(getattr(instance, self.inside), self.name)
+        return self if instance is None else getattr(getattr(instance, self.inside), str(self.name))
 
 
-def forwarded(inside: str) -> Any:
-    """In the body of a class that wraps an object: the member of that object, which the attribute ``inside`` holds."""
-    return _Forwarded(inside)
+def forwarded(inside: str, name: str | None = None) -> Any:
+    """In the body of a class that wraps an object: a member of that object, which the attribute ``inside`` holds.
+
+    The member of the same name, or of another one.
+    """
+    return _Forwarded(inside, name)

@@ -614,7 +614,7 @@ def _spanned(gradients, vectors) -> jax.Array:
 
 
 def gradients_of(functions: tuple[Energy, ...], x) -> jax.Array:
-    """Of several functions at a state, shape (functions, n)."""
+    """The gradients of several functions at a state, shape (functions, n)."""
     return jnp.stack([f.gradient(x) for f in functions])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from abc import abstractmethod
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -12,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-import manifolds as mf
-from manifolds._module import Module
-
 from ..dissipation.base import Dissipation, Law
+from ..dissipation.geometry import Geometry
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
@@ -28,19 +24,15 @@ class Decided(NamedTuple):
     unknown: frozenset[str]
 
 
-class Kind(Module):
+class Kind(Geometry):
     """A kind of system: its data, and answers that a subclass may replace; :class:`System` has what follows from them.
 
     The attributes are those of :class:`System`.
     """
 
-    poisson: mf.PoissonStructure
-    energy: Energy
     entropy: Energy | None
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
-    dim: int = eqx.field(static=True)
-    space: mf.Space | None = eqx.field(static=True)
     preserved_as: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
     """What the functions are called that the dissipation is told to preserve, one after another."""
     decided: Decided | None = eqx.field(static=True, kw_only=True, default=None)
@@ -55,21 +47,6 @@ class Kind(Module):
     def kind(self) -> str:
         """What it is, for messages."""
         return type(self).__name__
-
-    @property
-    def sites(self) -> tuple[int, ...]:
-        """The sites of a system of many equal ones, whose states are shown as arrays of shape ``(*sites, d)``."""
-        return ()
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
-        return (*self.sites, self.dim // math.prod(self.sites))
-
-    @property
-    def heating_sites(self) -> tuple[int, ...]:
-        """The sites that may each heat a bath of their own."""
-        return self.sites
 
     @property
     def body_dim(self) -> int:
@@ -194,13 +171,6 @@ class Kind(Module):
 
     # -- states as users see them -------------------------------------------------------------------------------------
 
-    def points(self, x) -> jax.Array:
-        """State vectors, shape (..., n), as they are shown: of shape ``(*sites, d)``, or as points of the space."""
-        if self.space is not None:
-            return self.space.from_vector(x)
-        x = jnp.asarray(x)
-        return x.reshape(*x.shape[:-1], *self.shape) if self.sites else x
-
     def seen(self, x) -> jax.Array:
         """The part of a state that is the user's, as points: what the functions of an event are functions of."""
         return self.points(x)
@@ -214,60 +184,6 @@ class Kind(Module):
         """The parts of a state that have sizes of their own, such as a momentum and the attitude beside it."""
         n = self.body_dim
         return (slice(None),) if self.baths is None else (slice(0, n), slice(n, self.dim))
-
-    # -- the metric of the space --------------------------------------------------------------------------------------
-
-    def raised(self, x, alpha) -> jax.Array:
-        """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
-        if self.space is None:
-            return alpha
-        return self.space.to_vector(self.space._sharp(self.points(x), self.points(alpha).conj()))
-
-    def lowered(self, x, v) -> jax.Array:
-        """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
-        if self.space is None:
-            return v
-        return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
-
-    def tangent(self, x, w) -> jax.Array:
-        """The tangent vector nearest to an array, shape (n,); itself on R^n."""
-        if self.space is None:
-            return w
-        return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
-
-    @property
-    def isotropic_size(self) -> int:
-        """How many numbers :meth:`isotropic` takes."""
-        return self.dim if self.space is None else self.space.isotropic_size
-
-    def isotropic(self, x, w) -> jax.Array:
-        """``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
-        return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
-
-    @abstractmethod
-    def without_baths(self) -> Kind:
-        """The body alone: the geometry that its dissipation acts in. Itself where there are no baths."""
-
-    def at_sites(self, values, v) -> jax.Array:
-        """A vector, shape (n,), times a number for each site, shape (sites,); or times one number."""
-        if jnp.ndim(values) == 0:
-            return values * v
-        return (values[:, None] * v.reshape(len(values), -1)).ravel()
-
-    def over_sites(self, alpha, v) -> jax.Array:
-        """``alpha . v`` at each site, shape (sites,)."""
-        return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
-
-    def changes(self, x, rows) -> jax.Array:
-        """What the divergence of vector fields is the sum of, over the first axis.
-
-        ``rows(y, alpha)`` is what a covector alpha at y makes of the field, or of each of several; vectors of shape
-        (n,).
-        """
-        if self.space is None:
-            return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
-        vector = self.space.to_vector
-        return self.space._changes(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
 
     # -- for the engines ----------------------------------------------------------------------------------------------
 

@@ -30,17 +30,10 @@ class RiemannianRetraction(Chart):
 
     order = math.inf
 
-    def _point(self, z, v):
-        return self.space._exp(z, v)
-
-    def _vector(self, z, x):
-        return self.space._log(z, x)
-
-    def _middle(self, x, y):
-        return self.space._midpoint(x, y)
-
-    def _carry(self, z, v, u):
-        return self.space._transport(z, v, u)
+    _point = forwarded("space", "_exp")
+    _vector = forwarded("space", "_log")
+    _middle = forwarded("space", "_midpoint")
+    _carry = forwarded("space", "_transport")
 
 
 @jax.tree_util.register_static
@@ -70,8 +63,7 @@ class EuclideanRetraction(Chart):
     def _carry(self, z, v, u):
         return u + jnp.zeros_like(v)
 
-    def _reach(self, z, v):
-        return self.space._straight_reach(z, v)
+    _reach = forwarded("space", "_straight_reach")
 
     def _midpoint_reach(self, z, v):
         return 0.5 * self.space._straight_reach(z, v)
@@ -138,11 +130,8 @@ class GroupRetraction(_GroupChart):
     def order(self):
         return math.inf if self.space.exp_of_group else 1
 
-    def _point(self, z, v):
-        return self.space._group_exp(z, v)
-
-    def _vector(self, z, x):
-        return self.space._group_log(z, x)
+    _point = forwarded("space", "_group_exp")
+    _vector = forwarded("space", "_group_log")
 
 
 @jax.tree_util.register_static
@@ -161,11 +150,8 @@ class CayleyRetraction(_GroupChart):
     def order(self):
         return 2 if self.space.exp_of_group else 1
 
-    def _point(self, z, v):
-        return self.space._cayley(z, v)
-
-    def _vector(self, z, x):
-        return self.space._inverse_cayley(z, x)
+    _point = forwarded("space", "_cayley")
+    _vector = forwarded("space", "_inverse_cayley")
 
     def _reach(self, z, v):
         return 0.0 * self.space._reach(z, v)
@@ -205,8 +191,7 @@ class MidpointRetraction(Retraction):
         z = self.chart._middle(x, y)
         return z, self.chart._vector(z, y) - self.chart._vector(z, x)
 
-    def _reach(self, z, v):
-        return self.chart._midpoint_reach(z, v)
+    _reach = forwarded("chart", "_midpoint_reach")
 
     def __repr__(self) -> str:
         return f"MidpointRetraction({self.chart!r})"
