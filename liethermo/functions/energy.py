@@ -118,7 +118,7 @@ class Energy(Module):
         return self.mapped(lambda term: Pullback(term, coordinates))
 
     def mapped(self, change: Callable[[Energy], Energy]) -> Energy:
-        """The sum of what its terms become."""
+        """The sum of what its terms become by ``change``, a function from a term to an energy."""
         return Sum.of([change(term) for term in self.terms])
 
     @property
