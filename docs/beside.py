@@ -39,15 +39,12 @@ def draw(path: Path) -> None:
         plt.close(figure)
 
 
-def draw_once(path: Path) -> None:
-    """Draw the picture where it is missing, or older than this file or than the library's version."""
-    import liethermo as lt
-
-    made_by = path.with_suffix(".txt")
-    told = f"liethermo {lt.__version__}\n{Path(__file__).read_text()}"
-    if not (path.is_file() and made_by.is_file() and made_by.read_text() == told):
+def draw_once(path: Path, made_by: str) -> None:
+    """Draw the picture where it is missing, or where this file or what is named has made another one."""
+    note, made_by = path.with_suffix(".txt"), f"{made_by}\n{Path(__file__).read_text()}"
+    if not (path.is_file() and note.is_file() and note.read_text() == made_by):
         draw(path)
-        made_by.write_text(told)
+        note.write_text(made_by)
 
 
 def errors() -> dict[str, np.ndarray]:

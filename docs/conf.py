@@ -7,14 +7,23 @@ import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
-# Examples draw without a screen and run on the CPU.
-os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE / "_ext")]
 
-import jax
+# Examples draw without a screen and run on the CPU. What is compiled for them is kept for the next build.
+KEPT = HERE / "_build" / "compiled"
+for setting, value in {
+    "MPLBACKEND": "Agg",
+    "JAX_PLATFORMS": "cpu",
+    "LIETHERMO_CACHE": str(KEPT / "liethermo"),
+    "JAX_COMPILATION_CACHE_DIR": str(KEPT / "xla"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}.items():
+    os.environ.setdefault(setting, value)  # for the processes that run the pages too
 
-import liethermo
-import manifolds
+import liethermo  # noqa: E402
+import manifolds  # noqa: E402
 
 for package in (liethermo, manifolds):  # what is imported on demand as an attribute autodoc imports as a module
     on_demand = ("plot", "scipy", "sympy", "diffrax") if package is liethermo else ("sympy",)
@@ -22,23 +31,15 @@ for package in (liethermo, manifolds):  # what is imported on demand as an attri
         if inspect.ismodule(value := getattr(package, name)):
             sys.modules.setdefault(f"{package.__name__}.{name}", value)
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE / "_ext")]
-
-# What XLA compiles for a page or an example is kept for the next build.
-KEPT = HERE / "_build" / "compiled"
-os.environ.setdefault("LIETHERMO_CACHE", str(KEPT / "liethermo"))
-jax.config.update("jax_compilation_cache_dir", str(KEPT / "xla"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
 import beside  # noqa: E402
 from facts import write_facts  # noqa: E402
+from made_by import digest, forget_others  # noqa: E402
 from rooms import draw  # noqa: E402
 from spec_keys import write_table  # noqa: E402
 
 draw(HERE / "generated" / "rooms.svg")
-beside.draw_once(HERE / "generated" / "beside.svg")
+beside.draw_once(HERE / "generated" / "beside.svg", digest())
+forget_others(HERE / "gallery", HERE / "_build" / "gallery.txt", digest())  # an example's own file is all it looks at
 write_facts(HERE / "generated" / "facts.md")
 write_table(HERE / "generated" / "spec_keys.md")
 
