@@ -79,3 +79,86 @@ def test_an_argument_that_nobody_tells_is_found():
     assert {"x", "system", "compensation"} <= arguments
     assert {"dim", "order"} <= attributes
     assert "colour" not in arguments | attributes
+
+
+PAGE = TABLE.with_name("api.md")
+ALSO = ("Fluctuations", "FourBracket", "Friction", "FrictionOperator", "LandauLifshitz", "SteepestEntropyAscent")
+MORE = ("Solution.audit", "learn.fit", *ALSO)
+"""Main names besides those that the first page of the reference lists."""
+
+WRITTEN_BY_THE_LIBRARY = ("Solution", "Audit")
+BY_CLASS_METHODS = ("LieAlgebra",)
+"""Nobody calls these: their docstrings describe what they hold."""
+
+WITHOUT_UNIT = frozenset(
+    """
+    algebra algebras also attitude axes basis batch bath build by_matrices checkpoint chunk constraints dense dim
+    dissipation engine first gradient group held kind matching measure method momentum_maps most_steps moving n
+    name names noise normalized number observed on_failure order outputs p parts path patience preserve progress
+    project projection q reconstruction retraction save_every save_to scheme seed shape shooting space spec stages
+    store substeps units validate validation window
+    """.split()
+)
+"""Options, names, counts and objects that have their own units. Any other parameter names its unit."""
+
+UNIT = re.compile(
+    r"\bunits?\b|dimensionless|without a unit|"
+    r"\((?:[^()]|\([^()]*\))*\b(?:time|energy|temperature|entropy|mass|length|kg|s|K|J|rad|mu)\b(?:[^()]|\([^()]*\))*\)"
+)
+
+
+def _main_names():
+    package = liethermo
+    for line in PAGE.read_text().partition("## By theme")[0].splitlines():
+        if line.startswith(".. currentmodule:: "):
+            package = {"liethermo": liethermo, "manifolds": manifolds}[line.split()[-1]]
+        elif re.fullmatch(r" {3}[A-Za-z][\w.]*", line):
+            yield package, line.strip()
+    yield from ((liethermo, name) for name in MORE)
+
+
+def _undescribed(thing, doc: str) -> list[str]:
+    """What is wrong with the description of each parameter."""
+    described: dict[str, str] = {}
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n---|\Z)", doc, re.MULTILINE | re.DOTALL)
+    for entry in re.split(r"\n(?=\S)", section[1]) if section else []:
+        head, _, words = entry.partition("\n")
+        names, _, kind = head.partition(" : ")
+        described |= {name.strip(): words.strip() and f"{kind} {words}" for name in names.split(",")}
+    wrong = []
+    for name, parameter in inspect.signature(thing).parameters.items():
+        keywords = parameter.kind is parameter.VAR_KEYWORD and described
+        text = described.get(name, "given by name" if keywords else "")
+        if name not in ("self", "cls"):
+            wrong += [] if text else [f"{name}: no words"]
+            wrong += [] if keywords or not text or name in WITHOUT_UNIT or UNIT.search(text) else [f"{name}: no unit"]
+    return wrong
+
+
+@pytest.mark.parametrize(("package", "name"), [pytest.param(*each, id=each[1]) for each in _main_names()])
+def test_parameters_of_the_main_names_have_words_and_units(package, name):
+    if name in WRITTEN_BY_THE_LIBRARY + BY_CLASS_METHODS:
+        pytest.skip("nobody calls it")
+    thing = functools.reduce(getattr, name.split("."), package)
+    assert _undescribed(thing, inspect.getdoc(thing)) == []
+
+
+def test_there_are_some_thirty_main_names():
+    assert len(list(_main_names())) > 30
+
+
+def test_a_parameter_without_words_or_unit_is_found():
+    def turned(rate, method, x0):
+        """Turned.
+
+        Parameters
+        ----------
+        rate : float
+            Of turning.
+        method : str
+        x0 : array
+            The start, in units of length.
+        """
+
+    assert _undescribed(turned, inspect.getdoc(turned)) == ["rate: no unit", "method: no words"]
+    assert _undescribed(turned, "Turned.") == ["rate: no words", "method: no words", "x0: no words"]

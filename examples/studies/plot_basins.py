@@ -36,7 +36,7 @@ def start(point):
 
 study = lt.Study(
     lambda point: body,
-    {"latitude": np.linspace(-89.0, 89.0, 90), "longitude": np.linspace(-179.0, 179.0, 180)},
+    {"latitude": np.linspace(-88.5, 88.5, 60), "longitude": np.linspace(-178.5, 178.5, 120)},
     x0=start,
     t_span=(0.0, 150.0),
     step=0.5,

@@ -29,10 +29,11 @@ class DoubleBracket(Dissipation):
     Parameters
     ----------
     rate : float, >= 0
+        Factor of the bracket. The unit of ``rate * metric`` is 1 / mu: s / (kg m**2) for a body in SI units.
     metric : array, shape (n, n) or (n,), optional
-        The positive semidefinite form ^♯, or its diagonal; by default the identity, or on a manifold the metric of the
-        space. On copies of an algebra it may be that of one site, shape (d, d). With either the bracket acts site by
-        site.
+        The positive semidefinite form ^♯, or its diagonal (dimensionless, or in units that go into that of the rate).
+        By default it is the identity, or on a manifold the metric of the space. On copies of an algebra it may be that
+        of one site, shape (d, d). Both act site by site.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
 

@@ -28,7 +28,8 @@ class FourBracket(Dissipation):
     Parameters
     ----------
     tensor : array, shape (n, n, n, n), or function from x, shape (n,), to one
-        ``R[i, j, k, l]``, antisymmetric in (i, j) and in (k, l), symmetric under exchange of the pairs.
+        ``R[i, j, k, l]``, antisymmetric in (i, j) and in (k, l), symmetric under exchange of the pairs (in units of
+        x**4 / (energy**2 * entropy * time)).
 
     Raises
     ------

@@ -28,9 +28,10 @@ class Friction(Dissipation):
     Parameters
     ----------
     D : array, shape (n, n), or (n,) for a diagonal matrix, or function from x, shape (n,), to a matrix (n, n); optional
-        Positive semidefinite. A function is taken to have the same rank everywhere. By default the identity, or on a
-        manifold the inverse of the metric of the space.
+        Positive semidefinite, in units such that ``rate * D`` has x**2 / (energy * time). A function must have the
+        same rank everywhere. By default the identity, or on a manifold the inverse of the metric of the space.
     rate : float, >= 0
+        Factor of D: see there for the unit.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
     """

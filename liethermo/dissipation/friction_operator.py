@@ -39,7 +39,9 @@ class FrictionOperator(Dissipation):
     Parameters
     ----------
     K : function from x, shape (n,), to a matrix (n, n), or a constant matrix
+        The friction matrix, symmetric and semidefinite, in units such that ``rate * K`` has x**2 / (entropy * time).
     rate : float, >= 0
+        Factor of K: see there for the unit.
     project : bool
         Take any symmetric semidefinite K, and let its projection off grad H act.
     projection : {"oblique", "orthogonal"}

@@ -40,8 +40,8 @@ class InnerProductDissipation(OfBracket):
     Parameters
     ----------
     K : array, shape (dim, dim)
-        The inner product 𝒦 on g, symmetric and positive semidefinite. On copies of an algebra it may be one of a
-        single site, shape (d, d), and acts site by site.
+        The inner product 𝒦 on g, symmetric and positive semidefinite (mu**2 * time / entropy). On copies of an algebra
+        it may be one of a single site, shape (d, d), and acts site by site.
 
     Raises
     ------
@@ -90,6 +90,9 @@ class KillingDissipation(OfBracket):
     Parameters
     ----------
     rate : float, >= 0
+        The factor of the form (mu**2 * time / entropy, with mu the unit of the momentum).
+    form : optional
+        𝒦 for rate 1 (dimensionless). A system fills it in from its algebra.
 
     Raises
     ------

@@ -31,7 +31,7 @@ class LandauLifshitz(Dissipation):
     Parameters
     ----------
     rate : float >= 0, or array of the shape of the sites
-        lambda_i.
+        lambda_i (1 / (energy * time)).
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that a site heats, from 0; by default all heat the first.
 

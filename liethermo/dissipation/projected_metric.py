@@ -39,16 +39,19 @@ class ProjectedMetric(Dissipation):
     Parameters
     ----------
     cometric : array, shape (n, n), or function from x, shape (n,), to one
-        Positive definite. By default the identity, or on a manifold the metric of the space.
+        G, positive definite, in any units: they go into that of the rate. By default the identity, or on a manifold
+        the metric of the space.
     preserve : sequence of functions or energies
-        Kept constant besides the energy.
+        Functions that the dissipation keeps constant besides the energy.
     normalized : bool
+        Leave out the factor det(C) [BFM Remark 2.1].
     rate : float, >= 0
-        Factor on the whole.
+        Factor of K. The unit of ``rate * G**2`` is x**4 / (energy**2 * entropy * time); that of ``rate * G`` with
+        ``normalized`` is x**2 / (entropy * time).
 
     Examples
     --------
-    >>> g = mf.se(3)
+
     >>> energy = lt.Quadratic([1.0, 2.0, 3.0, 1.0, 1.5, 2.0])
     >>> system = lt.LiePoissonSystem(g, energy, g.casimirs(2)[0], lt.ProjectedMetric(rate=0.1))
     >>> bool(system.check().passed)

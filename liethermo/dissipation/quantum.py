@@ -81,9 +81,9 @@ class ThermalJumps(Dissipation):
     Parameters
     ----------
     couplings : list of (V, rate)
-        V is a matrix, shape (N, N); a Hermitian one acts once, another together with its adjoint. The rate is a
-        number >= 0 (1 / time), or a function of omega and T, such as ``g / (2 sinh(omega / 2T))`` for a bath of bosons,
-        which has to be even in omega.
+        V is a dimensionless matrix, shape (N, N). A Hermitian V acts once, any other together with its adjoint. The
+        rate is a number >= 0 (1 / time), or a function of omega and T that is even in omega, such as
+        ``g / (2 sinh(omega / 2T))`` for a bath of bosons.
     bath : int
         The number of the bath, from 0.
 
@@ -223,7 +223,7 @@ class SteepestEntropyAscent(Dissipation):
     Parameters
     ----------
     rate : float, >= 0
-        1 / time.
+        The rate gamma of the ascent (1 / time).
     preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
         Observables ``tr(rho A)`` that are kept, or other functions.
     """

@@ -163,8 +163,11 @@ class Quadratic(Energy):
     Parameters
     ----------
     A : array, shape (n, n) symmetric, or (n,) for a diagonal matrix
+        The matrix of the quadratic form (unit of the function over that of ``x**2``): for a body the inverse inertia.
     b : array, shape (n,), optional
+        The coefficients of the linear part (unit of the function over that of x); zero by default.
     c : float, optional
+        The constant (unit of the function).
 
     Examples
     --------

@@ -33,6 +33,7 @@ class MetriplecticMidpoint(TransportingMethod):
     Parameters
     ----------
     gradient : {"gonzalez", "mean_value", "coordinate_increment", "symmetric_coordinate_increment"} or DiscreteGradient
+        The discrete gradient of the energy.
     retraction : str or manifolds.Retraction, optional
         On a manifold, in whose charts to run: ``"midpoint"`` is the paper's ``exp~_h`` (4.8), others as
         :func:`manifolds.retraction` names them. Where z is at the start of the step, the chart's own midpoint is taken,

@@ -21,7 +21,8 @@ class Reference:
     Parameters
     ----------
     rtol, atol : float
-        Tolerances; ``atol`` is ``rtol * 1e-2`` by default.
+        Relative tolerance (dimensionless) and absolute tolerance (in the units of the state). By default ``atol`` is
+        ``rtol * 1e-2``.
     scheme : {"DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}
         Order 8 by default; Radau for stiff systems.
 

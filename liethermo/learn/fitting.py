@@ -54,54 +54,55 @@ def fit(
 ) -> T:
     """A system like the given one, with what is learned of it fitted to trajectories.
 
-    First ``x'`` is matched to the rates of change of splines through the data. Then the states are matched at the ends
-    of short runs from the data (multiple shooting), whose steps obey both discrete laws. Each is a descent by Adam,
-    with a rate that falls along a cosine. The same arguments give the same result.
+    The first part matches the vector field to the derivatives of splines through the data. The second part matches the
+    states at the ends of short runs from the data (multiple shooting), whose steps obey both discrete laws. Each part
+    is a descent by Adam with a rate that falls along a cosine. The same arguments give the same result.
 
     Parameters
     ----------
     system : System
-        Any, such as :class:`Metriplectic`. Its parts are learned as far as they are marked: those of this module are.
-        No energy that depends on time, and no torque.
+        Any system, such as :class:`Metriplectic`, in the units of the data. The fit learns its marked parts: the
+        networks of this module are marked. The energy may not depend on time, and a torque is refused.
     data : pair (t, x), list of them, or solutions
-        Times of shape (m,), in any distances, and states of shape (m, n); or (trajectories, m, n) at the same times.
+        Times of shape (m,) at any spacing, and states of shape (m, n); or (trajectories, m, n) at the same times. They
+        are in the units of the system; the fit scales them by their spread.
     matching, shooting : int
-        Steps of both parts. Where not all components are observed nothing can be matched.
+        Numbers of iterations of the two parts. If not all components are observed, there is no matching.
     rate : float
-        Of Adam in the matching; 0.3 of it in the shooting.
+        Learning rate of Adam in the matching (dimensionless); the shooting uses 0.3 of it.
     batch : int, optional
-        Points, or short runs, of one step: 256 and 32 by default.
+        Points, or short runs, of one iteration: 256 and 32 by default.
     window : int
         Intervals of a short run.
     substeps : int
         Steps of a run between two times of the data.
     method : OneStepMethod
-        Of the runs: ``MetriplecticRungeKutta(4)`` by default, with one correction a step.
+        The method of the runs; by default ``MetriplecticRungeKutta(4)``, with one correction a step.
     noise : float, or array, shape (n,), optional
-        Standard deviation of the errors of the data. Splines then go past the points, losses are in units of it, and
-        the states in which runs begin are found too.
+        Standard deviation of the errors of the data (in the units of the states). Splines then smooth the data, losses
+        are relative to it, and the fit also finds the initial states of the short runs.
     observed : sequence of int, optional
-        Which components the data are of, shape (m, len(observed)). The others begin at zero and are found with the
-        states in which runs begin: they are known through the laws alone.
+        Indices of the components that were measured; the data then have shape (m, len(observed)). The other components
+        begin at zero, and the fit finds them with the initial states: only the laws determine them.
     validation : float, optional
-        What share of the trajectories, of one trajectory the share of its end, is held out. The weights that do best
-        there are taken. A fifth by default, and 0 where not all components are observed.
+        Fraction of the trajectories that is held out (of a single trajectory the end). The fit returns the weights that
+        do best there. By default a fifth, and 0 if not all components are observed.
     patience : int, optional
-        Looks, each after 50 steps, without anything better, after which a part of the fit ends.
+        A part of the fit ends after this number of evaluations without improvement; there is one every 50 iterations.
     seed : int
-        Of the choice of batches and of what is held out.
+        The seed of the batches and of the held-out data.
     also, positive : function from a system to its arrays, optional
-        Known parameters that are to be found too: ``also=lambda s: s.energy.A``. Those of ``positive``, such as
-        ``lambda s: s.dissipation.rate``, stay positive.
+        Further parameters to fit, such as ``also=lambda s: s.energy.A``. Those of ``positive``, such as
+        ``lambda s: s.dissipation.rate``, stay positive. They keep the units of the system.
     checkpoint : path, optional
-        A file that keeps the course after each look. Where it is there, the fit goes on from it, to the same result.
+        A file with the progress after each evaluation. If it exists, the fit continues from it, to the same result.
     progress : bool, optional
-        A progress bar; by default where someone is there to see it.
+        Show a progress bar; by default if the standard error is a terminal.
 
     Returns
     -------
     System
-        With the record in ``.training``: see :class:`Training`.
+        The fitted system, with the record in ``.training``: see :class:`Training`.
 
     Raises
     ------

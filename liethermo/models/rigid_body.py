@@ -44,8 +44,9 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
         of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
         so(3)* they are as good as any, but no rigid body has them.
     rate : float, >= 0
-        1 is the equation as printed in the paper, where 𝒦 is the dot product: ``KillingDissipation(rate / 2)``,
-        since the Killing form of so(3) is -2 times it.
+        lambda in ``mu' = mu x Omega + lambda Omega x (mu x Omega)`` (time). 1 is the equation as printed in the paper,
+        where 𝒦 is the dot product. It is ``KillingDissipation(rate / 2)``, since the Killing form of so(3) is -2 times
+        the dot product.
 
     Warns
     -----

@@ -13,6 +13,11 @@ from .solution import Solution
 def load(path: str | os.PathLike) -> Solution | Ensemble:
     """Read a file written by :meth:`Solution.save` or :meth:`Ensemble.save`.
 
+    Parameters
+    ----------
+    path : str or path
+        The NetCDF file.
+
     Raises
     ------
     FileError

@@ -101,13 +101,13 @@ class Solution(Recorded):
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held and the steps resolve the motion, as a table.
 
-        When this is first called the steps are looked at: all of them where that can be afforded, otherwise those where
-        the motion is fastest, and the verdict says how many. The worst are taken again.
+        The first call examines the steps: all of them in runs of ordinary length, otherwise those where the motion is
+        fastest, and the verdict then says how many. It computes the worst of them again.
 
         Parameters
         ----------
         energy, entropy, casimirs, residual, attitude, accuracy, consistency : float
-            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
+            The accepted deviation of each, relative (dimensionless): see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------

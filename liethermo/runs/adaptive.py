@@ -31,13 +31,13 @@ class Adaptive:
     Parameters
     ----------
     rtol, atol : float
-        Not both zero.
+        Relative tolerance (dimensionless) and absolute tolerance (in the units of the state), not both zero.
     first : float, optional
-        First step to try.
+        The first step to try (time).
     largest : float, optional
-        No step is longer.
+        The longest step allowed (time).
     most_steps : int
-        The run ends with the status "step_limit" after so many, tried ones among them.
+        The run ends with the status "step_limit" after this number of steps, rejected ones included.
 
     Examples
     --------

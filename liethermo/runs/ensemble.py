@@ -62,28 +62,30 @@ def ensemble(
     Parameters
     ----------
     system : System, or function from one set of parameters to a System
+        The system of all trajectories, or a function that builds the system of each. It fixes the units.
     x0s : array, shape (n,) or (B, n)
-        Initial states; one for all, or one each. For a system on sites, ``(*sites, d)`` may replace n; the
-        states of an ensemble are flat, and ``system.points`` shows them on the sites.
+        Initial states, in the units of the system; one for all, or one each. For a system on sites, ``(*sites, d)``
+        may replace n. The states of an ensemble are flat, and ``system.points`` shows them on the sites.
     t_span, step, method, save_every, save_at, until
-        As for :func:`integrate`: with ``lt.Adaptive(rtol, atol)`` every trajectory has steps of its own, the same as
-        alone, and with ``until`` an end of its own. ``e.end_time`` and ``e.event_time`` tell when.
+        As for :func:`integrate`, times in the unit of time of the system. With ``lt.Adaptive(rtol, atol)`` every
+        trajectory has its own steps, the same as in a single run, and with ``until`` its own end: ``e.end_time`` and
+        ``e.event_time``.
     parameters : optional
-        One set for each trajectory: arrays with the trajectories in front. For a function, whatever it takes (an
-        array, a dict of arrays, …). For a system, a dict from the names of its parameters, such as
-        ``{"dissipation.rate": rates}``, to their values.
+        One set for each trajectory, in the units of the system: arrays whose first axis is that of the trajectories.
+        For a function, its argument (an array, a dict of arrays, …). For a system, a dict from the names of its
+        parameters, such as ``{"dissipation.rate": rates}``, to their values.
     outputs : {"final", "trajectory", "summary"}
-        Final states; every ``save_every``-th state, or those at ``save_at``; or no states: 10^6 trajectories then need
-        some 100 MB. By default final states, or trajectories with ``save_at``.
+        Final states; every ``save_every``-th state, or those at ``save_at``; or no states, which saves memory. By
+        default final states, or trajectories with ``save_at``.
     engine : {"auto", "array", "compiled"}
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
     attitude : array, shape (m, m) or (B, m, m), optional
-        As for :func:`integrate`; one for all, or one each.
+        As for :func:`integrate` (dimensionless); one for all, or one each.
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
     noise : Fluctuations, optional
-        As for :func:`integrate`; every trajectory has its own, which depends on its number alone.
+        As for :func:`integrate`. Every trajectory has noise of its own, which depends on its number alone.
 
     Returns
     -------

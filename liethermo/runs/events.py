@@ -24,8 +24,12 @@ class Relaxed:
     Some systems produce no entropy, but their energy falls, as under a :class:`liethermo.DoubleBracket`. There the rate
     at which the dissipation lowers the energy takes the place of the production.
 
-    A state whose rate is below ``tol`` from the start, such as one near an unstable equilibrium, has to rise above it
-    first.
+    The rate may be below ``tol`` at the start, as near an unstable equilibrium. It then has to rise above it first.
+
+    Parameters
+    ----------
+    tol : float, > 0
+        The rate (entropy / time, or energy / time if the energy falls) below which the run stops.
 
     Examples
     --------

@@ -41,16 +41,20 @@ def flow(
     Parameters
     ----------
     system : System
+        The system. Its functions fix the units.
     x0 : array, shape (n,)
+        The initial state, in the units of the system.
     t_span : (float, float)
+        Start and end (in the unit of time of the system).
     step : float
-        Steps of one size; the last is shortened to arrive.
+        Size of all steps (time); the last one is shortened to end at the end of the span.
     method : OneStepMethod
-        ``MetriplecticGauss(1)`` by default, of order 2.
+        The integrator; by default ``MetriplecticGauss(1)``, of order 2.
     save_every : int, optional
-        Return the states on the way too: those of every ``save_every``-th step, the first and the last.
+        Return the first state, the states of every ``save_every``-th step, and the last.
     attitude : array, shape (m, m), optional
-        At the start, where a torque depends on it: the identity by default. What is returned are momenta all the same.
+        The initial attitude (dimensionless), if a torque depends on it; the identity by default. The function returns
+        momenta only.
 
     Returns
     -------

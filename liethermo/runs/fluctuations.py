@@ -43,11 +43,12 @@ class Fluctuations:
     boltzmann : float, >= 0
         k, in the units of the entropy: how large fluctuations are. Zero is the run without noise, to the bit.
     seed : int, >= 0; or one for every trajectory of an ensemble, no two alike
+        The seed of the random numbers.
     temperature : float, >= 0, optional
-        Of the bath, where there is one.
+        The temperature of the bath (energy / entropy), for dissipations that lower the energy.
     density : function from a state to a number, optional
-        The logarithm of the density of the measure that the motion keeps, where that is not volume; the states tend to
-        its product with the above.
+        The logarithm of the density of the measure that the motion keeps (dimensionless), if that is not volume. The
+        states tend to its product with the measure above.
     first : int, >= 0
         Number of the first trajectory: ``first=i`` of a single run is trajectory i of an ensemble.
     """

@@ -49,50 +49,50 @@ def integrate(
     Parameters
     ----------
     system : System
-        What moves: a :class:`LiePoissonSystem`, :class:`MetriplecticSystem` or any other, or a model of
+        The system, such as a :class:`LiePoissonSystem`, a :class:`MetriplecticSystem` or a model of
         :mod:`liethermo.models`. Its functions fix the units; the library has none of its own.
     x0 : array, shape (n,)
-        The state at the start, in the units of the system: for a body in SI units kg m**2 / s. ``system.state`` makes
-        it of other arrays, such as density matrices and spins; an entropy of baths that is left out is zero.
+        The initial state, in the units of the system: for a body in SI units kg m**2 / s. ``system.state`` converts
+        other arrays, such as density matrices and spins. If entropies of baths are left out, they are zero.
     t_span : (float, float)
-        Start and end (in the unit of time of the system; s in SI), the end later. The last step is shortened to arrive
-        there. An energy that depends on time, and a torque, are taken at these times.
+        Start and end (in the unit of time of the system; s in SI), the end later. The last step is shortened to end
+        there. Energies and torques that depend on time use these times.
     step : float or Adaptive
-        Step size (as time), > 0, or ``lt.Adaptive(rtol, atol)``; the spacing of the output for ``Reference``.
+        Step size (time), > 0, or ``lt.Adaptive(rtol, atol)``. For ``Reference`` it is the spacing of the output.
     method : OneStepMethod or Reference
-        ``MetriplecticGauss(1)`` by default, of order 2.
+        The integrator; by default ``MetriplecticGauss(1)``, of order 2.
     save_every : int
         Keep the states of every ``save_every``-th step, and the last. The laws are measured at every step.
     save_at : array of times, optional
-        Keep the states at these times, and the last: steps are made to end there, so that the laws hold there too.
+        Keep the states at these times (in the unit of ``t_span``), and the last. Steps end there, so the laws hold
+        there too.
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
-        Stop where the entropy production, or the fall of the energy, is below that of ``lt.Relaxed(tol)``, or where the
-        function is zero and changes its sign: located to rounding by a step that ends there. ``solution.event_time``
-        and the status tell whether it happened. A jump or a pole is no zero: a step ends there, the run goes on, and
-        the status says so. Where the function is not a number between two signs, the run ends with the status
-        "non_finite". Two crossings within a step of given size are not seen; adaptive steps are looked at between
-        their ends too.
+        Stop at an event. ``lt.Relaxed(tol)`` is the event that the rate of entropy production, or of the fall of the
+        energy, is below ``tol``. A function, in any unit, has its event where it is zero and changes its sign; a step
+        ends there, to rounding. ``solution.event_time`` and the status tell whether it happened. A jump or a pole is
+        not a zero: a step ends there, the run goes on, and the status says so. If the function is NaN between two
+        signs, the run ends with the status "non_finite". Steps of given size are examined at their ends, adaptive
+        steps also between them.
     dense : bool
-        Keep all states, so that ``solution(t)`` is known at any time: by a step from the last state before t.
+        Keep all states, so that ``solution(t)`` is known at any time, by a step from the last state before t.
     engine : {"auto", "array", "compiled", "sparse"}
-        JAX programs for systems of any size, or machine code of their own for small ones, which takes less time a
-        step; it is compiled the first time, and kept on disk. "auto" compiles for up to 16
-        components where a step has few operations, and for up to 40 in runs of 20,000 steps and more; it falls back,
-        with a warning, where the system uses what cannot be compiled. "sparse" solves stiff steps of large systems with
-        sparse matrices; "auto" takes it from 200 components on, where the system knows which of its components act on
-        which (networks do).
+        "array" runs JAX programs, for systems of any size. "compiled" runs machine code, which takes less time a step;
+        it is compiled the first time and kept on disk. "auto" compiles for up to 16 components if a step has few
+        operations, and for up to 40 in runs of 20,000 steps and more. It falls back to "array", with a warning, if a
+        part of the system cannot be compiled. "sparse" solves stiff steps of large systems with sparse matrices.
+        "auto" takes it from 200 components on, if the system knows which of its components act on which (networks do).
     on_failure : {"raise", "return"}
-        What to do where a step cannot be taken. The trajectory so far is kept either way: on the exception as
-        ``.solution``, or returned, with a ``status`` that says what happened.
+        What to do if a step fails. The trajectory so far is the ``.solution`` of the exception, or it is returned with
+        a ``status`` that says what happened.
     progress : bool, optional
-        Show a progress bar; by default where the standard error is a terminal.
+        Show a progress bar; by default if the standard error is a terminal.
     save_to : path, optional
-        Write the solution here, also on failure and at most once a minute on the way.
+        Write the solution to this file, at most once a minute during the run, at its end, and on failure.
     attitude : array, shape (m, m), optional
-        Where the system has a group: its element at the start, the identity by default.
+        If the system has a group, the initial element of it (dimensionless); the identity by default.
     noise : Fluctuations, optional
-        ``lt.Fluctuations(boltzmann, seed)``: the noise that belongs to the dissipation. Steps are then of one size, by
-        ``MetriplecticMidpoint``, which is the default.
+        ``lt.Fluctuations(boltzmann, seed)``, the noise that belongs to the dissipation. The method is then
+        ``MetriplecticMidpoint``, which is the default, with steps of one size.
 
     Returns
     -------

@@ -32,13 +32,16 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     Parameters
     ----------
     system : System
+        The system. Its functions fix the units.
     x0 : array, shape (n,)
+        The state near which the step is to be accurate, in the units of the system.
     rtol : float
+        The relative tolerance (dimensionless).
     method : OneStepMethod
-        ``MetriplecticGauss(1)`` by default, of order 2.
+        The integrator; by default ``MetriplecticGauss(1)``, of order 2.
     t0 : float
-        The time, for an energy or a torque that depends on it. A torque that depends on the attitude too is taken at
-        the identity.
+        The time (in the unit of the system), for an energy or a torque that depends on it. A torque that depends on
+        the attitude is evaluated at the identity.
 
     Raises
     ------
@@ -116,7 +119,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     Parameters
     ----------
     system, x0, rtol, t0
-        As for :func:`suggest_step`.
+        As for :func:`suggest_step`, with the same units.
 
     Raises
     ------

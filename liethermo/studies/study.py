@@ -65,24 +65,24 @@ class Study:
     Parameters
     ----------
     build : System, or function from a dict with one entry for each parameter to a System
-        Of a system the axes are its parameters, such as ``"dissipation.rate"``. One program builds the systems of all
-        points where the function accepts traced JAX arrays; otherwise each point is built by itself, which takes
-        longer.
+        For a system, the names of axes are those of its parameters, such as ``"dissipation.rate"``. If a function
+        accepts traced JAX arrays, one program builds the systems of all points. Otherwise each point is built by
+        itself, which takes longer.
     axes : dict from str to values
         Lists of numbers or texts, or :func:`zipped`, :func:`latin_hypercube`, :func:`sobol`, :func:`replicas`.
     x0 : array, shape (n,), or function from the dict of a point to one
-        Initial states; left out where replicas bring some.
+        Initial states, in the units of the system; left out if the axes have replicas with states.
     t_span, step, method, until, engine
-        As for :func:`integrate` and :func:`ensemble`.
+        As for :func:`integrate` and :func:`ensemble`, with the same units.
     measure : dict from str to measure
-        What is kept of each point: a name ("final", "relaxation_time", "end_time", …), ``lt.Relaxed(tol)`` for the time
-        of relaxation to a rate below it, where the run ends too, ``lt.At(times)``, or any function of a
+        The results to keep of each point: a name ("final", "relaxation_time", "end_time", …), ``lt.Relaxed(tol)`` for
+        the time at which the rate is below ``tol``, where the run ends too, ``lt.At(times)``, or any function from a
         :class:`Solution` to a number or an array.
     store : path, optional
         Folder of the results. Without one they are kept until this object and all that is taken from its results are
         gone.
     attitude : array, shape (m, m), or function from the dict of a point to one, optional
-        As for :func:`integrate`.
+        As for :func:`integrate` (dimensionless).
     noise : Fluctuations, optional
         As for :func:`integrate`. Every point has a seed of its own, made from that of the noise and from its place on
         the axes alone: chunks, workers and longer axes do not change it.

@@ -31,11 +31,13 @@ class HeatBaths(Module):
     Parameters
     ----------
     capacity, temperature : float > 0, or array, shape (number,)
-        C (energy / temperature) and T, in any consistent units. A bath of infinite capacity keeps its temperature,
-        ``U = T y``.
+        C (energy / temperature) and T (temperature, at y = 0), in any consistent units. A bath of infinite capacity
+        keeps its temperature, ``U = T y``.
     number : int
+        The number of baths.
     energy : function from y, a scalar, to a scalar, optional
-        The same for all baths, in place of the two numbers. It has to increase.
+        The energy of each bath as a function of its entropy y (energy / temperature), instead of the two numbers. It
+        has to increase.
 
     Attributes
     ----------

@@ -35,32 +35,36 @@ class LiePoissonSystem(System):
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
+        The Lie algebra g. Its structure constants are numbers without a unit.
     energy : function from mu, shape ``algebra.shape``, to a scalar, or an Energy
-        Or of mu and the time t: see :class:`liethermo.TimeDependent`.
+        H, or a function of mu and the time t: see :class:`liethermo.TimeDependent`. It fixes the units: that of H over
+        that of mu is 1 / time.
     entropy : likewise, optional
-        A Casimir function of the algebra (checked).
+        S, a Casimir function of the algebra (checked), in any unit of entropy, or dimensionless.
     dissipation : Dissipation, or a list of them that act together; optional
+        The part of the motion that produces entropy or lowers the energy.
     momentum_maps : dict of functions, or a sequence of them
         Conserved quantities of a symmetry: checked by :meth:`check`, recorded and audited along runs.
     validate : bool
         Test the axioms at a few random points and refuse a system that fails.
     group : manifolds.MatrixGroup, optional
-        A group of this algebra, or of the summand that it begins with where the other is abelian, as of a body with
-        wheels inside: :func:`liethermo.integrate` then returns attitudes g(t) beside mu(t), with
-        ``g' = g hat(xi)``. There xi is :meth:`transport`: the gradient of H, and what friction inside adds to it. It
-        is the body's, so that the momentum in space is ``Ad_star(inverse(g), mu)``, constant where no torque acts.
+        A group of this algebra. If the algebra is a sum with an abelian one, as for a body with internal wheels, the
+        group may be that of the first summand. :func:`liethermo.integrate` then returns attitudes g(t) too, with
+        ``g' = g hat(xi)``. Here xi is :meth:`transport`: the gradient of H, and the velocity that internal friction
+        adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
-        How; by default so that the spatial momentum of a free body is kept, where the group has such a way, else by
-        Cayley's map where that stays in the group. See :class:`liethermo.WithAttitude`.
+        The map of the attitude. The default keeps the spatial momentum of a free body, if the group has such a map;
+        else it is Cayley's map, if that stays in the group. See :class:`liethermo.WithAttitude`.
     baths : HeatBaths, optional
-        What takes the heat of a dissipation that lowers the energy. A state is then mu, in one row, followed by the
-        entropies of the baths; mu alone stands for one with all of these zero.
+        The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
+        temperature). A state is then mu, in one row, followed by the entropies of the baths. If these are left out of
+        a state, they are zero.
     torque : function of t, shape (), and mu, and of the attitude, shape (m, m), where it needs three; or a list of them
-        What acts from outside, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy). It does work,
-        ``W' = xi . torque``, which is the ledger of a run: the energy less the work is constant. With a group it has an
-        impulse besides, what it has given to the momentum in space. An ``equinox.Module`` has its arrays as
-        parameters, ``"torque.moment"``. Casimirs are no constants where a torque acts; momentum maps are those that the
-        torque keeps too. Ready ones are in ``lt.torques``.
+        An external torque, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy, if xi is 1 / time).
+        It does the work W, ``W' = xi . torque``, and the energy less the work is constant. With a group it also has an
+        impulse, the momentum in space that it has transferred. The arrays of an ``equinox.Module`` are parameters,
+        such as ``"torque.moment"``. With a torque, Casimirs are not constant, and momentum maps must be conserved by
+        the torque too. ``lt.torques`` has ready ones.
 
     Attributes
     ----------

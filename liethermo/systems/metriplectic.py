@@ -23,26 +23,29 @@ class MetriplecticSystem(System):
     Parameters
     ----------
     poisson : manifolds.PoissonStructure, or function from x, shape (n,), to a skew (n, n) matrix, or a constant matrix
-        None for a system that only relaxes.
+        Pi. The unit of ``Pi[i, j]`` is that of ``x[i] x[j]`` over energy * time. None means no conservative motion.
     energy, entropy : function from x, shape (n,), to a scalar, or an Energy
-        The energy may depend on time: a function of x and t, see :class:`liethermo.TimeDependent`.
+        H and S, in any consistent units; they fix the units of the system. The energy may be a function of x and the
+        time t: see :class:`liethermo.TimeDependent`.
     dissipation : Dissipation, or a list of them that act together; optional
+        The part of the motion that produces entropy or lowers the energy.
     dim : int
-        Number of state components; needed where ``poisson`` is a plain function or None, and no space is given.
+        Number of state components; needed if ``poisson`` is a plain function or None, and there is no space.
     momentum_maps : dict of functions, or a sequence of them
+        Conserved quantities of a symmetry: checked by :meth:`check`, recorded and audited along runs.
     validate : bool
-        Test the axioms at a few random points and refuse a system that fails. Turn off where the functions are not
+        Test the axioms at a few random points and refuse a system that fails. Turn this off if the functions are not
         defined at normally distributed points, and use ``system.check(points=...)``.
     space : manifolds.Space or manifolds.MatrixGroup, optional
-        The manifold that the states live on; native, a product, or from ``manifolds.from_geomstats``; a group stands
-        for ``manifolds.GroupSpace(group)``. Energy, entropy
-        and momentum maps are then functions of points, shape ``(*space.shape)``, and their gradients may be those of
-        the ambient array: only their action on tangent vectors matters. What is handed to a Poisson structure or to a
-        dissipation are flat real arrays, shape (space.size,), as ``space.to_vector`` makes them: a state x, and
-        covectors that Pi(x) and K(x) have to take to tangent vectors.
+        The manifold of the states: native, a product, or from ``manifolds.from_geomstats``. A group means
+        ``manifolds.GroupSpace(group)``. Energy, entropy and momentum maps are then functions of points, shape
+        ``(*space.shape)``. Their gradients may be those of the ambient array: only their action on tangent vectors
+        matters. Poisson structures and dissipations get flat real arrays, shape (space.size,), as ``space.to_vector``
+        makes them: a state x, and covectors that Pi(x) and K(x) map to tangent vectors.
     baths : HeatBaths, optional
-        What takes the heat of a dissipation that lowers the energy. A state is then x, in one row, followed by the
-        entropies of the baths, and ``dim`` counts x alone; x alone stands for one with all entropies zero.
+        The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
+        temperature). A state is then x, in one row, followed by the entropies of the baths; ``dim`` counts x alone. If
+        the entropies are left out of a state, they are zero.
 
     Raises
     ------

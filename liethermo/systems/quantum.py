@@ -38,15 +38,18 @@ class QuantumSystem(System):
     Parameters
     ----------
     hamiltonian : array, shape (N, N), or function from t to one
-        Hermitian (energy). A ``Qobj`` of QuTiP is taken too.
+        H, Hermitian (energy; hbar = 1, so the unit of time is 1 / energy). It may be a ``Qobj`` of QuTiP.
     dissipation : ThermalJumps, SteepestEntropyAscent, or a list of them; optional
+        The part of the motion that produces entropy.
     baths : HeatBaths, optional
-        What jumps exchange heat with. ``HeatBaths(capacity=np.inf, temperature=T)`` stays at its temperature.
+        The baths with which jumps exchange heat (k_B = 1, so temperatures are energies and entropies dimensionless).
+        ``HeatBaths(capacity=np.inf, temperature=T)`` keeps its temperature.
     entropy : VonNeumann, optional
+        The entropy of rho (dimensionless, k_B = 1), with a floor for eigenvalues near zero; by default without one.
     parts : sequence of int, optional
-        The sizes of the systems that this one is the product of.
+        The dimensions of the factors of which this system is the product.
     names : sequence of str, optional
-        Their names.
+        The names of these factors.
     validate : bool
         Test the axioms at a few random points. They hold by form, whatever matrices are given.
 

@@ -68,10 +68,16 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
     so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
     ``E_ij g - E_ji g`` for i < j in lexicographic order, g the form.
 
+    Parameters
+    ----------
+    p, q : int
+        The numbers of 1 and of -1 in the form.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
+
     Examples
     --------
-    >>> g = mf.so(3)
-    >>> g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]).tolist()
+
     [0.0, 0.0, 1.0]
     >>> print(*g.casimirs(degree=2))
     mu1**2 + mu2**2 + mu3**2

@@ -25,6 +25,11 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
     Up to dimension 40 it is given by its structure constants; a larger one acts block by block, without them, and
     copies of one algebra in a row as one batch. See :func:`manifolds.power`.
 
+    Parameters
+    ----------
+    algebras : LieAlgebra
+        The summands, at least one.
+
     Examples
     --------
     >>> g = mf.direct_sum(mf.so(3), mf.abelian(1))

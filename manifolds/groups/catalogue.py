@@ -18,6 +18,11 @@ from .rotations import rotation_log
 def SO(n: int) -> MatrixGroup:
     """Rotations of R^n: ``g^T g = I``, ``det g = 1``.
 
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+
     Examples
     --------
     >>> group = mf.SO(3)

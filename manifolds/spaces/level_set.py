@@ -42,9 +42,10 @@ class LevelSet(Space):
     shape : int, or tuple of int
         Of a point.
     metric : array, shape (n, n), or function from x to one; optional
-        Positive definite: inner products of arrays in one row, n their number of entries, restricted to the manifold.
-        By default the sum of products.
+        Positive definite (dimensionless, or in any units): inner products of arrays in one row, n their number of
+        entries, restricted to the manifold. By default the sum of products.
     name : str
+        The name in messages.
 
     Raises
     ------

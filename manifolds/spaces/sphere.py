@@ -24,6 +24,11 @@ class Sphere(Space):
     Distances are angles. Closed forms throughout, accurate to rounding up to the antipode; there the direction of the
     logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
 
+    Parameters
+    ----------
+    n : int
+        The dimension of the sphere; points have n + 1 dimensionless entries.
+
     Examples
     --------
     >>> sphere = mf.Sphere(2)
