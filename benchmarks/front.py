@@ -113,7 +113,7 @@ THEMES: dict[str, list[Pair]] = {
 COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body")
 """Measurements without another program: their targets that are no ratios are a table of their own."""
 
-NOTES = {"The same scheme in C": "That the energy drifts is in the nature of two of the variational schemes."}
+NOTES = {"The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."}
 """What a reader has to know before a table."""
 
 GROUPS = {
@@ -187,7 +187,7 @@ def sentences(found: list[Comparison]) -> Iterator[str]:
         if ours:
             best, worst, won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
             yield (
-                f"**{name}**: this library is faster in {won} of {len(ours)} works. It takes {best.ratio:.2g} times "
+                f"**{name}**: this library is faster in {won} of {len(ours)} tasks. It takes {best.ratio:.2g} times "
                 f"the other's time at best ({best.work}) and {worst.ratio:.2g} times at worst ({worst.work})."
             )
     judged = [c for c in found if c.our_laws is not None and not c.peer.startswith("C")]

@@ -14,7 +14,7 @@ TOLERANCE, TIMES = 1e-6, 401
 """What the others are asked for, and the number of times at which a run is looked at."""
 
 COLOURS = {"SciPy DOP853": "#d55e00", "diffrax Dopri8": "#009e73", "heyoka": "#cc79a7", "liethermo": "#0072b2"}
-TITLES = ("Drift of the energy", "Entropy short of its greatest", "Drift of the momentum in space")
+TITLES = ("Drift of the energy", "Entropy below its maximum", "Drift of the momentum in space")
 
 
 def draw(path: Path) -> None:

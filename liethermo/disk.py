@@ -25,7 +25,7 @@ WRITING = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | 
 
 
 def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
-    """Write a file whole: under a random name that is nobody else's, then renamed. The last of several writers wins.
+    """Write a file whole: under a random name of its own, then renamed. The last of several writers wins.
 
     Parts that dead processes have left of the same file are removed.
 
@@ -67,7 +67,7 @@ def sweep(folder: Path, name: str) -> None:
 
 
 def is_dead(part: Path) -> bool:
-    """Whether nobody writes this part any more."""
+    """Whether no process writes this part any more."""
     named = NAMED.fullmatch(part.name)
     if named is None:
         return False

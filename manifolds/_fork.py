@@ -1,4 +1,4 @@
-"""Processes that are forked after JAX has run: they cannot compile, and are told so instead of waiting for ever."""
+"""Processes that are forked after JAX has run: they cannot compile, and raise an error instead of waiting for ever."""
 
 from __future__ import annotations
 

@@ -88,6 +88,12 @@ MANNER = (
     "It is rounded once where the processor can; which ones are does not depend on the number of lanes.",
     "Keep every n-th state, n this number, and the last.",
     "Which entries of the ledger a solution has in its energy, and its laws are stated without.",
+    "How to write a space is told elsewhere.",
+    "A rod by and by lies down.",
+    "The attitude is left out, since nobody asks for it.",
+    "The status tells how it ended.",
+    "A matrix is skew, so is the next.",
+    "Then every Casimir stays what it is.",
 )
 """Sentences that readers stumbled over, each for a manner."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 
@@ -124,7 +125,12 @@ def test_10_saved_and_read(tmp_path):
     assert lt.load(tmp_path / "body.nc").audit().passed
 
 
-def test_the_page_lists_these_tasks():
-    listed = [int(number) for number in re.findall(r"^\| (\d+) \|", PAGE.read_text(), re.MULTILINE)]
-    written = [int(number) for name in globals() if (number := re.sub(r"^test_(\d+)_.*", r"\1", name)).isdigit()]
-    assert listed == sorted(written) == list(range(1, 11))
+def test_the_page_lists_these_tasks_and_their_lines():
+    rows = re.findall(r"^\| (\d+) \|.*\| (\d+) \|$", PAGE.read_text(), re.MULTILINE)
+    written = {}
+    for name, thing in globals().items():
+        if (number := re.sub(r"^test_(\d+)_.*", r"\1", name)).isdigit():
+            body = inspect.getsource(thing).partition("):\n")[2]
+            written[int(number)] = sum(1 for line in body.splitlines() if line.strip())
+    assert {int(number): int(lines) for number, lines in rows} == written
+    assert sorted(written) == list(range(1, 11))

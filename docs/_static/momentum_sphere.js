@@ -3,11 +3,10 @@
 
 pictures("momentum-sphere", (canvas, scene) => {
   const reach = Math.max(...scene.axes);
-  let clock = null;
+  let clock = scene.relaxing.length - 1; // a reader sees the finished curve first, and then how it came
 
   function draw(view) {
     const { context, project } = view, scale = 0.46 * Math.min(view.width, view.height) / reach;
-    if (clock === null) clock = scene.relaxing.length - 1; // a reader sees the finished curve first, and then how it came
 
     function faces(p) { // does the surface at p look towards the eye?
       return project(p.map((value, i) => value / scene.axes[i] ** 2))[2] < 0;
@@ -45,7 +44,7 @@ pictures("momentum-sphere", (canvas, scene) => {
 
   function advance(seconds) {
     clock += 30 * seconds;
-    if (clock > scene.relaxing.length + 60) clock = 0;
+    if (clock > scene.relaxing.length + 150) clock = 0; // five seconds of the finished curve
   }
 
   turning(canvas, { advance, draw });

@@ -139,7 +139,7 @@ class Chosen:
         return SinglePaces(self.system, self.method, pacing, step)
 
     def _choose(self, operations: Callable[[CompiledEngine], int]) -> None:
-        """Choose an engine when the run begins; ``operations`` tells how many the compiled one would need a step."""
+        """Choose an engine when the run begins; ``operations`` counts those of a step of the compiled one."""
         if not self._chosen:
             self._engine = self._choice(operations)
             self._chosen = True

@@ -1,7 +1,7 @@
 """Energies and entropies: functions of the state as sums of terms, quadratic or general.
 
 The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
-midpoint is one already; a general term gets a correction of its own, along its own coordinates where it is told them
+midpoint is one already; a general term gets a correction of its own, along its own coordinates where these are given
 (:meth:`Energy.on`) [:doc:`/explanation/exact_laws`].
 """
 

@@ -52,7 +52,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 
-    Momentum maps are held on request alone, or where the dissipation is told to preserve them. Nearer to a relative
+    Momentum maps are held on request alone, or where the dissipation has to preserve them. Nearer to a relative
     equilibrium than O(h^{2s}), such as a circular orbit, the levels of H and J may leave a step nowhere to go; it then
     ends with a status.
 
@@ -75,7 +75,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         On a manifold, in whose charts to run, such as ``"exp"``: :func:`manifolds.retraction` names them.
     held : tuple of str
         Names of the functions of the system to hold. A run fills it in with what the system conserves of its Casimirs
-        and of what its dissipation is told to preserve.
+        and of what its dissipation has to preserve.
     moving : tuple of int, optional
         Which of ``preserve`` are momentum maps, that move the state, and not Casimirs; a run finds out.
 
@@ -234,7 +234,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return self._holds(system, name) if known else super().keeps(system, name)
 
     def _holds(self, system: System, name: str) -> bool:
-        """Whether it holds a constant of the system unasked: Casimirs, and what the dissipation is told to preserve.
+        """Whether it holds a constant of the system unasked: Casimirs, and what the dissipation has to preserve.
 
         A skew friction is not projected, and keeps by itself what is quadratic alone.
         """

@@ -30,7 +30,7 @@ both."""
 VANISHED_LENGTH = math.sqrt(VANISHED)
 
 ALONG = Gonzalez(NOISY)
-"""The discrete gradient by which it is told what a function changes by in a step."""
+"""The discrete gradient that gives the change of a function in a step."""
 
 
 class Law(NamedTuple):

@@ -99,7 +99,7 @@ def solve_ivp(
         of zeros after which to stop) and ``direction`` mean what they mean in SciPy. A change of sign counts, as in
         SciPy, even where the function jumps; one across states where it is not a number does not.
     vectorized : bool
-        Of no account: a system takes states of any shape.
+        Without effect: a system takes states of any shape.
     args : tuple, optional
         Passed to the events. The system has its parameters in itself.
     rtol, atol : float

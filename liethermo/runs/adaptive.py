@@ -19,7 +19,7 @@ UNDERFLOW = 1e-14
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Steps chosen by an estimate of the local error, so that errors add up to what is asked for.
+    """Steps chosen by an estimate of the local error, so that errors add up to the tolerance.
 
     In the time in which the state changes by its own size, going as fast as it ever has, the errors of the steps add up
     to ``atol + rtol * max|x|`` at most: a step that takes a part of that time may have this part of the error, a longer

@@ -69,7 +69,7 @@ def integrate(
     until : Relaxed or function from a state, shape (n,), to a scalar, optional
         Stop at an event. ``lt.Relaxed(tol)`` is the event that the rate of entropy production, or of the fall of the
         energy, is below ``tol``. A function, in any unit, has its event where it is zero and changes its sign; a step
-        ends there, to rounding. ``solution.event_time`` and the status tell whether it happened. A jump or a pole is
+        ends there, to rounding. ``solution.event_time`` and the status show whether it happened. A jump or a pole is
         not a zero: a step ends there, the run goes on, and the status says so. If the function is NaN between two
         signs, the run ends with the status "non_finite". Steps of given size are examined at their ends, adaptive
         steps also between them.

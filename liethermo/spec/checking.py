@@ -19,7 +19,7 @@ ALTERNATIVES: dict[str, type] = {"table": AdaptiveStep, "points": Points, "sampl
 
 
 MOST_TOLD = 100
-"""Faults of a section that are told one by one."""
+"""Faults of a section, reported one by one."""
 
 
 def checked(key: str, schema: type, table, problems: list[str], taker: str) -> Any:

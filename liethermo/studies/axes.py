@@ -216,7 +216,7 @@ class Axis:
         return len(self.labels)
 
     def same(self, other: Axis) -> bool:
-        """Whether the places of another axis, of the same columns, are told apart by the same numbers in its order."""
+        """Whether the places of another axis, of the same columns, have the same distinct numbers in its order."""
         pairs = [(self.labels, other.labels), *((column, other.columns[n]) for n, column in self.columns.items())]
         if self.states is not None or other.states is not None:
             pairs.append((np.asarray(self.states), np.asarray(other.states)))

@@ -195,7 +195,7 @@ def read(path: Path) -> bytes:
 
 
 def _plainly(path: str, flags: int) -> int:
-    """Open no link, and wait for nobody at the other end of a pipe."""
+    """Open no link, and do not wait for the other end of a pipe."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
 
 
@@ -222,7 +222,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Remove what runs that were killed have left half written: nobody else works on the store."""
+    """Remove half-written files of killed runs: no other run works on the store."""
     for folder, _, files in os.walk(root):
         for name in files:
             if name.endswith(disk.PART) and name.startswith("."):
@@ -237,7 +237,7 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def locked(root: Path) -> Iterator[Callable[[int], None]]:
-    """Be the only run that works on a store; the system lets go of it however a run ends.
+    """Be the only run that works on a store; the operating system releases it however a run ends.
 
     Yields a function that tells others how many points were done when the work began.
 

@@ -60,7 +60,7 @@ class StudyStatus:
         elif self.interrupted:
             lines.append("interrupted; run the study again to go on")
         elif not self.complete:
-            lines.append("nobody works on it; run the study again to go on")
+            lines.append("no run works on it; run the study again to continue")
         lines += [f"done again: {name}" for name in self.damaged]
         return "\n".join(lines)
 

@@ -395,7 +395,7 @@ class Study:
         return np.asarray(solver.members.example.state(x0), dtype=np.float64)
 
     def _check_axes(self, point: dict[str, Any]) -> None:
-        """Refuse axes that nobody reads."""
+        """Refuse axes that are not used."""
         watched = Watched(plain(point))
         for function in filter(callable, (self._task.build, self._task.x0, self._task.attitude)):
             try:

@@ -320,11 +320,11 @@ class System(Kind):
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
-        """The functions that the dissipation, or one of its summands, is told to preserve besides the energy."""
+        """The functions that the dissipation, or one of its summands, has to preserve besides the energy."""
         return () if self.dissipation is None else self.dissipation.preserve
 
     def functions(self) -> dict[str, Energy]:
-        """Momentum maps, what the dissipation is told to preserve, and Casimirs, by name; one name for one quantity."""
+        """Momentum maps, what the dissipation has to preserve, and Casimirs, by name; one name for one quantity."""
         casimirs, own = self.casimirs(), dict[str, Energy]()
         for name, L in zip(self.preserved_names, self.preserved, strict=True):
             if name not in self.momentum_maps and name not in own:
@@ -358,10 +358,10 @@ class System(Kind):
     def first_integrals(self) -> frozenset[str]:
         """The names of those of :meth:`functions` that the system conserves.
 
-        Momentum maps are claimed to be. A Casimir is conserved if the dissipation keeps it, and what the dissipation is
-        told to preserve if the motion and the other summands keep it: where no construction says so, it is found out at
-        random points, or left out while the system is being traced. What the dissipation is told to preserve counts as
-        conserved where that cannot be found out.
+        Momentum maps are claimed to be conserved. A Casimir is conserved if the dissipation keeps it. A function that
+        one dissipation has to preserve is conserved if the motion and the other summands keep it. If no construction
+        says so, random points decide; while the system is being traced the function is left out. If random points
+        cannot decide, a function that the dissipation has to preserve counts as conserved.
         """
         return self._found().constant
 
@@ -388,7 +388,7 @@ class System(Kind):
         return found
 
     def _found(self, near=None, declared: bool = True) -> Decided:
-        """What it conserves; with ``declared``, what its dissipation is told to preserve unless it is seen not to."""
+        """What it conserves; with ``declared``, what its dissipation has to preserve unless it is seen not to."""
         if self.decided is not None:
             return self.decided
         claimed, casimirs = set(self.momentum_maps), self.casimirs()

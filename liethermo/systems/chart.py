@@ -1,8 +1,8 @@
 """A system on a manifold in the coordinates of a chart: a system on R^dim, for the methods of vector spaces.
 
 Functions pull back by ``c -> point(c)``, the Poisson tensor and the dissipation by the inverse of its derivative
-[:doc:`/explanation/exact_laws`]: Pi stays a Poisson tensor, K symmetric and semidefinite, and each stays what it was to
-the gradients of the functions. So every law that a method keeps in R^dim it keeps on the manifold.
+[:doc:`/explanation/exact_laws`]: Pi is still a Poisson tensor, K symmetric and semidefinite, with the same relations to
+the gradients of the functions. So a method keeps on the manifold every law that it keeps in R^dim.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ _AXIOMS = {
     "symmetric": ("K symmetric", "the friction matrix must be symmetric"),
     "kernel": ("K grad H = 0", "the dissipation would change the energy"),
     "semidefinite": ("K >= 0", "the friction matrix has a negative eigenvalue, so entropy could fall"),
-    "preserved": ("K grad L = 0", "the dissipation does not keep the functions it is told to preserve"),
+    "preserved": ("K grad L = 0", "the dissipation does not keep the functions it has to preserve"),
     "first law": ("energy law", "dH/dt along the vector field has the wrong size or sign"),
     "second law": ("entropy law", "dS/dt along the vector field has the wrong sign"),
     "production": ("min", "smallest entropy production found (no guarantee asked)"),

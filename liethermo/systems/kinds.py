@@ -34,7 +34,7 @@ class Kind(Geometry):
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
     preserved_as: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
-    """What the functions are called that the dissipation is told to preserve, one after another."""
+    """What the functions are called that the dissipation has to preserve, one after another."""
     decided: Decided | None = eqx.field(static=True, kw_only=True, default=None)
     """What it conserves, where that has been found out near the states of a run."""
     baths: HeatBaths | None = eqx.field(kw_only=True, default=None)

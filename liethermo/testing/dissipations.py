@@ -28,7 +28,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     Raises
     ------
     PropertyError
-        If it does not keep what it states: its laws, the functions that it is told to preserve.
+        If it does not keep what it states: its laws, the functions that it has to preserve.
     """
     system = dissipation if isinstance(dissipation, System) else _system(dissipation, algebra or mf.so(3))
     if system.dissipation is None:

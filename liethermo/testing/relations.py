@@ -363,7 +363,7 @@ def study(case: Case) -> Outcome:
 
 
 def file(case: Case) -> Outcome:
-    """What is saved is what is loaded."""
+    """A loaded run equals the saved one."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.nc"
         case.base.save(path)

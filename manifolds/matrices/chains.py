@@ -7,7 +7,7 @@ The derivative of order k of f at A, in the directions E1 … Ek, is a sum over 
 with the eigenvalues p and eigenvectors U of A and the divided differences f[…] [Daleckii & Krein 1965; Higham 2008,
 Theorem 3.11]. A chain is linear in each direction. Its derivative by A in the direction D is the sum of the
 longer chains that have D at each place in between. Its adjoint in one direction is the chain of the others in cyclic
-order. So derivatives of every order are chains again, and nobody differentiates an eigenvector: they are finite where
+order. So derivatives of every order are chains again, and no eigenvector is differentiated: they are finite where
 eigenvalues meet. For matrices that are not Hermitian the exponential has the same chains, as blocks of the
 exponential of a larger matrix [Najfeld & Havel 1995].
 """

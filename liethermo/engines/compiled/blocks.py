@@ -74,7 +74,7 @@ def _reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
 def _while(writer: Any, loop: While, args: Sequence[ir.Value]) -> Results:
     """Until the test fails in every lane that is :attr:`.Writer.active`.
 
-    A pass need not wait for the test that tells which lanes the one before has left: those go on too, and what they
+    A pass need not wait for the test of which lanes the one before has left: those go on too, and what they
     come to is not kept. They wait where a loop inside might not end for them.
     """
     build, fixed = writer.builder, len(loop.test.inputs[0])

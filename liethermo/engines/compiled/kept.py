@@ -25,7 +25,7 @@ LARGEST = 2**28
 """Bytes of a file."""
 
 PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
-"""Flags that open no link, and wait for nobody at the other end of a pipe."""
+"""Flags that open no link, and do not wait for the other end of a pipe."""
 
 
 def cache_folder() -> Path | None:

@@ -188,7 +188,7 @@ class Stepper:
     """The fields of a trajectory."""
 
     begins: tuple[str, ...] = ()
-    """What a run that begins is told besides its x."""
+    """The input of a run besides its x."""
 
     given: tuple[str, ...] = ("p", "dW", "h")
     """What a step is given besides them."""
