@@ -3,8 +3,8 @@ What takes the place of the momentum sphere on other algebras?
 ==============================================================
 
 A free body moves on a sphere :math:`|\mu| = \mathrm{const}`, a level surface of the Casimir of so(3). On every Lie
-algebra the motion stays on the common level surfaces of its Casimirs. Here are those of four algebras of dimension
-three, with motions of one and the same energy function.
+algebra the motion stays on the common level surfaces of its Casimirs. The figure has these surfaces for four algebras
+of dimension three, with motions of the same energy function.
 """
 
 import jax
@@ -31,8 +31,8 @@ surfaces = [
 ]
 
 # %%
-# The Casimirs are found, not looked up, and every motion keeps its own to rounding. The motions are the lines of
-# constant energy on the surface, the darkest those of least energy; on the far side they are pale.
+# The library computes the Casimirs, and every motion keeps its Casimir to rounding. The motions are the lines of
+# constant energy on the surface. Dark lines have little energy, and lines on the far side are pale.
 
 
 def draw(ax, g, casimir, surface):

@@ -3,9 +3,9 @@ Where does a covariance of given energy have most entropy?
 ==========================================================
 
 A Gaussian cloud with the covariance P, a positive definite matrix, has the entropy log det P / 2, and in a harmonic
-trap with the stiffness A the energy tr(A P) / 2. At a given energy the entropy is largest where P is a multiple of the
-inverse of A: equipartition. The gradient flow of the entropy at constant energy, in the affine-invariant metric of the
-positive definite matrices, leads there. It is a metriplectic system with no motion of its own.
+trap with the stiffness A the energy tr(A P) / 2. At a given energy the entropy is largest if P is a multiple of the
+inverse of A. This is equipartition. The gradient flow of the entropy at constant energy, in the affine-invariant metric
+of the positive definite matrices, leads there. It is a metriplectic system without conservative motion.
 """
 
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ solution = lt.integrate(system, start, (0.0, 16.0), 0.1)
 print(solution.audit())
 
 # %%
-# The limit is known, and it is reached:
+# The run reaches the known limit:
 
 P = np.asarray(system.points(solution.x))
 limit = np.linalg.inv(stiffness) * 2 * solution.energy[0] / 3

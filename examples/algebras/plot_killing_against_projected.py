@@ -2,8 +2,8 @@ r"""
 Is Killing dissipation the same as the projected metric?
 ========================================================
 
-Both keep the energy and raise a Casimir. On so(3) they are one and the same, up to a factor. On larger algebras they
-differ, and need not even come to rest in the same place.
+Both keep the energy and raise a Casimir. On so(3) they are the same up to a factor. On larger algebras they differ, and
+may even have different states of rest.
 """
 
 import matplotlib.pyplot as plt
@@ -37,8 +37,8 @@ for g in mf.so(3), mf.su(3):
 # %%
 # Killing dissipation produces the entropy :math:`|[\Omega, \mu]|^2`, with :math:`\Omega = \nabla H`. It stops wherever
 # :math:`\Omega` and :math:`\mu` commute, and there the free motion stops too: at a relative equilibrium. On so(3)
-# commuting vectors are parallel, and the one that attracts has the largest entropy. On su(3) they need not be parallel.
-# The projected metric does not rest before :math:`\Omega` is parallel to :math:`\mu`.
+# commuting vectors are parallel, and the attracting state has the largest entropy. On su(3) commuting elements need not
+# be parallel. The projected metric rests only where :math:`\Omega` is parallel to :math:`\mu`.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.6), layout="constrained")
 styles = {"Killing": {"color": "#0072B2"}, "projected": {"color": "#E69F00", "linestyle": "--"}}

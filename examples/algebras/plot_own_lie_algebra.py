@@ -2,8 +2,8 @@
 How do I run a system on a Lie algebra of my own?
 =================================================
 
-The oscillator algebra is not in the catalogue. It has a rotation J, the Heisenberg pair Q and P that J turns into each
-other, and a centre Z: [J, Q] = P, [J, P] = -Q, [Q, P] = Z. Three lines define it.
+The oscillator algebra is not in the catalogue. It has a rotation J, a Heisenberg pair Q and P that J rotates, and a
+central element Z: [J, Q] = P, [J, P] = -Q, [Q, P] = Z. Three lines define it.
 """
 
 import matplotlib.pyplot as plt
@@ -20,7 +20,7 @@ g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="oscillato
 print(f"{g}: solvable {g.is_solvable()}, nilpotent {g.is_nilpotent()}, unimodular {g.is_unimodular()}")
 
 # %%
-# The axioms are checked, exactly where the constants are rational. Here Z is no longer central:
+# The library checks the axioms, and exactly for rational constants. In this wrong version Z is not central:
 
 C[J, Z, Z] = 1
 try:
@@ -29,15 +29,15 @@ except mf.JacobiError as error:
     print(error)
 
 # %%
-# Two Casimirs are expected. The linear one is the centre; the quadratic one will be the entropy.
+# There are two independent Casimirs. The linear one is Z, and the quadratic one will be the entropy.
 
 (centre,), (casimir,) = g.casimirs(1), g.casimirs(2)
 print(f"{g.casimir_count()} Casimirs: {centre} and {casimir}")
 
 # %%
 # Killing dissipation would do nothing here: by Cartan's criterion the Killing form of a solvable algebra vanishes on
-# all brackets. The projected metric works on every algebra. Told to preserve the centre as well, it lets Q and P die
-# out and J take up their energy.
+# all brackets. The projected metric works on every algebra. If it preserves Z as well, Q and P decay and J takes up
+# their energy.
 
 energy = lt.Quadratic([1.0, 2.0, 2.0, 0.0])
 dissipation = lt.ProjectedMetric(preserve=[centre], rate=0.05)

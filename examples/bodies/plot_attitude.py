@@ -2,10 +2,10 @@
 What does a relaxing body look like from outside?
 =================================================
 
-The momentum of a body lives in its own frame. Given the group, the integrator returns the attitude too: the rotation
-g(t) from the body to space. A box that spins about its middle axis tumbles. Nothing acts on it from outside, so its
-angular momentum in space, ``g mu``, is constant. Friction inside makes heat of its kinetic energy, until it turns about
-its axis of greatest inertia.
+The momentum of a body is given in body axes. If the system has a group, the integrator returns the attitude too: the
+rotation g(t) from the body to space. A box that spins about its middle axis tumbles. Nothing acts on it from outside,
+so its angular momentum in space, ``g mu``, is constant. Internal friction turns its kinetic energy into heat, until the
+box spins about its axis of greatest inertia.
 """
 
 import matplotlib.pyplot as plt
@@ -23,7 +23,7 @@ print(solution.audit())
 print(f"off the rotations by at most {float(mf.SO(3).defect(solution.attitude).max()):.0e}")
 
 # %%
-# The momentum seen from space does not move, and what the kinetic energy loses, the heat gains.
+# The momentum in space is constant, and the heat grows by the loss of kinetic energy.
 
 momentum = solution.x[:, :3]
 in_space = np.einsum("tij,tj->ti", solution.attitude, momentum)
@@ -33,8 +33,9 @@ print(f"kinetic energy from {kinetic[0]:.4f} to {kinetic[-1]:.4f}; the least tha
 print(f"angle from the shortest edge: {np.degrees(lt.bodies.nutation(solution)[[0, -1]]).round(1)} degrees")
 
 # %%
-# The box seen from outside, and its angular momentum. That stands still, and the box turns about it: at first with its
-# middle edge along it, in the end with its shortest. Which end of that edge is ahead depends on the start.
+# The box seen from outside, and its angular momentum. The momentum is fixed, and the box turns about it. At first the
+# middle edge is along the momentum, in the end the shortest edge. The initial state decides which end of that edge is
+# ahead.
 
 corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2
 faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]

@@ -2,9 +2,9 @@ r"""
 How does a body in space come to spin about one axis?
 =====================================================
 
-A rigid body with three wheels that rub in their bearings loses none of its angular momentum and none of its energy:
-what the motion loses heats the body. Its equations are Euler-Poincaré equations with entropy on :math:`so(3) + R^3`,
-and their variational principle, discretised through the Cayley map, keeps the spatial momentum exactly.
+A rigid body has three wheels that rub in their bearings. Its angular momentum and its total energy are constant: the
+lost kinetic energy heats the body. Its equations are Euler-Poincaré equations with entropy on :math:`so(3) + R^3`, and
+their variational principle, discretised through the Cayley map, keeps the spatial momentum exactly.
 """
 
 import matplotlib.pyplot as plt
@@ -19,8 +19,8 @@ solution = lt.integrate(body, x0, (0.0, 150.0), h, method, engine="array")
 print(solution.audit(energy=1e-3))  # of a variational scheme, which does not keep it to rounding
 
 # %%
-# The momentum as seen from the body moves to the axis of greatest inertia. Turned by the attitudes of the body it is
-# seen from space, and does not move at all.
+# The momentum as seen from the body moves to the axis of greatest inertia. The attitudes of the body transform it to
+# space, where it is constant.
 
 attitudes = method.attitudes(body, solution.x, h)[:, :3, :3]
 momenta = np.asarray(body.momenta(solution.x))[:, :3]
@@ -28,7 +28,7 @@ spatial = np.einsum("kij,kj->ki", attitudes, momenta)
 print(f"the spatial momentum moves by {np.abs(spatial - spatial[0]).max():.1e}")
 
 # %%
-# Where it ends is known in closed form.
+# The final state is known in closed form.
 
 temperature = np.asarray(body.temperature(solution.x))
 expected = body_with_wheels_rest(np.linalg.norm(momenta[0]), solution.energy[0])

@@ -3,9 +3,9 @@ How does a body fluctuate about its axis?
 =========================================
 
 The dissipation of Morrison's rigid body (1986) turns it to the axis of its largest moment of inertia, where the entropy
-``S = 2 |mu|^2`` is largest at the energy that it has. With the noise that belongs to the dissipation it does not stay
-there: it wanders over its energy surface, and comes to the measure ``exp(S / k)`` on it. On every path the energy is
-that of the start, to rounding.
+``S = 2 |mu|^2`` is largest for its energy. With the noise that belongs to the dissipation the momentum wanders over its
+energy surface. Its distribution tends to the measure ``exp(S / k)`` on this surface. On every path the energy is
+constant to rounding.
 """
 
 import matplotlib.pyplot as plt
@@ -24,8 +24,8 @@ bodies = lt.ensemble(body, start, (0.0, 8.0), 0.05, noise=noise, outputs="trajec
 print(bodies.audit())
 
 # %%
-# What the histogram is to be: uniform directions u give points of the ellipsoid of the energy with the measure that a
-# thin shell of it has; each is weighed by ``exp(S / k)``.
+# The exact distribution: uniform directions u give points on the energy ellipsoid, distributed as in a thin shell. Each
+# point has the weight ``exp(S / k)``.
 
 u = np.random.default_rng(1).standard_normal((400_000, 3))
 points = np.sqrt(moments) * u / np.linalg.norm(u, axis=1, keepdims=True)

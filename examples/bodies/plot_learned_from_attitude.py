@@ -5,10 +5,10 @@ A body from its attitude alone
 A satellite tumbles with friction inside. A camera sees its attitude, and nothing else. What are its moments of inertia,
 and how strong is the friction?
 
-Left to itself, it keeps its momentum in space. In body axes the momentum is then :math:`\mu(t) = R(t)^T \pi`, with one
-vector :math:`\pi` that is not known. The body turns with the velocity :math:`\xi + \sigma`, its ``transport``, and a
-spline through the attitudes tells that. So three moments of inertia, a rate and the direction of :math:`\pi` are found
-by least squares. Attitudes tell no mass: inertias are known relative to :math:`|\pi|`.
+No torque acts, so the momentum in space is constant. In body axes the momentum is then :math:`\mu(t) = R(t)^T \pi`,
+with one unknown vector :math:`\pi`. The body turns with the velocity :math:`\xi + \sigma`, its ``transport``, which a
+spline through the attitudes gives. Least squares then finds three moments of inertia, a rate and the direction of
+:math:`\pi`. Attitudes do not determine the mass, so inertias are relative to :math:`|\pi|`.
 """
 
 import jax
@@ -36,7 +36,8 @@ h = 1e-4  # the velocity in body axes, by a difference of the spline
 velocity = (spline(run.t[2:-2] - h).inv() * spline(run.t[2:-2] + h)).as_rotvec() / (2 * h)
 
 # %%
-# What a body with other numbers would do. Unknown are the logarithms of four numbers, and :math:`\pi`, of length 1.
+# The motion of a body with other numbers. The unknowns are the logarithms of four numbers, and :math:`\pi`, of length
+# 1.
 
 
 def with_numbers(logs):
@@ -64,7 +65,7 @@ print("inertias", inertia.round(4), "true", INERTIA)
 print("rate    ", rate.round(4), "true", RATE)
 
 # %%
-# The body that was found tumbles on. Its laws hold whatever the errors of its numbers are.
+# The fitted body continues to tumble. Its laws hold for all errors of the fit.
 
 found = lt.models.tumbling_body(inertia, rate=rate)
 start = run.attitude[0].T @ best.x[4:] / np.linalg.norm(best.x[4:]) * scale

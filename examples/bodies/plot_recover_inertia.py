@@ -2,11 +2,11 @@
 Inertias and a rate from a noisy record
 =======================================
 
-Derivatives of a trajectory by its parameters turn measurements into parameters. Morrison's rigid body relaxes; its
-momentum is recorded with noise of two per cent. Least squares finds the moments of inertia and the rate of dissipation
-again, with the Jacobian from ``lt.flow``: it differentiates the discrete flow itself, by the implicit function theorem.
+Derivatives of a trajectory by its parameters make fits possible. Morrison's rigid body relaxes, and its momentum is
+recorded with noise of two per cent. Least squares finds the moments of inertia and the rate of dissipation again, with
+the Jacobian from ``lt.flow``: it differentiates the discrete flow itself, by the implicit function theorem.
 
-The equations know the inertias only through their inverses and the momentum, so all three are found.
+The equations contain the inverses of the inertias and the momentum, so the record determines all three inertias.
 """
 
 import jax

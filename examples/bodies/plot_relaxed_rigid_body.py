@@ -3,7 +3,7 @@ Where does Morrison's rigid body settle?
 ========================================
 
 A torque that does no work acts on a rigid body (Morrison 1986). Its energy is constant, its entropy
-:math:`S = |\\mu|^2/2` grows, and it ends by spinning about its axis of greatest inertia. This is the run of Figure 1 of
+:math:`S = |\\mu|^2/2` grows, and it ends in a spin about its axis of greatest inertia. This is the run of Figure 1 of
 Bloch, Farré Puiggalí and Martín de Diego (2024).
 """
 
@@ -24,7 +24,7 @@ print(solution.audit())
 print(f"entropy reached: {solution.entropy[-1]:.6f}, largest possible: {max(inertia) * solution.energy[0]:.6f}")
 
 # %%
-# The body starts next to its middle axis, where the curves of constant entropy cross. It leaves along one of them, and
-# from then on cuts them all in the direction of greater spheres, without ever leaving the energy surface.
+# The body starts next to its middle axis, where the curves of constant entropy cross. It leaves along one of them. From
+# then on it crosses them towards larger spheres and stays on the energy surface.
 
 lt.plot.momentum_sphere(solution, body)

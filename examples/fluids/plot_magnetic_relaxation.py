@@ -3,10 +3,10 @@ Where does a magnetic field on a sphere come to rest?
 =====================================================
 
 A conducting fluid carries its magnetic field along, and the field pulls at the fluid. On the sphere both are functions:
-the vorticity, and the potential theta, whose level lines are the lines of the field. Where nothing is lost, energy,
-cross helicity and every integral of a function of theta are constant. With friction the energy falls, yet the
-lines of the field can be moved and not cut: the integrals of theta stay what they are. The motion tends to a magnetic
-equilibrium, in which the current is a function of theta.
+the vorticity, and the potential theta, whose level lines are the lines of the field. Without friction, energy, cross
+helicity and every integral of a function of theta are constant. With friction the energy falls. The field lines move
+but do not reconnect, so the integrals of theta are still constant. The motion tends to a magnetic equilibrium, in which
+the current is a function of theta.
 """
 
 import matplotlib.pyplot as plt
@@ -34,7 +34,7 @@ for name, series in damped.casimirs.items():
     print(f"{name}: changed by {np.ptp(series) / np.abs(series).max():.0e}")
 
 # %%
-# The potential at the start, on the way and at the end.
+# The potential at the start, during the run and at the end.
 
 figure = plt.figure(figsize=(10, 3), layout="constrained")
 for place, i in enumerate((0, 4, len(damped.t) - 1), start=1):
@@ -42,7 +42,7 @@ for place, i in enumerate((0, 4, len(damped.t) - 1), start=1):
     lt.plot.sphere_field(sphere.on_grid(sphere.magnetic_fields(damped.x[i])[1]), ax=ax, title=f"t = {damped.t[i]:g}")
 
 # %%
-# Current against potential at points of the sphere. In an equilibrium they are on a curve; the run is on its way there.
+# Current against potential at points of the sphere. In an equilibrium they lie on a curve. The run approaches it.
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 for ax, i in zip(axes, (0, -1), strict=False):

@@ -2,12 +2,12 @@
 Where does a decaying flow on a sphere end?
 ===========================================
 
-An ideal fluid on the sphere conserves its energy and the integral of every function of its vorticity. What a real one
-loses first is enstrophy, in filaments that are too fine to be seen, while the energy stays: *selective decay*. Here it
-is a metriplectic system on the dual of su(N), Zeitlin's model of the fluid: the vorticity is an N by N matrix W, the
-energy is constant to rounding, and the enstrophy falls at every step, by ``K`` made of commutators with the stream
-function P. It can fall until ``[P, W] = 0``: then the flow is steady, and its vorticity is a function of its stream
-function.
+An ideal fluid on the sphere conserves its energy and the integral of every function of its vorticity. A real fluid
+first loses enstrophy, in filaments that are too fine to be seen, while its energy is nearly constant. This is
+*selective decay*. Here it is a metriplectic system on the dual of su(N), Zeitlin's model of the fluid. The vorticity is
+an N by N matrix W. The energy is constant to rounding, and the enstrophy falls in every step, by a ``K`` of commutators
+with the stream function P. It falls until ``[P, W] = 0``. Then the flow is steady, and its vorticity is a function of
+its stream function.
 """
 
 import matplotlib.pyplot as plt
@@ -23,8 +23,8 @@ solution = lt.integrate(system, start, (0.0, 60.0), 0.04, lt.MetriplecticRungeKu
 print(solution.audit())
 
 # %%
-# The vorticity at the start, on the way and at the end, all of the sphere in a projection that keeps areas. Small
-# vortices are gone, and what is left is as large as the sphere.
+# The vorticity at the start, during the run and at the end, on the whole sphere in an equal-area projection. Small
+# vortices disappear, and the remaining ones are as large as the sphere.
 
 figure = plt.figure(figsize=(10, 3), layout="constrained")
 shown = (0, 2, len(solution.t) - 1)
@@ -34,7 +34,7 @@ for place, i in enumerate(shown, start=1):
 
 # %%
 # Every point of the sphere has a vorticity and a stream function. At the start they make a cloud, at the end a curve.
-# It is no straight line: the flow is steady before its enstrophy is the least that there is for its energy.
+# The curve is not a straight line: the flow becomes steady before its enstrophy is the least possible for its energy.
 
 
 def scatter_of_levels(mu):

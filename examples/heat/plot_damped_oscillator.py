@@ -2,9 +2,9 @@ r"""
 How well does a step keep up with friction?
 ===========================================
 
-An oscillator whose friction heats a bath of temperature :math:`\gamma` is an isolated system: nothing is lost of the
-energy :math:`H = p^2/2 + q^2/2 + \gamma S`. Its motion is the evolution field of H on a contact manifold. These are the
-runs of Figures 1 and 2 of Anahory Simoes, Martín de Diego, Lainz Valcázar and de León (2020).
+An oscillator and the bath of temperature :math:`\gamma` that its friction heats are an isolated system. Its energy
+:math:`H = p^2/2 + q^2/2 + \gamma S` is constant. Its motion is the evolution field of H on a contact manifold. These
+are the runs of Figures 1 and 2 of Anahory Simoes, Martín de Diego, Lainz Valcázar and de León (2020).
 """
 
 import matplotlib.pyplot as plt
@@ -22,7 +22,7 @@ print(solution.audit())
 
 # %%
 # For this H the midpoint scheme is the closed formula (39) of the paper. The positions follow the exact ones with a
-# small delay, as those of the midpoint rule do; no step is without its heat.
+# small delay, as in the midpoint rule. Every step produces heat.
 
 exact = damped_oscillator_solution(solution.t, x0)
 error = solution.x - exact

@@ -4,7 +4,7 @@ Where do work and heat from outside go?
 
 A gas under a piston that rubs on its cylinder is pushed by the air outside and heated for two seconds. The system is
 not isolated: a ledger in its state records the work and the heat that it receives, and its energy less the ledger is
-constant. How far a discretisation is from closing that balance is what the audit shows.
+constant. The audit shows how well a discretisation closes this balance.
 """
 
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ for step in (0.02, 0.01, 0.005):
     print(f"step {step:5}: balance closed to {run.audit().energy_drift:.1e} of the energy")
 
 # %%
-# From rest to rest at one pressure all heat goes into the enthalpy, whatever the friction:
+# From rest to rest at constant pressure all heat goes into the enthalpy, for every friction:
 
 work, heat = (solution.casimirs[name] for name in ("work received", "heat received"))
 temperature = np.asarray(gas.temperature(solution.x))

@@ -2,8 +2,8 @@
 Where does a piston between two gases stop?
 ===========================================
 
-A piston that conducts heat and rubs on its cylinder separates two gases of different temperature and amount. First it
-finds equal pressures, and then, as the heat spreads, drifts on until the temperatures are equal too.
+A piston that conducts heat and rubs on its cylinder separates two gases of different temperature and amount. First the
+pressures become equal. Then heat spreads, and the piston drifts until the temperatures are equal too.
 """
 
 import matplotlib.pyplot as plt

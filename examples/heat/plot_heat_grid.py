@@ -2,9 +2,9 @@
 How long may a step be when heat spreads?
 =========================================
 
-Neighbouring bodies of a grid exchange their heat in a time c/k; all of the grid becomes one temperature only after a
-time that grows with the square of its width. An implicit step may be a hundred times as long as the first of these, and
-both laws hold in it as in a short one. The Jacobian matrix of such a step is sparse, and is solved as one.
+Neighbouring bodies of a grid exchange their heat in a time c/k. The whole grid reaches one temperature only after a
+time that grows with the square of its width. An implicit step may be a hundred times longer than c/k, and both laws
+still hold. The Jacobian matrix of such a step is sparse, and the engine solves it as a sparse matrix.
 """
 
 import matplotlib.pyplot as plt
@@ -21,8 +21,8 @@ solution = lt.integrate(grid, np.log(start).ravel(), t_span=(0.0, 800.0), step=1
 print(solution.audit())
 
 # %%
-# The exact temperatures are sums of cosines. The midpoint scheme damps nothing by itself, so it wants a start that is
-# smooth on the scale to which heat spreads in a step.
+# The exact temperatures are sums of cosines. The midpoint scheme has no numerical damping. So the initial temperatures
+# must be smooth on the scale to which heat spreads in a step.
 
 late = np.exp(solution.x[-1]).reshape(shape)
 exact = heat_grid_solution(800.0, start)

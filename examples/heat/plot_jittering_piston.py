@@ -2,10 +2,11 @@
 How much does a piston between two gases jitter?
 ================================================
 
-Two gases push a piston from both sides. It rests where the pressures agree; but it is hit by molecules, and so it never
-rests. The size of it follows from the entropy alone: displaced by d, the gases have ``-d^2 / 2 (n_l R / q^2 + n_r R /
-(L - q)^2)`` less of it, so that the variance of the place is k over that bracket. With the k of nature it is below the
-size of an atom; here k is larger, as for gases of few molecules. The energy of the whole is exact on every path.
+Two gases push a piston from both sides. Its mean position is where the pressures agree, but molecules hit it, and so it
+never rests. The size of its motion follows from the entropy: a displacement d changes the entropy of the gases by
+``-d^2 / 2 (n_l R / q^2 + n_r R / (L - q)^2)``, so the variance of the position is k over that bracket. With the real k
+the motion is smaller than an atom. Here k is larger, as for gases of few molecules. The total energy is exact on every
+path.
 """
 
 import matplotlib.pyplot as plt

@@ -2,9 +2,10 @@ r"""
 What becomes of the energy in a variational scheme?
 ===================================================
 
-A mass on a spring rubs in a room full of gas, and all that it loses the gas gains. The three variational schemes of
-Gay-Balmaz and Yoshimura discretise the variational principle of this system. None of them keeps the energy to rounding;
-these are the figures 5.2 to 5.25 of their paper: two cases, four frictions, :math:`10^5` steps of a millisecond.
+A mass on a spring rubs in a room full of gas, and the gas gains the energy that the mass loses. The three variational
+schemes of Gay-Balmaz and Yoshimura discretise the variational principle of this system. None of them keeps the energy
+to rounding; these are the figures 5.2 to 5.25 of their paper: two cases, four frictions, :math:`10^5` steps of a
+millisecond.
 """
 
 import matplotlib.pyplot as plt
@@ -71,20 +72,20 @@ def draw(case, runs):
 
 
 # %%
-# Case 1. The entropy grows at every step at which the mass moves; with no friction it stays what it was, and so does
-# the temperature. With a friction of 10 the case is critically damped, a branch that the exact solution in the paper
-# leaves out.
+# Case 1. With friction the entropy grows in every step in which the mass moves. Without friction entropy and
+# temperature are constant. With a friction of 10 the case is critically damped, a branch that the exact solution in the
+# paper leaves out.
 #
-# The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. As found:
-# that of scheme 1 decreases until the mass rests; that of scheme 2 is rounding where nothing rubs, and *grows* with
-# the heat to 1.5e-11, where it stays; that of scheme 3 swings up to 3.01e-11 and settles there too. Where the mass has
-# come to rest all three have lost the same.
+# The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. Here the
+# error of scheme 1 decreases until the mass rests. That of scheme 2 is rounding without friction, and otherwise *grows*
+# with the heat to 1.5e-11 and stays there. That of scheme 3 oscillates up to 3.01e-11 and settles at the same value.
+# When the mass has come to rest, all three have the same error.
 
 runs = study(1)
 draw(1, runs)
 
 # %%
 # Case 2, a heavier mass on a stiffer spring in twice the gas. The bounds in the paper, 1e-6 for scheme 1 and 1e-9 for
-# the others, are a hundred times wider than what it takes.
+# the others, are a hundred times wider than needed.
 
 draw(2, study(2))

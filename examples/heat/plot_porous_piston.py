@@ -3,8 +3,8 @@ Where does a piston stop that lets the gas through?
 ===================================================
 
 Two gases push a piston to the place where their pressures agree. If the piston has pores, particles pass from the
-higher to the lower chemical potential too, and in the end both densities are equal. Wherever the piston is then,
-nothing pushes it any more. So the place where it stops depends on how fast the gas leaks while the piston moves.
+higher to the lower chemical potential too, and in the end both densities are equal. Then no force acts on the piston,
+at any position. So its final position depends on how fast the gas leaks while the piston moves.
 """
 
 import matplotlib.pyplot as plt
@@ -40,4 +40,4 @@ axes[0].legend(frameon=False)
 # %%
 # Without pores the piston rests where the pressures agree, two thirds along the cylinder, as the gases have two and one
 # particle. With pores the densities agree as well. The laws and the number of particles hold to rounding in all runs:
-# the membrane is friction between chemical potentials, built like the friction of the piston.
+# the membrane acts as a friction between chemical potentials, in the same form as the friction of the piston.

@@ -2,14 +2,14 @@ r"""
 How far does a reaction go in a vessel that it heats?
 =====================================================
 
-In a vessel A and B combine to C and fall apart again. The reaction sets energy free and warms the mixture, and the
-mixture warms the jacket of the vessel. The warmer it is, the less of C there is in the end: the law of mass action,
+In a vessel A and B combine to C, and C decays again. The reaction releases energy and warms the mixture, and the
+mixture warms the jacket of the vessel. The warmer it is, the less C there is in the end. The law of mass action,
 
 .. math::
    \frac{n_C}{n_A n_B} = K(T),
 
-has a constant that falls with the temperature. The system knows nothing of this law: it has an energy, an entropy, and
-a reaction that is friction between chemical potentials.
+has a constant that falls with the temperature. The system does not contain this law. It has an energy, an entropy, and
+a reaction that acts as a friction between chemical potentials.
 """
 
 import matplotlib.pyplot as plt

@@ -2,14 +2,14 @@ r"""
 How does a pendulum that swings in all directions come to rest in a gas?
 ========================================================================
 
-A bob on a rod can be anywhere on a sphere. It swings in a gas, the gas rubs on it, and all that the bob loses warms the
-gas. The positions are points of the sphere, in the three components of a unit vector: no angles, and no pole at which
-angles fail. The Lagrangian, the friction and the entropy are written as on :math:`\mathbb R^3`,
+A bob on a rod moves on a sphere. It swings in a gas, and its friction warms the gas. The positions are points of the
+sphere, given as unit vectors. There are no angles, and so no pole at which angles fail. The Lagrangian, the friction
+and the entropy are written as on :math:`\mathbb R^3`,
 
 .. math::
    L = \tfrac12 m |v|^2 - m g q_3 - U(S), \qquad F = -r v, \qquad U(S) = C T_0 e^{S/C},
 
-with the rod of length 1. What these functions do across the sphere counts for nothing.
+with the rod of length 1. Only the derivatives of these functions along the sphere matter.
 """
 
 import jax.numpy as jnp
@@ -55,8 +55,8 @@ x0 = on_sphere(y0)
 reference = on_sphere(solve_ivp(in_angles, (0.0, end), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1])
 
 # %%
-# The variational schemes keep the sphere, to rounding, and the second law; the energy they do not. The metriplectic
-# methods keep all three. Each falls with the step as its order says.
+# The variational schemes keep the sphere to rounding, and the second law, but not the energy. The metriplectic methods
+# keep all three. The errors fall with the step according to the order of each method.
 
 methods = {
     "scheme 1": lt.VariationalIntegrator.verlet(),
@@ -79,7 +79,7 @@ for name, method in methods.items():
     )
 
 # %%
-# The path from above, what warms the gas, and the errors.
+# The path from above, the energies, and the errors.
 
 run = lt.integrate(pendulum, x0, (0.0, 40.0), 0.02, lt.MetriplecticGauss(2))
 T = T0 * np.exp(run.x[:, 6] / C)

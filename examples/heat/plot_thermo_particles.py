@@ -27,7 +27,7 @@ print(f"at the end {temperatures[-1]}, in equilibrium {(273.15 + 300.0) / 2}")
 print(f"largest error on the way: {np.abs(temperatures - exact).max():.3f}")
 
 # %%
-# All has happened after a tenth of the run; the rest shows that nothing drifts.
+# The temperatures are equal after a tenth of the run. The rest shows that nothing drifts.
 
 early = solution.t <= 5.0
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained")

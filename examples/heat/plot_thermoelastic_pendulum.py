@@ -3,8 +3,8 @@ Where does the swing of a warm pendulum go?
 ===========================================
 
 Two bodies hang on thermoelastic springs, one below the other, without gravity: the double pendulum of Romero (2009). A
-spring cools when it is stretched; heat flows from the warmer spring to the colder one and does not come back. So the
-springs stop swinging, though nothing rubs: what is left is a rotation, since the angular momentum is kept.
+spring cools when it is stretched. Heat flows from the warmer spring to the colder one and does not come back. So the
+springs stop oscillating without any friction. A rotation remains, since the angular momentum is constant.
 """
 
 import matplotlib.pyplot as plt

@@ -3,7 +3,7 @@ What does a variational integrator lose?
 ========================================
 
 The discrete Herglotz integrator comes from a discrete Lagrangian, not from a discrete gradient. On the damped
-oscillator it is cheap and explicit, and its path is good; but it keeps neither law exactly. These are the runs of
+oscillator it is cheap and explicit, and its path is accurate. But it keeps neither law exactly. These are the runs of
 Figures 5 and 6 of Anahory Simoes, Martín de Diego, Lainz Valcázar and de León (2020).
 """
 
@@ -33,7 +33,7 @@ metriplectic = lt.integrate(oscillator, x1, (h, 80.0 + h), h)
 exact = damped_oscillator_solution(variational.t - h, x1)
 
 # %%
-# The audit finds what the picture hides: the energy oscillates and settles a sixtieth below where it began, and in some
+# The audit shows more than the picture. The energy oscillates and settles a sixtieth below its initial value. In some
 # steps, where the motion turns, the entropy falls.
 
 print(variational.audit())

@@ -3,8 +3,8 @@ Two routes to a piston between two gases
 ========================================
 
 A piston between two gases has three entropies: one for itself and one for each gas. A variational scheme discretises
-the principle that such a system obeys; a metriplectic method discretises the bracket. Both make entropy at every step.
-What else they keep, and at which order, is seen here.
+the variational principle of such a system. A metriplectic method discretises the bracket. Both produce entropy in every
+step. The example compares the other laws and the orders.
 """
 
 import matplotlib.pyplot as plt

@@ -2,10 +2,10 @@
 Does it agree with QuTiP?
 =========================
 
-Operators may be those of QuTiP: a Hamiltonian or a coupling that has a method ``full()`` is read by it, so nothing has
-to be converted by hand. Where a bath keeps its temperature the motion is Lindblad's equation, which ``qutip.mesolve``
-integrates. The two are compared for a qubit, for two qubits that are coupled, and for a chain of five levels. Without
-QuTiP, which the extra ``quantum`` installs, the comparison is with the exponential of the generator.
+Operators of QuTiP need no conversion: the library reads a Hamiltonian or a coupling by its method ``full()``. If a bath
+keeps its temperature, the motion is Lindblad's equation, which ``qutip.mesolve`` integrates. The example compares the
+two for a qubit, for two coupled qubits, and for a chain of five levels. Without QuTiP, which the extra ``quantum``
+installs, the comparison is with the exponential of the generator.
 """
 
 import matplotlib.pyplot as plt

@@ -3,8 +3,8 @@ What does heat do on its way through two qubits?
 ================================================
 
 Two qubits are coupled, and each has a bath. Heat flows from the hot bath into the first qubit, to the second, and into
-the cold bath. The baths are of finite size, so the flow ends. The ledger of entropies adds up at every time: the hot
-bath loses entropy, the cold one gains more than that, and the qubits keep what they have.
+the cold bath. The baths are of finite size, so the flow ends. At every time the hot bath has lost entropy, the cold
+bath has gained more, and the entropy of the qubits is almost constant.
 """
 
 import matplotlib.pyplot as plt
@@ -27,7 +27,7 @@ solution = lt.integrate(pair, pair.state(start), (0.0, 150.0), 0.25)
 print(solution.audit())
 
 # %%
-# Each entropy is measured from its start.
+# Each entropy is relative to its initial value.
 
 baths = solution.x[:, -2:] - solution.x[0, -2:]
 whole = solution.entropy - solution.entropy[0]

@@ -3,9 +3,9 @@ How much work does a qubit make of heat?
 ========================================
 
 An Otto engine with one qubit has four strokes: it takes heat from a hot bath at a high frequency, the frequency is
-lowered and work comes out, it gives heat to a cold bath, the frequency is raised again. In theory its efficiency is
-one minus the quotient of the frequencies, below that of Carnot. Each stroke here is a run of its own, and the work is
-what the Hamiltonian that depends on time does.
+lowered and work comes out, it gives heat to a cold bath, the frequency is raised again. In theory its efficiency is one
+minus the quotient of the frequencies, which is below Carnot's. Each stroke is a run of its own. The work is that of the
+time-dependent Hamiltonian.
 """
 
 import matplotlib.pyplot as plt

@@ -2,9 +2,9 @@
 How far do spins turn to a field?
 =================================
 
-Spins in a field B and in a bath of temperature T: the double bracket turns each to the field, and its noise turns it
-away. The magnetisation of their equilibrium is Langevin's function ``L(x) = coth x - 1/x`` at ``x = B / (k T)``. The
-length of a spin is exact on every path.
+Spins are in a field B and in a bath of temperature T. The double bracket turns each spin to the field, and its noise
+turns it away. The magnetisation of their equilibrium is Langevin's function ``L(x) = coth x - 1/x`` at
+``x = B / (k T)``. The length of a spin is exact on every path.
 """
 
 import matplotlib.pyplot as plt

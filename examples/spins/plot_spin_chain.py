@@ -2,9 +2,9 @@
 How does a chain of spins order itself?
 =======================================
 
-Neighbours on a ring of spins want to be parallel: ``H = -sum s_i . s_(i+1)`` and a weak easy axis. Damped, the ring
-gives its disorder away as heat, to a bath with the entropy S. The state space is a power of the sphere times a line,
-and nothing else changes: the copies of the sphere run as one batch.
+The energy of a ring of spins favours parallel neighbours: ``H = -sum s_i . s_(i+1)`` and a weak easy axis. Damping
+turns the energy of the disordered spins into heat of a bath with the entropy S. The state space is a power of the
+sphere times a line, and nothing else changes: the copies of the sphere run as one batch.
 """
 
 import jax.numpy as jnp

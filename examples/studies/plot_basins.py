@@ -2,9 +2,9 @@
 To which of three equilibria does a body go?
 ============================================
 
-A body whose energy is least in three directions of its momentum loses energy by a double bracket, which keeps the
-size of the momentum. From most directions it first goes round before it decides: the basins of the three equilibria
-are wound around each other.
+The energy of a body has three minima on the sphere of its momentum. A double bracket lowers the energy and keeps the
+size of the momentum. Most motions first go round the sphere, so the basins of the three equilibria are wound around
+each other.
 """
 
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ study = lt.Study(
 print(study.run())
 
 # %%
-# The equilibrium that a momentum ends nearest to has a number, and a colour.
+# The colour is the number of the nearest equilibrium at the end of a run.
 
 results = study.results
 nearest = np.argmax(results.final.values @ AXES.T, axis=-1)

@@ -2,16 +2,16 @@ r"""
 Which systems show the good long-time behaviour?
 ================================================
 
-A variational scheme of a mechanical system without friction keeps an energy near the true one for a very long time.
-Its error swings, and does not grow. Gay-Balmaz and Yoshimura see the same in two systems that rub, and ask for which
-systems it holds. This study looks at schemes 2 and 3 over friction, stiffness and step, in these systems:
+A variational scheme of a mechanical system without friction keeps an energy near the true one for a very long time. Its
+error oscillates and does not grow. Gay-Balmaz and Yoshimura observe the same in two systems with friction, and ask for
+which systems it holds. This study looks at schemes 2 and 3 over friction, stiffness and step, in these systems:
 
 - a spring *beside* a gas: friction warms the gas, and the gas does nothing to the motion;
 - a spring *against* a gas: the pressure of the gas moves the mass, and the heat changes the pressure;
 - either *driven* by a periodic force, so that it never comes to rest.
 
 The measure is the error of the energy of system and surroundings, the mean of the last 200 steps less the first value,
-so that what merely swings counts for nothing, in parts of the mechanical energy :math:`\tfrac12 k x_0^2` at the start.
+so that oscillations cancel, relative to the mechanical energy :math:`\tfrac12 k x_0^2` at the start.
 """
 
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ for kind, build in KINDS.items():
         found[kind, name] = study.results
 
 # %%
-# For each kind and scheme: the error that is left, over the friction, for the three steps and the stiffest spring.
+# The remaining error over the friction, for each kind and scheme, for the three steps and the stiffest spring.
 
 stiffness = np.array(AXES["stiffness"])
 
@@ -107,7 +107,7 @@ axes[0].set(ylabel="error of the energy that is left")
 axes[0].legend(frameon=False, fontsize="x-small")
 
 # %%
-# What was found, in parts of the first mechanical energy and for the stiffest spring:
+# The results, relative to the initial mechanical energy and for the stiffest spring:
 #
 # - *Without a drive nothing grows.* Once the mass has come to rest, the error is the same after a quarter of the time
 #   and after all of it, to a percent, for both schemes. Beside a gas it is at most 4.5e-6 for scheme 2 and 9.1e-6 for
@@ -121,5 +121,5 @@ axes[0].legend(frameon=False, fontsize="x-small")
 #   step. It is of the same size beside a gas and against one. Scheme 2 does so to a far smaller degree: beside a gas
 #   nothing grows, against a gas by 45 % from a quarter of the time to all of it, at an error of 6e-6.
 #
-# So the good behaviour is that of systems that come to rest. Scheme 2, which takes forces and heat at one point, has
-# nearly all of it in systems that do not. The entropy falls in no step of any run.
+# So systems that come to rest show the good behaviour. Scheme 2, which evaluates forces and heat at one point, shows
+# nearly all of it in driven systems too. The entropy falls in no step of any run.

@@ -3,9 +3,9 @@ Where does a body with a flywheel settle?
 =========================================
 
 A wheel inside a body turns about its third axis at a constant momentum. A torque that does no work, as in Morrison's
-rigid body (1986), brings the whole to the state of greatest entropy, ``|mu|^2 / 2``, at its energy. For a strong wheel
-that is the spin about the axis of the wheel; for a weak one the momentum tilts towards the axis of greatest inertia.
-How far it tilts is an order parameter, and 100,000 runs are its phase diagram.
+rigid body (1986), brings the body with its wheel to the state of greatest entropy, ``|mu|^2 / 2``, at its energy. For a
+strong wheel that is the spin about the axis of the wheel; for a weak one the momentum tilts towards the axis of
+greatest inertia. How far it tilts is an order parameter, and 100,000 runs are its phase diagram.
 """
 
 import jax.numpy as jnp

@@ -2,9 +2,9 @@
 How long does a body take to relax?
 ===================================
 
-A body with friction inside, left to itself, ends by spinning about its axis of greatest inertia: its angular momentum
-stays, and its kinetic energy becomes heat. How long that takes depends on its inertias and on the rate of the friction:
-a grid of 50 by 20 runs.
+A body with internal friction and without torque ends in a spin about its axis of greatest inertia. Its angular momentum
+is constant, and kinetic energy becomes heat. The duration depends on its inertias and on the rate of friction. The
+study is a grid of 50 by 20 runs.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ import numpy as np
 import liethermo as lt
 
 # %%
-# A study takes a function from a point of the grid to a system, the axes, and what is to be kept of each run. The heat
-# capacity is large, so that the body hardly gets warmer; nobody asks for its attitude here.
+# A study takes a function from a point of the grid to a system, the axes, and the measures of each run. The heat
+# capacity is large, so the body hardly gets warmer. The attitude is left out.
 
 
 def body(point):
@@ -37,10 +37,9 @@ print(study.run())
 lt.plot.study(study.results)
 
 # %%
-# The larger the rate the shorter the time, nearly in inverse proportion: weak friction moves the energy as a function
-# of the rate times the time alone. The body begins near its axis of least inertia, and stays there the longer the less
-# the middle moment differs from the least. The spots in the picture are bodies that come near their middle axis, where
-# the motion is slow, and linger.
+# The time is nearly inversely proportional to the rate: with weak friction the energy is a function of rate times time
+# alone. The body begins near its axis of least inertia. It stays there longer if the middle moment is close to the
+# least. The spots in the picture are bodies that come near their middle axis, where the motion is slow.
 
 tau = study.results.tau
 print(f"tau * rate, for the least and the largest rate: {(tau * tau.rate)[25, [0, -1]].values.round(2)}")

@@ -72,10 +72,10 @@ class ThermalJumps(Dissipation):
     ``K = sum (rate / 2) B* L B`` over the parts and their adjoints. ``K dE = 0`` and ``K >= 0`` by form, for discrete
     gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is constant the motion
     is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and V^H at
-    ``rate * exp(-omega / 2T)``. The Hamiltonian may change in time where its eigenvectors stay.
+    ``rate * exp(-omega / 2T)``. The Hamiltonian may change in time if its eigenvectors do not change.
 
-    In a system without baths the jumps exchange no heat, which is the limit of infinite temperature: the identity is at
-    rest (the noise is unital), and the entropy cannot fall. The energy is kept where every V commutes with H, as in
+    In a system without baths the jumps exchange no heat. This is the limit of infinite temperature: the identity is at
+    rest (the noise is unital), and the entropy cannot fall. The energy is constant if every V commutes with H, as in
     dephasing.
 
     Parameters

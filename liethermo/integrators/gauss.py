@@ -32,36 +32,39 @@ from .tableaus import finer, gauss
 
 
 class MetriplecticGauss(GaussMethod, TransportingMethod):
-    """``k_i = Pi(u_i) gH_i + K_d gS_i`` at Gauss nodes ``u_i = x + h sum_j A_ij k_j``; ``x' = x + h sum_i b_i k_i``.
+    """Implicit Gauss steps with both laws exact, of order 2 s with s stages.
 
-    The gradients carry one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
-    ``h sum_i b_i gH_i . k_i = H(x') - H(x)``. Likewise gS, and gC of every first integral C that is held: the Casimirs
-    that the system is known to conserve, and the functions of ``preserve``. K_d is the dissipation rebuilt with gH_i
-    and the gC_i in its kernel. Hence
+    ``k_i = Pi(u_i) gH_i + K_d gS_i`` at Gauss nodes ``u_i = x + h sum_j A_ij k_j``; ``x' = x + h sum_i b_i k_i``.
+
+    The gradients have one correction for all stages, ``gH_i = grad H(u_i) + alpha d_i``, such that
+    ``h sum_i b_i gH_i . k_i = H(x') - H(x)``. The same holds for gS, and for gC of every first integral C that the
+    method keeps: the known Casimirs of the system, and the functions of ``preserve``. K_d is the dissipation rebuilt
+    with gH_i and the gC_i in its kernel. Hence
 
         H(x') = H(x),    S(x') - S(x) = h sum b_i gS_i . K_d gS_i >= 0,    C(x') = C(x),
 
-    for every smooth H, S and C and every step. Order 2s: alpha is O(h^{2s}) [Hairer, Lubich & Wanner, II.1].
+    for all smooth H, S and C and every step whose equations are solved. The order is 2s, since alpha is O(h^{2s})
+    [Hairer, Lubich & Wanner, II.1].
 
-    The motion ``Pi gH`` has to keep S and C too. How it does depends on what they are:
+    The motion ``Pi gH`` has to keep S and C too. There are four cases:
 
-    - A quadratic Casimir: collocation keeps it. So the motion keeps an entropy that is a function of such; see
-      :func:`composed_gradients`.
+    - A quadratic Casimir: collocation keeps it, and so it keeps an entropy that is a function of quadratic Casimirs;
+      see :func:`composed_gradients`.
     - A quadratic momentum map J: d_i is k_i less its component along the symmetry ``Pi grad J``, so that gH_i is
       invariant as grad H is [Gonzalez 1996].
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 
-    Momentum maps are held on request alone, or where the dissipation has to preserve them. Nearer to a relative
-    equilibrium than O(h^{2s}), such as a circular orbit, the levels of H and J may leave a step nowhere to go; it then
-    ends with a status.
+    The method keeps momentum maps only on request, or if the dissipation has to preserve them. Within O(h^{2s}) of a
+    relative equilibrium, such as a circular orbit, no step may be able to stay on the levels of both H and J. The run
+    then ends with a status.
 
-    One implicit equation of s times the size of the state. An iteration costs s gradients of H and S; for each that is
-    not quadratic two values and a gradient at the end of the step besides, and s + 1 gradients between the nodes where
-    s is 1 or 2.
+    The step solves one implicit equation of s times the size of the state. An iteration costs s gradients of H and S.
+    For each function that is not quadratic it also costs two values and a gradient at the end of the step, and s + 1
+    gradients between the nodes if s is 1 or 2.
 
-    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the
-    state, a new one at each step: same order, same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the arrays around it. With ``retraction`` it runs in the chart ``v -> R(x, v)``
+    around the state, a new chart in each step, with the same order and laws. See :class:`InCharts`.
 
     Parameters
     ----------
@@ -72,12 +75,13 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         Further first integrals to hold exactly, such as momentum maps. The system has to conserve them (checked when a
         run starts).
     retraction : str or manifolds.Retraction, optional
-        On a manifold, in whose charts to run, such as ``"exp"``: :func:`manifolds.retraction` names them.
+        On a manifold, the retraction whose charts are used, such as ``"exp"``: :func:`manifolds.retraction` has the
+        names.
     held : tuple of str
-        Names of the functions of the system to hold. A run fills it in with what the system conserves of its Casimirs
-        and of what its dissipation has to preserve.
+        Names of the functions of the system to keep. A run fills it in: the conserved ones among its Casimirs and the
+        functions that its dissipation has to preserve.
     moving : tuple of int, optional
-        Which of ``preserve`` are momentum maps, that move the state, and not Casimirs; a run finds out.
+        Indices of the functions of ``preserve`` that are momentum maps and not Casimirs. A run fills it in.
 
     Examples
     --------

@@ -17,16 +17,17 @@ from .charts import in_charts
 class MetriplecticMidpoint(TransportingMethod):
     """``(x' - x)/h = Pi(z) dgrad H + K_d(z) grad S(z)``, z the midpoint, dgrad a discrete gradient [BFM 4.5].
 
-    K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly: for every H,
-    step and dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
-    (``MetriplecticGauss`` removes that restriction). Quadratic Casimirs are kept exactly where the dissipation keeps
-    them by construction; where H is quadratic all quadratic first integrals are. Others drift at O(h^2).
+    K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly for every H and
+    every dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
+    (``MetriplecticGauss`` removes that restriction). The scheme keeps quadratic Casimirs exactly if the dissipation
+    keeps them by construction. If H is quadratic, it keeps all quadratic first integrals. Others drift at O(h^2).
 
-    Order 2, except 1 with ``"coordinate_increment"`` as printed in the paper, which is not symmetric. One implicit
-    equation of the size of the state per step; a general energy costs two values and three gradients an iteration with
-    ``"gonzalez"``, two and five with ``"mean_value"``, and about 3n gradients with ``"coordinate_increment"``.
+    The order is 2, and 1 with ``"coordinate_increment"`` as printed in the paper, which is not symmetric. A step solves
+    one implicit equation of the size of the state. For a general energy an iteration costs two values and three
+    gradients with ``"gonzalez"``, two and five with ``"mean_value"``, and about 3n gradients with
+    ``"coordinate_increment"``.
 
-    On a manifold it runs in the space around. With ``retraction`` it is
+    On a manifold the scheme runs in the arrays around it. With ``retraction`` it is
     ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the chart around z [BFM
     §4.4]: see :class:`InCharts`.
 
@@ -35,9 +36,9 @@ class MetriplecticMidpoint(TransportingMethod):
     gradient : {"gonzalez", "mean_value", "coordinate_increment", "symmetric_coordinate_increment"} or DiscreteGradient
         The discrete gradient of the energy.
     retraction : str or manifolds.Retraction, optional
-        On a manifold, in whose charts to run: ``"midpoint"`` is the paper's ``exp~_h`` (4.8), others as
-        :func:`manifolds.retraction` names them. Where z is at the start of the step, the chart's own midpoint is taken,
-        so the order is 2 too.
+        On a manifold, the retraction whose charts are used. ``"midpoint"`` is the paper's ``exp~_h`` (4.8), and
+        :func:`manifolds.retraction` has the other names. If z is the start of the step, the scheme uses the midpoint in
+        the chart, so the order is 2 too.
 
     Examples
     --------

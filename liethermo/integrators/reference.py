@@ -14,9 +14,9 @@ from ..tracing.programs import program
 
 @dataclass(frozen=True)
 class Reference:
-    """SciPy's ``solve_ivp`` on the vector field, to measure errors against and to show what ordinary solvers lose.
+    """SciPy's ``solve_ivp`` on the vector field, as a reference for errors and as an example of an ordinary solver.
 
-    Neither energy nor entropy law is kept: both drift with the tolerance. ``step`` is only the spacing of the output.
+    It keeps neither law: energy and entropy drift with the tolerance. ``step`` is only the spacing of the output.
 
     Parameters
     ----------

@@ -29,18 +29,18 @@ class MetriplecticRungeKutta(ExplicitMethod):
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X_i),    sigma = grad S . K grad S >= 0,
 
     for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. The weights b of Lobatto's
-    quadrature are nonnegative, so that the entropy never falls; the quadrature is of the order p of the method, 4, 6 or
-    8, so that x' - y is O(h^{p+1}). How x' is found: :class:`.explicit.ExplicitMethod`.
+    quadrature are nonnegative, so the entropy never falls. The quadrature has the order p of the method, 4, 6 or
+    8, so x' - y is O(h^{p+1}). :class:`.explicit.ExplicitMethod` computes x'.
 
-    Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
+    If the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
     quadrature.
 
-    A step costs 4, 7 or 11 evaluations of the field, and one to four corrections, as many as it takes: for each, one
-    value of what each function changes by. There is nothing to iterate, but stiff systems ask for short steps. A step
-    that is too long for its corrections fails with a status.
+    A step costs 4, 7 or 11 evaluations of the field, and one to four corrections. A correction costs one change of
+    each function. There are no stage equations to solve, but stiff systems need short steps. A step that is too long
+    for its corrections ends the run with a status.
 
-    On a manifold the scheme runs in the space around; with ``retraction`` in the chart ``v -> R(x, v)`` around the
-    state, a new one at each step: same order, same laws. See :class:`InCharts`.
+    On a manifold the scheme runs in the arrays around it. With ``retraction`` it runs in the chart ``v -> R(x, v)``
+    around the state, a new chart in each step, with the same order and laws. See :class:`InCharts`.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
     preserve : sequence of functions or energies
         Further first integrals to hold exactly. The system has to conserve them (checked when a run starts).
     retraction : str or manifolds.Retraction, optional
-        On a manifold, in whose charts to run, with its base point where the step starts, such as ``"exp"``.
+        On a manifold, the retraction whose charts are used, such as ``"exp"``; its base point is the start of a step.
     held : tuple of str
-        Names of the functions of the system to hold. A run fills it in with what the system conserves.
+        Names of the functions of the system to keep. A run fills it in with those that the system conserves.
 
     Examples
     --------

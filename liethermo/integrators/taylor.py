@@ -40,22 +40,21 @@ class MetriplecticTaylor(ExplicitMethod):
         H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + h sum_i b_i sigma(X(s_i)),    sigma = grad S . K grad S >= 0,
 
     for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. The s_i and b_i are those of
-    Lobatto's quadrature, with ``p / 2 + 1`` nodes: it is of order p, and nothing that it produces is negative. How x'
-    is found: :class:`.explicit.ExplicitMethod`.
+    Lobatto's quadrature, with ``p / 2 + 1`` nodes. It has order p, and its weights are positive.
+    :class:`.explicit.ExplicitMethod` computes x'.
 
-    The coefficients come one after another from the recurrences of Taylor arithmetic [Hairer, Nørsett & Wanner 1993,
-    I.8], which are read off the functions of the system: see :mod:`liethermo.tracing.taylor`. All have to be smooth.
-    What they decide by ``jnp.where`` or ``lax.cond`` they decide at the start of each step.
+    The coefficients follow from the recurrences of Taylor arithmetic [Hairer, Nørsett & Wanner 1993, I.8], which the
+    library derives from the functions of the system: see :mod:`liethermo.tracing.taylor`. All functions have to be
+    smooth. A choice by ``jnp.where`` or ``lax.cond`` is made at the start of each step.
 
     A step costs about ``p^2 / 2`` times the products of the field, ``p / 2`` evaluations of the entropy production, and
-    one correction or a few. Steps are long: in double precision no method takes fewer. It is for accuracies from 1e-8
-    on.
+    a few corrections. Steps are long. The method is for accuracies of 1e-8 and better.
 
     Parameters
     ----------
     order : int or None
-        From 2 to 24. None: what the tolerance of adaptive steps asks for, ``1 - log(rtol) / 2`` [Jorba & Zou 2005], and
-        13, which 1e-10 asks for, where there is no tolerance.
+        From 2 to 24. None means the order ``1 - log(rtol) / 2`` for the tolerance of adaptive steps [Jorba & Zou 2005],
+        and 13, the order for 1e-10, without a tolerance.
     preserve, retraction, held
         As of :class:`MetriplecticRungeKutta`.
 

@@ -55,9 +55,9 @@ def ensemble(
 ) -> Ensemble:
     """Integrate many trajectories of one system, or of a family of systems.
 
-    A trajectory that fails has its own status and does not stop the others; nor does one that cannot be started,
-    with its parameters or from its initial state: its status is "inadmissible". After Ctrl-C the rest is returned with
-    the status "interrupted".
+    A trajectory that fails has its own status and does not stop the others. A trajectory with invalid parameters or an
+    invalid initial state does not start, and its status is "inadmissible". After Ctrl-C the unfinished trajectories
+    have the status "interrupted".
 
     Parameters
     ----------

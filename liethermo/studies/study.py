@@ -57,10 +57,10 @@ SLOW = 1_000
 
 
 class Study:
-    """Runs over grids and samples of parameters, in chunks that are kept as they are done.
+    """Runs over grids and samples of parameters, in chunks whose results are kept.
 
-    A point that cannot be run, that fails or that breaks a law has a status and a message of its own and stops nothing.
-    The results of a point do not depend on how the study was cut into chunks, nor on who did them.
+    A point that cannot run, that fails or that breaks a law has its own status and message, and the others go on. The
+    results of a point do not depend on the chunks or on the workers.
 
     Parameters
     ----------
@@ -79,19 +79,19 @@ class Study:
         the time at which the rate is below ``tol``, where the run ends too, ``lt.At(times)``, or any function from a
         :class:`Solution` to a number or an array.
     store : path, optional
-        Folder of the results. Without one they are kept until this object and all that is taken from its results are
-        gone.
+        Folder of the results. Without one they are kept in a temporary folder as long as this object, or an array of
+        its results, exists.
     attitude : array, shape (m, m), or function from the dict of a point to one, optional
         As for :func:`integrate` (dimensionless).
     noise : Fluctuations, optional
-        As for :func:`integrate`. Every point has a seed of its own, made from that of the noise and from its place on
-        the axes alone: chunks, workers and longer axes do not change it.
+        As for :func:`integrate`. The seed of a point depends only on that of the noise and on its place on the axes.
+        Chunks, workers and longer axes do not change it.
     chunk : int, optional
-        Points of a chunk, about: what is in memory at once, and what is lost at most where a run is killed.
+        The approximate number of points of a chunk. A chunk is in memory at once, and is lost if a run is killed.
     units, names : dict from str to str, optional
-        Of axes, parameters and measures, for tables and pictures: ``units={"rate": "1/s"}``.
+        Units and names of axes, parameters and measures, for tables and pictures: ``units={"rate": "1/s"}``.
     spec : dict, optional
-        JSON data that is kept beside the results.
+        JSON data to keep with the results.
 
     Raises
     ------
