@@ -3,8 +3,8 @@ What does heat do on its way through two qubits?
 ================================================
 
 Two qubits are coupled, and each has a bath. Heat flows from the hot bath into the first qubit, to the second, and into
-the cold bath. The baths are of finite size, so the flow ends. At every time the hot bath has lost entropy, the cold
-bath has gained more, and the entropy of the qubits is almost constant.
+the cold bath. The baths are of finite size, so the flow ends. In the end the cold bath has gained more entropy than the
+hot bath has lost.
 """
 
 import matplotlib.pyplot as plt
