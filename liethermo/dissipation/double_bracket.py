@@ -22,9 +22,9 @@ class DoubleBracket(Dissipation):
     """Double bracket: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
 
     ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
-    on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. No entropy is needed: one that is given must be a Casimir
-    and is conserved. On so(3) it moves the momentum of a body that is left to itself and has parts that rub: |mu| is
-    constant, and the kinetic energy falls. Where a system has baths, they take it: see :class:`liethermo.HeatBaths`.
+    on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. It needs no entropy. An entropy of the system must be a Casimir,
+    and is conserved. On so(3) it describes a body with internal friction and without torque: |mu| is constant, and the
+    kinetic energy falls. If the system has baths, they take this energy: see :class:`liethermo.HeatBaths`.
 
     Parameters
     ----------

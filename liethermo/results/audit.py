@@ -113,7 +113,7 @@ LAW_FAILS = "A LAW FAILS"
 
 @dataclass(frozen=True)
 class Audit(Tabular):
-    """The laws of a run, how accurate it is, and whether it is one of its system. Printing it gives a table.
+    """The laws of a run, its accuracy, and its consistency with the vector field. Printing it gives a table.
 
     Attributes
     ----------
@@ -127,12 +127,12 @@ class Audit(Tabular):
         to keep; NaN where there is none.
     worst_residual : float
     passed : bool
-        Whether the laws hold along the motion of the system. How accurate the steps are is another question: see
-        ``verdict``, and ``resolved``.
+        Whether the laws hold along the motion of the system. ``resolved`` and ``verdict`` are about the accuracy of the
+        steps.
     resolved : bool or None
-        Whether the steps that were looked at resolve the motion: whether the worst of them, measured against short
-        ones, is within the tolerance ``accuracy``. It is about each step by itself, not about what errors add up to.
-        None where nothing is known of the steps.
+        Whether the examined steps resolve the motion: whether the worst of them, compared with short steps, is within
+        the tolerance ``accuracy``. It is about single steps and not about the accumulated error. None without
+        information about the steps.
     rows : tuple of AuditRow
     coverage : str
         How many of the steps were looked at for that, where it was not all; the verdict says it too.

@@ -50,7 +50,7 @@ class Solution(Recorded):
     attitude : ndarray, shape (times, m, m), or None
         Elements of the group of the system, where it has one.
     evidence : Evidence
-        What an audit needs besides the series: found when first asked for, and written to files.
+        The data that an audit needs besides the series: computed at its first use, and saved in files.
 
     Examples
     --------

@@ -21,12 +21,12 @@ UNDERFLOW = 1e-14
 class Adaptive:
     """Steps chosen by an estimate of the local error, so that errors add up to the tolerance.
 
-    In the time in which the state changes by its own size, going as fast as it ever has, the errors of the steps add up
-    to ``atol + rtol * max|x|`` at most: a step that takes a part of that time may have this part of the error, a longer
-    one all of it. So the error of a run is proportional to the tolerance, with every method.
+    Take the time in which the state changes by its own size, at its greatest speed so far. In this time the estimated
+    errors of the steps add up to at most ``atol + rtol * max|x|``: a step that takes a fraction of this time may have
+    the same fraction of the error. So the error of a run is about proportional to the tolerance, with every method.
 
-    Steps are short enough, too, for what grows near the state to grow at its rate, to a few thousandths, however small
-    it is yet: a body spinning about its middle axis falls when it has to. The laws hold at every step.
+    Steps also resolve every growing deviation, however small it is, so that it grows at its rate to a few thousandths:
+    a body spinning about its middle axis leaves that axis at the right time. The laws hold at every step.
 
     Parameters
     ----------

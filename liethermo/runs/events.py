@@ -21,8 +21,8 @@ from ..tracing.traced import settled
 class Relaxed:
     """The event that the entropy production falls below ``tol`` (per unit of time), for ``integrate(until=...)``.
 
-    Some systems produce no entropy, but their energy falls, as under a :class:`liethermo.DoubleBracket`. There the rate
-    at which the dissipation lowers the energy takes the place of the production.
+    Some systems produce no entropy, but their energy falls, as under a :class:`liethermo.DoubleBracket`. For these the
+    rate at which the dissipation lowers the energy is used instead.
 
     The rate may be below ``tol`` at the start, as near an unstable equilibrium. It then has to rise above it first.
 

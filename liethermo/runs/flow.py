@@ -31,12 +31,12 @@ def flow(
 ) -> jax.Array:
     """The final state of the flow from x0, a differentiable function of x0 and of the parameters of the system.
 
-    The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations:
-    the stage equations ``k = slopes(x, k)`` define k, and their linearisation its derivative (implicit function
-    theorem), exactly for the discrete flow. Use it under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``,
-    and derivatives of derivatives: the parameters are the arrays among the leaves of the system, or whatever a function
-    builds it from, those that its functions close over among them. By itself it runs a compiled program, which is found
-    again for other numbers.
+    The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations.
+    The stage equations ``k = slopes(x, k)`` define k, and their linearisation defines its derivative (implicit function
+    theorem). This derivative is exact for the discrete flow. The function works under ``jax.grad``, ``jax.jacfwd``,
+    ``jax.vmap`` and ``jax.jit``, and it has derivatives of every order. Parameters are the arrays among the leaves of
+    the system, the arguments from which a function builds it, and numbers in closures. Without a transformation the
+    function runs a compiled program, which is reused for other numbers.
 
     Parameters
     ----------

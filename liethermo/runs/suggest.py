@@ -26,8 +26,8 @@ from .stepwise import Outcome, Steps, follow
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
     """A step size for fixed steps as accurate as those of ``lt.Adaptive(rtol)``, near x0.
 
-    The smallest of the first thirty that adaptive steps take, once they no longer grow as fast as they are let,
-    rounded down to two digits.
+    It is the smallest of the first thirty adaptive steps, after their first growth at the largest allowed rate, rounded
+    down to two digits.
 
     Parameters
     ----------
@@ -111,10 +111,10 @@ CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (
 
 @by_own_settings
 def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
-    """The method, of those that hold both laws, that reaches an accuracy with least work near x0.
+    """The method, of those that keep both laws, that reaches an accuracy with the least work near x0.
 
-    Each is run for some thirty adaptive steps; stages times iterations over the step is what it costs. So stiffness,
-    which keeps explicit steps short, shows by itself.
+    Each method runs for some thirty adaptive steps. Its cost is stages times iterations, divided by the step. So
+    stiffness, which makes explicit steps short, is taken into account.
 
     Parameters
     ----------

@@ -24,9 +24,10 @@ from ..functions.warmth import Reservoir, Warmth, warmth
 class HeatBaths(Module):
     """Baths, each with an energy that is a function of its own entropy y: by default ``U = C T (exp(y / C) - 1)``.
 
-    That is a constant heat capacity C, and the temperature T at y = 0. A system with baths has the state (x, y), the
-    energy ``H(x) + U(y)``, and an entropy that ``sum y`` belongs to. A dissipation that lowers the energy of its body
-    heats the first bath, or the one that its ``bath`` names: see :class:`liethermo.dissipation.heating.Heating`.
+    This default has the constant heat capacity C, and the temperature T at y = 0. A system with baths has the state
+    (x, y), the energy ``H(x) + U(y)``, and an entropy that includes ``sum y``. A dissipation that lowers the energy of
+    its body heats the first bath, or the bath with the number ``bath``: see
+    :class:`liethermo.dissipation.heating.Heating`.
 
     Parameters
     ----------

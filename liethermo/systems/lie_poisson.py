@@ -28,9 +28,9 @@ from .torque import checked_torque, name_of, torque_at
 class LiePoissonSystem(System):
     """``mu' = ad*_{grad H} mu + K grad S`` on g* [BFM 3.1, §3].
 
-    On copies of an algebra, ``g ** sites``, a state is an array of shape ``(*sites, g.dim)``: so functions are handed
-    it, and so solutions have it. What is written for components in one row stays so: ``lt.Quadratic``, terms on
-    components (``lt.Each``, ``.on(...)``), Casimirs of the algebra and matrices of dissipations.
+    On copies of an algebra, ``g ** sites``, a state is an array of shape ``(*sites, g.dim)``, in functions and in
+    solutions. Flat states are used by ``lt.Quadratic``, by terms on components (``lt.Each``, ``.on(...)``), by Casimirs
+    of the algebra and by matrices of dissipations.
 
     Parameters
     ----------

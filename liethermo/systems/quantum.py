@@ -31,9 +31,9 @@ WITHIN = 1e-12
 class QuantumSystem(System):
     """A density matrix with a Hamiltonian, dissipation and heat baths: ``rho' = -i [H, rho] + ...`` (hbar = k_B = 1).
 
-    Energy ``tr(rho H) + U(y)``, entropy ``-tr(rho ln rho) + sum y``: y are the entropies of the baths. A state is a
-    row of real numbers, the coordinates of rho (:class:`manifolds.DensityMatrices`) and then y; :meth:`state` makes it
-    from a matrix and :meth:`density` makes the matrix of it.
+    The energy is ``tr(rho H) + U(y)`` and the entropy ``-tr(rho ln rho) + sum y``, with the entropies y of the baths. A
+    state is a row of real numbers: the coordinates of rho (:class:`manifolds.DensityMatrices`) and then y.
+    :meth:`state` converts a matrix to a state, and :meth:`density` a state to a matrix.
 
     Parameters
     ----------

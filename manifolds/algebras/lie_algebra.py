@@ -36,9 +36,9 @@ class LieAlgebra:
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
     (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
 
-    What is said about the structure (``is_semisimple``, ``derived_series``, …) holds for the algebra and not for its
-    basis: it is decided on constants that a scaling of the basis elements has made of similar size, where what is below
-    1e-10 counts as rounding.
+    Statements about the structure (``is_semisimple``, ``derived_series``, …) do not depend on the basis: they are
+    decided after a scaling of the basis elements that makes the constants of similar size. Constants below 1e-10 then
+    count as rounding.
 
     Attributes
     ----------
