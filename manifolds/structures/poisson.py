@@ -134,7 +134,7 @@ class PoissonTensor(PoissonStructure):
 
 
 class PoissonBySharp(PoissonStructure):
-    """A structure of which :meth:`sharp` is what is known."""
+    """A structure that is given by :meth:`sharp` alone."""
 
     @abstractmethod
     def sharp(self, x, alpha) -> jax.Array: ...
