@@ -90,7 +90,7 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
     found = front._compared(report, pair)
     assert found == front.Comparison("work", "peer, quick", 2.0, 1.0, "hold", "broken: energy")  # the fastest counts
     (sentence, laws) = front.sentences([dataclasses.replace(found, peer="heyoka")])
-    assert "faster in 0 of 1 works" in sentence
+    assert "faster in 0 of 1 tasks" in sentence
     assert "1 of 1 runs of this library and in 0 of theirs" in laws
     assert front._compared(report, dataclasses.replace(pair, theirs="nobody")) is None
 
