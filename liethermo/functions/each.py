@@ -16,6 +16,7 @@ from ..tracing.traced import settled
 from .checks import check_scalar, recognised
 from .energy import Energy, Function
 from .indices import Indices, cliques
+from .path import Path
 
 
 class Each(Energy):
@@ -92,27 +93,16 @@ class Each(Energy):
         return self._spread(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def one(start, compensation, step, points, slopes, further, symmetries, *a):
-            mine = path._replace(
-                start=start,
-                compensation=compensation,
-                step=step,
-                points=points,
-                slopes=slopes,
-                further=further,
-                symmetries=symmetries,
-            )
-            return self._at(a).stage_gradients(scheme, mine)
+        def one(own: Path, *a):
+            return self._at(a).stage_gradients(scheme, own)
 
-        n = path.start.shape[0]
-        ends = map(self._gathered, (path.start, jnp.zeros_like(path.start) + path.compensation, path.step))
-        stages = map(self._gathered, (path.points, path.slopes))
-        further = None if path.further is None else tuple(map(self._gathered, path.further))
-        symmetries = None if path.symmetries is None else self._gathered(path.symmetries)
-        optional = (None if further is None else 1, None if symmetries is None else 2)
-        axes = (0, 0, 0, 1, 1, *optional, *(0 for _ in self.parameters))
-        found = jax.vmap(one, in_axes=axes, out_axes=1)(*ends, *stages, further, symmetries, *self.parameters)
-        return jax.vmap(lambda g: self._spread(g, n))(found)
+        compensation = jnp.zeros_like(path.start) + path.compensation
+        gathered = Path(*jax.tree.map(self._gathered, path._replace(compensation=compensation)[:7]), *path[7:])
+        further, symmetries = None if path.further is None else 1, None if path.symmetries is None else 2
+        axes = Path(0, 0, 0, 1, 1, further, symmetries, None, None, None)  # type: ignore[arg-type]
+        in_axes = axes, *(0 for _ in self.parameters)
+        found = jax.vmap(one, in_axes=in_axes, out_axes=1)(gathered, *self.parameters)
+        return jax.vmap(lambda g: self._spread(g, path.start.shape[0]))(found)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         return cliques(self.places, dim)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -53,37 +54,36 @@ class At:
         object.__setattr__(self, "times", tuple(times.tolist()))
 
 
-class Measure(Protocol):
+class Measure(ABC):
     """One measure.
 
     Attributes
     ----------
     path : bool
         Whether it needs the states along the run.
-    final : bool
-        Whether it needs the last state.
     """
 
-    @property
-    def path(self) -> bool: ...
-    @property
-    def final(self) -> bool: ...
+    path: ClassVar[bool] = False
 
+    @property
+    def final(self) -> bool:
+        """Whether it needs the last state."""
+        return False
+
+    @abstractmethod
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         """Its values of at least the first ``count`` trajectories, and why it has none of some of them."""
-        ...
 
+    @abstractmethod
     def description(self) -> str:
         """What it is, in words that tell it from another."""
-        ...
 
 
 @dataclass(frozen=True)
-class Named:
+class Named(Measure):
     """A field of an ensemble."""
 
     name: str
-    path: bool = False
 
     @property
     def final(self) -> bool:
@@ -109,12 +109,10 @@ def _last(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class EventTime:
+class EventTime(Measure):
     """When the event of the study happened; NaN where it did not."""
 
     event: str
-    path: bool = False
-    final: bool = False
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         return ensemble.event_time, {}
@@ -124,12 +122,12 @@ class EventTime:
 
 
 @dataclass(frozen=True)
-class AtTimes:
+class AtTimes(Measure):
     """Values at given times."""
 
     at: At
-    path: bool = True
-    final: bool = False
+
+    path = True
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         values = getattr(ensemble, self.at.what)
@@ -143,7 +141,7 @@ class AtTimes:
 
 
 @dataclass(frozen=True)
-class OfSolution:
+class OfSolution(Measure):
     """A user's function of a solution, to a number or an array of a fixed shape.
 
     Attributes
@@ -155,8 +153,8 @@ class OfSolution:
 
     function: Callable
     like: np.ndarray | None = field(default=None, compare=False)
-    path: bool = True
-    final: bool = False
+
+    path = True
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         found: dict[int, np.ndarray] = {}

@@ -141,10 +141,6 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
 
     @property
-    def configurations(self) -> mf.Space | None:
-        return configurations(self.contact)
-
-    @property
     def degrees_of_freedom(self) -> int:
         return self.own_size // 2
 
