@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
+from ..tracing.once import has_products
+
 EXACT = frozenset(
     """abs broadcast_in_dim ceil clamp concatenate convert_element_type copy copy_p copysign dynamic_slice
     dynamic_update_slice expand_dims floor gather imag iota max min neg pad real reduce_max reduce_min reshape rev round
@@ -59,8 +61,10 @@ def with_rounding(function: Callable, x) -> tuple[jax.Array, jax.Array]:
     def erring(shares):
         return _evaluated(closed.jaxpr, closed.consts, [x], itertools.count(), shares)[0]
 
-    # one program, as one is quicker to compile; of large arrays one sample after another, for they need memory
-    each = jax.vmap(erring) if np.size(x) <= LONGEST else functools.partial(jax.lax.map, erring)
+    # one program, as one is quicker to compile; of large arrays one sample after another, for they need memory, and of
+    # functions within that are called by several samples, such as networks
+    together = np.size(x) <= LONGEST and not any(map(_is_called, closed.jaxpr.eqns))
+    each = jax.vmap(erring) if together else functools.partial(jax.lax.map, erring)
     found = each(np.eye(SAMPLES + 1, SAMPLES, -1) * SHARE)
     right, wrong = found[0], found[1:]
     size = jnp.max(jnp.abs(wrong - right), axis=0) / SHARE
@@ -98,7 +102,11 @@ def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], share
         name, parameters = equation.primitive.name, equation.params
         inner = next((parameters[key] for key in INNER if key in parameters), None)
         if inner is not None and name not in LOOPS and hasattr(inner, "consts"):
-            found = _evaluated(inner.jaxpr, inner.consts, given, numbers, shares)
+            if _is_called(equation):
+                whole = jax.jit(lambda given, shares, i=inner: _evaluated(i.jaxpr, i.consts, given, numbers, shares))
+                found = whole(given, shares)
+            else:
+                found = _evaluated(inner.jaxpr, inner.consts, given, numbers, shares)
         else:
             bound = equation.primitive.get_bind_params(parameters)
             functions, parameters = bound if isinstance(bound, tuple) else ((), bound)  # as older versions of JAX have
@@ -108,6 +116,11 @@ def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], share
                 found = [_erring(value, next(numbers), shares) for value in found]
         values.update(zip(equation.outvars, found, strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
+
+
+def _is_called(equation) -> bool:
+    """Whether it calls a function with products of matrices: in machine code that is a routine, written once."""
+    return equation.primitive.name in ("jit", "pjit") and has_products(equation.params["jaxpr"].jaxpr)
 
 
 def _erring(value, number: int, shares):

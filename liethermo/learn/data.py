@@ -40,9 +40,9 @@ def trajectories(data: Any, system: System, observed: Sequence[int] | None) -> l
 def _pairs(data: Any) -> list[tuple[Any, Any]]:
     if hasattr(data, "t") and hasattr(data, "x"):
         return [(data.t, data.x)]
-    if isinstance(data, tuple) and len(data) == 2 and np.ndim(data[0]) == 1:
+    if isinstance(data, tuple) and len(data) == 2 and _ndim(data[0]) == 1:
         t, x = data
-        return [(t, x) for x in np.asarray(x)] if np.ndim(x) == 3 else [(t, x)]
+        return [(t, x) for x in np.asarray(x)] if _ndim(x) == 3 else [(t, x)]
     if not isinstance(data, Sequence):
         raise InputError(
             f"data is a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such pairs, "
@@ -51,16 +51,32 @@ def _pairs(data: Any) -> list[tuple[Any, Any]]:
     return [pair for part in data for pair in _pairs(part)]
 
 
+def _ndim(values: Any) -> int | None:
+    """None of rows of different lengths."""
+    try:
+        return np.ndim(values)
+    except ValueError:
+        return None
+
+
+def _real(values: Any) -> np.ndarray:
+    """Raises TypeError, or ValueError, where they are none."""
+    found = np.asarray(values)
+    if found.dtype.kind not in "biufO":
+        raise TypeError(f"they are of type {found.dtype}")
+    return found.astype(np.float64)
+
+
 def _checked(number: int, t, x, system: System, count: int, whole: bool) -> Trajectory:
     what = f"trajectory {number}"
     try:
-        t, x = np.asarray(t, dtype=np.float64), np.asarray(x, dtype=np.float64)
+        t, x = _real(t), _real(x)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} is not made of real numbers: {error}") from None
     if t.ndim != 1 or len(t) < 2:
         raise InputError(f"{what} has {t.size} point{'s' if t.size != 1 else ''}: at least 2 tell of a motion")
-    if len(x) != len(t):
-        raise InputError(f"{what} has {len(t)} times and {len(x)} states")
+    if x.ndim == 0 or len(x) != len(t):
+        raise InputError(f"{what} has {len(t)} times and {len(x) if x.ndim else 'no'} states")
     for name, values in (("time", t), ("state", x)):
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
@@ -72,7 +88,10 @@ def _checked(number: int, t, x, system: System, count: int, whole: bool) -> Traj
         i = int(falls[0])
         raise InputError(f"{what}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
     if whole:
-        x = np.asarray(system.numbers(x, batch=True))
+        try:
+            x = np.asarray(system.numbers(x, batch=True))
+        except InputError as error:
+            raise type(error)(f"{what}: {error}") from None
     elif x.shape != (len(t), count):
         raise InputError(f"{what} has states of shape {x.shape}, but {count} components are observed at {len(t)} times")
     return Trajectory(t, x)

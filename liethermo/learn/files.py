@@ -74,15 +74,20 @@ def load(path: str | os.PathLike, system: T) -> T:
     """
     said, arrays = read(Path(path), FORMAT)
     leaves, structure, static = _arrays(system)
-    kept = [arrays[f"leaf_{i}"] for i in range(sum(name.startswith("leaf_") for name in arrays))]
-    shapes = [[x.shape for x in these] for these in (kept, map(np.asarray, leaves))]
+    kept = [arrays.get(f"leaf_{i}", np.zeros(0, bool)) for i in range(sum(n.startswith("leaf_") for n in arrays))]
+    shapes = [[(x.shape, x.dtype.kind) for x in these] for these in (kept, map(np.asarray, leaves))]
     if said.get("kind") != system.kind or shapes[0] != shapes[1]:
         raise FileError(
             f"{path!s:.200} holds a {said.get('kind')} with {len(kept)} arrays, and this {system.kind} with "
             f"{len(leaves)} is built otherwise: give load a system made as the one that was saved"
         )
     found = eqx.combine(jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, kept))), static)
+    if not all(np.isfinite(x).all() for x in kept if x.dtype.kind == "f"):
+        raise FileError(f"{path!s:.200} has numbers that are not finite: it is no system that was fitted")
     if "training" in said:
-        curves: dict[str, Any] = {name: arrays[name] for name in CURVES}
-        object.__setattr__(found, "training", Training(**curves, **said["training"]))
+        try:
+            training = Training(**{name: arrays[name] for name in CURVES}, **said["training"])  # type: ignore[arg-type]
+        except (KeyError, TypeError) as error:
+            raise FileError(f"{path!s:.200} has a record of its fit that is damaged ({error!s:.100})") from None
+        object.__setattr__(found, "training", training)
     return found

@@ -56,7 +56,8 @@ def fit(
 
     The first part matches the vector field to the derivatives of splines through the data. The second part matches the
     states at the ends of short runs from the data (multiple shooting), whose steps obey both discrete laws. Each part
-    is a descent by Adam with a rate that falls along a cosine. The same arguments give the same result.
+    is a descent by SOAP [Vyas et al. 2025], which is Adam in the eigenvectors of each layer's gradients, with a rate
+    that falls along a cosine. The same arguments give the same result.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def fit(
     matching, shooting : int
         Numbers of iterations of the two parts. If not all components are observed, there is no matching.
     rate : float
-        Learning rate of Adam in the matching (dimensionless); the shooting uses 0.3 of it.
+        Learning rate in the matching (dimensionless); the shooting uses 0.3 of it.
     batch : int, optional
         Points, or short runs, of one iteration: 256 and 32 by default.
     window : int
@@ -112,6 +113,12 @@ def fit(
         If the checkpoint is of another fit, or cannot be written.
     """
     began = time.perf_counter()
+    if not isinstance(system, System):
+        raise InputError(f"fit takes a system, such as lt.learn.Metriplectic(4), not {type(system).__name__}")
+    if not isinstance(method, OneStepMethod | None):
+        raise InputError(f"method is a OneStepMethod, such as lt.MetriplecticRungeKutta(4), not {method!r}")
+    if not (_is_real(rate) and 0.0 < rate < np.inf):
+        raise InputError(f"rate is a positive number, not {rate!r}")
     counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
     for name, value in {**counts, "patience": patience, "seed": seed}.items():
         _check_count(name, value, 0 if name in BATCH or name == "seed" else 1, name in ("batch", "patience"))
@@ -152,7 +159,15 @@ def fit(
     if matching and observed is None:
         task = matched(train)
         phases.append(
-            Phase("matching", task, matched(held) if held else None, matching, rate, batch or BATCH["matching"])
+            Phase(
+                "matching",
+                task,
+                matched(held) if held else None,
+                matching,
+                rate,
+                batch or BATCH["matching"],
+                own.shapes,
+            )
         )
     if shooting:
         free, slower = sigma is not None or observed is not None, SLOWER if phases else 1.0
@@ -165,6 +180,7 @@ def fit(
                 shooting,
                 slower * rate,
                 batch or BATCH["shooting"],
+                own.shapes,
             )
         )
     settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
@@ -186,21 +202,32 @@ def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
         raise InputError(f"{name} is an integer >= {least}, not {value!r}")
 
 
+def _is_real(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def _places(observed: Sequence[int] | None, dim: int) -> np.ndarray:
     if observed is None:
         return np.arange(dim)
-    places = np.asarray(observed)
+    try:
+        places = np.asarray(observed)
+    except ValueError:  # rows of different lengths
+        places = np.zeros(0)
     if places.dtype.kind not in "iu" or places.ndim != 1 or not len(places) or len(set(places.tolist())) < len(places):
         raise InputError(f"observed is a sequence of different component numbers, not {observed!r}")
-    if places.min() < 0 or places.max() >= dim:
-        raise InputError(f"observed has component {places.max()}, but a state has the components 0 to {dim - 1}")
+    outside = places[(places < 0) | (places >= dim)]
+    if len(outside):
+        raise InputError(f"observed has component {outside[0]}, but a state has the components 0 to {dim - 1}")
     return places
 
 
 def _noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
     if noise is None:
         return None
-    sigma = np.asarray(noise, dtype=np.float64)
+    try:
+        sigma = np.asarray(noise, dtype=np.float64)
+    except (TypeError, ValueError):
+        sigma = np.array(np.nan)
     if sigma.shape not in ((), (count,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
         raise InputError(
             f"noise is a positive standard deviation, or one for each of {count} components, not {noise!r}"
@@ -217,7 +244,7 @@ def _whole(x: np.ndarray, places: np.ndarray, dim: int) -> np.ndarray:
 
 def _split(data: list[Trajectory], share: float, seed: int) -> tuple[list[Trajectory], list[Trajectory]]:
     """What is learned from, and what is held out: whole trajectories, or the end of the only one."""
-    if not 0.0 <= share < 1.0:
+    if not (_is_real(share) and 0.0 <= share < 1.0):
         raise InputError(f"validation is a share from 0 to below 1, not {share!r}")
     if share == 0.0:
         return data, []

@@ -19,6 +19,9 @@ from .data import Windows
 from .model import tied
 from .networks import learned
 
+SLOW = 0.1
+"""Mean square of the rates of change, in units of their usual size, below which they count as slow."""
+
 
 class Weights(NamedTuple):
     """The numbers of a system that are learned, as one vector.
@@ -27,10 +30,13 @@ class Weights(NamedTuple):
     ----------
     start : array, shape (p,)
         As they are; the logarithms of those that have to be positive.
+    shapes : tuple of tuple of int
+        Of the arrays that stand in it, one after another.
     system : function from such a vector to the system
     """
 
     start: np.ndarray
+    shapes: tuple[tuple[int, ...], ...]
     system: Callable[[Any], System]
 
 
@@ -46,13 +52,14 @@ def weights(system: System, also: Callable | None = None, positive: Callable | N
     signs = none if positive is None else eqx.tree_at(positive, none, replace_fn=lambda _: True)
     varied, fixed = eqx.partition(system, mask)
     logs, plain = eqx.partition(varied, signs)
-    first, back = ravel_pytree((jax.tree_util.tree_map(jnp.log, logs), plain))
+    both = jax.tree_util.tree_map(jnp.log, logs), plain
+    first, back = ravel_pytree(both)
 
     def rebuilt(vector) -> System:
         logs, plain = back(vector)
         return tied(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
 
-    return Weights(np.asarray(first), rebuilt)
+    return Weights(np.asarray(first), tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(both)), rebuilt)
 
 
 class Task(NamedTuple):
@@ -75,12 +82,17 @@ class Task(NamedTuple):
 
 
 def matching(own: Weights, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -> Task:
-    """The mean square of what ``x'`` misses of rates of change, in units of ``size``, shape (n,)."""
+    """The mean square of what ``x'`` misses of rates of change, in units of ``size``, shape (n,).
+
+    Relative to how fast the state changes: else a loss is all about the few fastest moments, and the phase of a slow
+    motion, which errors pile up in, counts for nothing.
+    """
 
     def loss(vector, arrays, chosen):
         points, wanted = (values[chosen] for values in arrays)
         found = jax.vmap(own.system(vector)._vector_field)(points)
-        return jnp.mean(((found - wanted) / size) ** 2)
+        speed = jnp.mean((wanted / size) ** 2, axis=1, keepdims=True)
+        return jnp.mean(((found - wanted) / size) ** 2 / (SLOW + speed))
 
     return Task(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
 

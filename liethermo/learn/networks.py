@@ -30,7 +30,13 @@ class Learned(Module):
     function: Callable
 
     def __call__(self, *arguments):
-        return self.function(*arguments)
+        return _called(self.function, arguments)
+
+
+@eqx.filter_jit
+def _called(function: Callable, arguments: tuple):
+    """A call that is traced once: machine code has one routine for all of its places."""
+    return function(*arguments)
 
 
 class Perceptron(Module):

@@ -55,6 +55,15 @@ class Energy(Function):
             )
         self.quadratic = False
 
+    def gradient(self, x) -> jax.Array:
+        return _gradient(self.function, x)
+
+
+@eqx.filter_jit
+def _gradient(function: Callable, x) -> jax.Array:
+    """A gradient that is traced once, as the calls of :class:`.networks.Learned` are."""
+    return jax.grad(lambda y: jnp.asarray(function(y)))(x)
+
 
 class Entropy(Energy):
     """An entropy that is learned: as :class:`Energy`, with other first weights for the same seed."""

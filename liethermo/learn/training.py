@@ -18,6 +18,7 @@ import numpy as np
 from .. import disk
 from ..errors import FileError, InputError
 from ..runs.progress import Progress
+from .descent import descent
 from .losses import Task
 
 BLOCK = 50
@@ -42,6 +43,7 @@ class Phase:
     steps: int
     rate: float
     batch: int
+    shapes: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Training:
         Steps taken when the course was looked at, those of all phases together.
     phase : ndarray of str, shape (looks,)
     loss : ndarray, shape (looks,)
-        The mean over the steps since the last look; mean squares, relative to the spread of the data or the noise.
+        The mean over the steps since the last look; mean squares, of the matching relative to the speed of the state,
+        of the shooting to the spread of the data or the noise.
     validation : ndarray, shape (looks,)
         The loss of what is held out, NaN where nothing is.
     parameters : int
@@ -204,6 +207,8 @@ class Course:
             return
         self._enter()
         self.block, self.since, self.least = said["block"], said["since"], said["least"]
+        if not self.vector.shape == arrays["vector"].shape == arrays["best"].shape:
+            raise FileError(f"{path} cannot be gone on from: its numbers are not as many as those of this fit")
         self.vector, self.best = jnp.asarray(arrays["vector"]), arrays["best"]
         first, structure = jax.tree_util.tree_flatten(self.state)
         leaves = [jnp.asarray(arrays[f"state_{i}"]) for i in range(len(first))]
@@ -211,13 +216,13 @@ class Course:
 
 
 def _optimiser(phase: Phase) -> Any:
-    """Adam, with a rate that falls to a hundredth along a cosine; steps with a gradient that is not finite are left."""
+    """With a rate that falls to a hundredth along a cosine; steps with a gradient that is not finite are left."""
     try:
         import optax
     except ImportError:
         raise InputError("lt.learn.fit needs optax: pip install 'liethermo[learn]'") from None
     schedule = optax.cosine_decay_schedule(phase.rate, phase.steps, alpha=0.01)
-    return optax.apply_if_finite(optax.adam(schedule), max_consecutive_errors=10 * BLOCK)
+    return optax.apply_if_finite(descent(phase.shapes, schedule), max_consecutive_errors=10 * BLOCK)
 
 
 def _programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
@@ -260,9 +265,9 @@ def write(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> None:
     ------
     FileError
     """
-    made = io.BytesIO()
-    text = np.frombuffer(json.dumps(said).encode(), dtype=np.uint8)
-    np.savez(made, __json__=text, **{name: np.asarray(values) for name, values in arrays.items()})  # type: ignore[arg-type]
+    made, held = io.BytesIO(), {name: np.asarray(values) for name, values in arrays.items()}
+    text = json.dumps({**said, "checksum": _checksum(said, held)})
+    np.savez(made, __json__=np.frombuffer(text.encode(), dtype=np.uint8), **held)  # type: ignore[arg-type]
     try:
         disk.write(path, made.getvalue())
     except (OSError, ValueError) as error:
@@ -283,11 +288,20 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         said = json.loads(arrays.pop("__json__").tobytes())
         if not isinstance(said, dict) or said.get("format") != kind:
             raise ValueError(f"it is no {kind}")
+        if said.pop("checksum", None) != _checksum(said, arrays):
+            raise ValueError("its contents are not those that were written")
     except FileNotFoundError:
         raise FileError(f"there is no file {path!s:.200}") from None
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
         raise FileError(f"{path!s:.200} cannot be read: it is damaged or of another kind ({error!s:.100})") from error
     return said, arrays
+
+
+def _checksum(said: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    parts = [
+        part for name in sorted(arrays) for part in (name, arrays[name].dtype.str, arrays[name].shape, arrays[name])
+    ]
+    return fingerprint(json.dumps(said, sort_keys=True), *parts)
 
 
 def fingerprint(*parts: Any) -> str:

@@ -178,6 +178,13 @@ class Builder:
         Instructions that it may collect.
     around : (Builder, dict), optional
         Of a program inside a loop, the builder of what is around it, and the names that scalars of that have inside.
+
+    Attributes
+    ----------
+    routines : dict
+        Functions that are written once: see :mod:`.scalarize`.
+    entries_of : dict
+        What is in the tables of what is around, by their names inside.
     """
 
     def __init__(self, limit: int, around: tuple[Builder, dict[str, str]] | None = None):
@@ -186,6 +193,8 @@ class Builder:
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
         self._branches: dict[tuple[str, ...], int] = {}
+        self.routines: dict[tuple, Any] = {} if around is None else around[0].routines
+        self.entries_of: dict[str, tuple[str, ...]] = {}
 
     @property
     def real(self) -> Builder:
@@ -246,8 +255,9 @@ class Builder:
             return self.table(entries)
         outer, entered = self.around
         inverse = {inner: a for a, inner in entered.items()}
-        table = outer.held([inverse[a] for a in entries])
-        return entered.setdefault(table, f"x0_{len(entered)}")
+        name = entered.setdefault(outer.held([inverse[a] for a in entries]), f"x0_{len(entered)}")
+        self.entries_of[name] = tuple(entries)
+        return name
 
     def _made(self, a: Scalar) -> Instruction | None:
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None

@@ -86,13 +86,18 @@ class Program:
         place : int
             Of the input.
         """
-        degrees: dict[Scalar, float] = dict.fromkeys(self.inputs[place], 1)
+        return self._degree(dict.fromkeys(self.inputs[place], 1))
+
+    def _degree(self, degrees: dict[Scalar, float]) -> float:
+        """Where those of some of the inputs are known, and the others count for nothing."""
         for target, op, args in self.instructions:
             found = [degrees.get(a, 0) for a in args]
-            if op in ("add", "sub", "neg", "table", "item"):
+            if op in ("add", "sub", "neg", "table", "item", "column"):
                 degrees[target] = max(found)
             elif op == "mul" or isinstance(op, Product):
                 degrees[target] = sum(found)
+            elif isinstance(op, Routine):
+                degrees[target] = op.program._degree(dict(zip(op.program.inputs[0], found, strict=True)))
             elif op == "div" and not found[1]:
                 degrees[target] = found[0]
             else:

@@ -24,6 +24,7 @@ from manifolds.matrices import chains
 from ..errors import InputError, LiethermoError
 from .builder import Builder, LimitExceededError, Scalar, array, constant, elementwise
 from .complex_numbers import ComplexBuilder, arranged, flat, kinds
+from .once import has_products, written_once
 from .primitives import PARAMETERS, RULES
 from .program import Program, Routine, Scan, While, live
 
@@ -184,9 +185,14 @@ WRAPPING = frozenset(
 
 def _call(b, eqn, *arguments):
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-    if isinstance(inner, ClosedJaxpr):
-        return _unroll(b, inner.jaxpr, inner.consts, arguments)
-    return _unroll(b, inner, (), arguments)
+    if not isinstance(inner, ClosedJaxpr):
+        return _unroll(b, inner, (), arguments)
+    if has_products(inner.jaxpr):
+        avals, made = ([var.aval for var in both] for both in (eqn.invars, eqn.outvars))
+        found = written_once(b, _unroll, inner, arguments, avals, made)
+        if found is not None:
+            return found
+    return _unroll(b, inner.jaxpr, inner.consts, arguments)
 
 
 def _chain(b, eqn, *arguments):

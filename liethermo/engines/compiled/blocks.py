@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -123,10 +123,20 @@ def _scan(writer: Any, loop: Scan, args: Sequence[Any]) -> Results:
 class Table:
     """Values of one kind in memory, by their numbers."""
 
-    def __init__(self, writer: Any, kind: ir.Type, values: Sequence[ir.Value] = (), length: int = 0):
+    def __init__(
+        self,
+        writer: Any,
+        kind: ir.Type,
+        values: Sequence[ir.Value] = (),
+        length: int = 0,
+        start: ir.Value | None = None,
+    ):
         self.build, self.kind, self.writer = writer.builder, kind, writer
         self.length = max(len(values), length)
         self.widened = writer.kinds["i"] if kind == writer.kinds["b"] else None  # bits are awkward in memory
+        if start is not None:
+            self.start = start
+            return
         if values and not self.widened and all(isinstance(value, ir.Constant) for value in values):
             rows, module = ir.ArrayType(self.kind, len(values)), self.build.module
             fixed = ir.GlobalVariable(module, rows, module.get_unique_name("table"))
@@ -206,27 +216,36 @@ def table(writer: Any, values: Sequence[ir.Value]) -> Table:
     return Table(writer, kind, [writer.cast(v, "f") if kind == writer.number else v for v in values])
 
 
-def _routine(writer: Any, routine: Routine, args: Sequence[ir.Value]) -> Results:
-    """By a function of its own, which all that need it call."""
+def _routine(writer: Any, routine: Routine, args: Sequence[Any]) -> Results:
+    """By a function of its own, which all that need it call: numbers are handed over in memory, tables stay there."""
     build, count = writer.builder, len(routine.kinds)
-    given = Table(writer, writer.number, [writer.cast(a, "f") for a in args])
-    found = Table(writer, writer.number, length=count)
-    name = "routine_" + hashlib.sha256(repr(routine).encode()).hexdigest()[:16]
-    function = build.module.globals.get(name) or _written(writer, routine, name)
-    build.call(function, [given.start, found.start])
+    tables = {i: a for i, a in enumerate(args) if isinstance(a, Table | Given)}
+    numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
+    given, found = Table(writer, writer.number, numbers, length=1), Table(writer, writer.number, length=count)
+    said = repr((routine, *((i, type(a).__name__, str(a.start.type)) for i, a in tables.items())))
+    name = "routine_" + hashlib.sha256(said.encode()).hexdigest()[:16]
+    function = build.module.globals.get(name) or _written(writer, routine, name, tables)
+    build.call(function, [given.start, found.start, *(a.start for a in tables.values())])
     return Results([], [found], count)
 
 
-def _written(writer: Any, routine: Routine, name: str) -> ir.Function:
-    kinds = [writer.number.as_pointer()] * 2
+def _written(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table | Given]) -> ir.Function:
+    kinds = [writer.number.as_pointer()] * 2 + [a.start.type for a in tables.values()]
     function = ir.Function(writer.builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
     function.linkage = "internal"
     function.attributes.add("noinline")
     inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
-    build, (given, found) = inside.builder, function.args
+    build, (given, found, *starts) = inside.builder, function.args
+    own: dict[int, Table | Given] = {}
+    for (i, a), start in zip(tables.items(), starts, strict=True):
+        if isinstance(a, Given):
+            own[i] = Given(inside, start, a.length)
+        else:
+            own[i] = Table(inside, a.kind, length=a.length, start=start)
+    order = {j: i for i, j in enumerate(j for j in range(len(routine.program.inputs[0])) if j not in tables)}
 
-    def read(i: int, j: int) -> ir.Value:
-        return build.load(build.gep(given, [inside.whole_number(j)]))
+    def read(i: int, j: int) -> Any:
+        return own[j] if j in own else build.load(build.gep(given, [inside.whole_number(order[j])]))
 
     for i, value in enumerate(inside.write(routine.program, read)[0]):
         build.store(value, build.gep(found, [inside.whole_number(i)]))

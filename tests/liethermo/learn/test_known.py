@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from liethermo.learn import files, training
 
 from . import cases
 
@@ -83,6 +84,28 @@ def test_a_fitted_system_comes_back_from_its_file(tmp_path):
         lt.learn.load(path, lt.learn.Metriplectic(3, width=6, depth=1))
     with pytest.raises(lt.FileError, match="there is no file"):
         lt.learn.load(tmp_path / "none.npz", system)
+    with np.load(path) as file:
+        honest = dict(file)
+    for changed in (
+        {"leaf_0": honest["leaf_0"] + 1e-9},
+        {"leaf_0": honest["leaf_0"].astype(str)},
+        {"loss": np.zeros(0)},
+    ):
+        np.savez(tmp_path / "other.npz", **{**honest, **changed})
+        with pytest.raises(lt.FileError, match="not those that were written"):
+            lt.learn.load(tmp_path / "other.npz", system)
+    for changed, words in (
+        ({"leaf_0": np.nan * honest["leaf_0"]}, "not finite"),
+        ({"leaf_0": "text"}, "built otherwise"),
+    ):
+        said, arrays = training.read(path, files.FORMAT)
+        training.write(tmp_path / "other.npz", said, arrays | changed)  # by someone who knows the format
+        with pytest.raises(lt.FileError, match=words):
+            lt.learn.load(tmp_path / "other.npz", system)
+    said["training"].pop("seconds")
+    training.write(tmp_path / "other.npz", said, arrays)
+    with pytest.raises(lt.FileError, match="record of its fit"):
+        lt.learn.load(tmp_path / "other.npz", system)
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(lt.FileError, match="damaged"):
         lt.learn.load(path, system)

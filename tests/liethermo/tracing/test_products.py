@@ -10,6 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.tracing.calls import Product
+from liethermo.tracing.program import Routine
 from liethermo.tracing.scalarize import scalarize
 
 RANDOM = np.random.default_rng(0)
@@ -69,6 +70,59 @@ def test_a_quadratic_function_of_a_large_matrix_is_one():
     assert _program(lambda A, x: x @ A @ x, A, X).degree(1) == 2
     system = lt.MetriplecticSystem(None, lambda x: 0.5 * x @ jnp.asarray(A) @ x, dim=15)
     assert system.energy.is_quadratic
+
+
+@jax.jit
+def _network(W, x):
+    return jnp.sum(jnp.tanh(W.T @ jnp.tanh(W @ x)))
+
+
+def test_a_function_that_is_called_again_is_written_once():
+    """The gradient of a network at three places: two routines, of the way there and back, and the weights stay."""
+
+    def f(W, x):
+        gradient = jax.grad(lambda y: _network(W, y))
+        return gradient(gradient(x)) + gradient(jnp.zeros(15))
+
+    program = _program(f, W, X)
+    calls = [i for i in program.instructions if isinstance(i.op, Routine)]
+    assert len(calls) == 6
+    assert len({i.op for i in calls}) == 2
+    assert "tanh" not in {str(i.op) for i in program.instructions}
+    assert all(len(i.args) < W.size for i in calls)
+    np.testing.assert_allclose(program.evaluate(W, X)[0], f(W, X), rtol=1e-12, atol=1e-13)
+
+
+def test_a_routine_is_handed_what_loops_around_it_know():
+    def f(W, x):
+        return jax.lax.fori_loop(0, 300, lambda i, x: x + 0.01 * jax.grad(lambda y: _network(W, y))(x), x)
+
+    np.testing.assert_allclose(_program(f, W, X).evaluate(W, X)[0], f(W, X), rtol=1e-12)
+
+
+def test_truth_values_and_whole_numbers_are_handed_over():
+    @jax.jit
+    def kinked(W, x, n, on):
+        return jnp.where(on, jnp.sum(jax.nn.relu(W.T @ jax.nn.relu(W @ x))), 0.0) * n, n + 1, ~on
+
+    def f(W, x):
+        value = jax.grad(lambda y: kinked(W, y, 2, x[0] > 0.0)[0])(x)
+        _, n, off = kinked(W, x, jnp.asarray(x[1] > 0.0, int), x[2] > 5.0)
+        return jnp.where(off, value * n, 0.0)
+
+    program = _program(f, W, X)
+    assert any(isinstance(i.op, Routine) for i in program.instructions)
+    np.testing.assert_allclose(program.evaluate(W, X)[0], f(W, X), rtol=1e-12)
+
+
+def test_a_routine_has_the_degree_of_what_it_computes():
+    @jax.jit
+    def square(W, x):
+        return W.T @ (W @ x)
+
+    program = _program(lambda W, x: x @ square(W, x) + jnp.sum(square(W, x)), W, X)
+    assert any(isinstance(i.op, Routine) for i in program.instructions)
+    assert program.degree(1) == 2
 
 
 SLOW = pytest.param(lt.MetriplecticRungeKutta(4), marks=pytest.mark.slow)

@@ -1,0 +1,89 @@
+"""The descent of a fit: Adam, for matrices in the eigenvectors of what their gradients are like."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+MEMORY = 0.95
+"""The share of a mean of gradients, of their squares or of their products that is kept from step to step."""
+
+REFRESHED = 10
+"""Steps between two looks at the eigenvectors."""
+
+LARGEST = 256
+"""Rows or columns of a matrix that is turned: of more, eigenvectors cost more than they bring."""
+
+TINY = 1e-8
+"""What is added to the sizes of gradients, as in Adam."""
+
+
+def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
+    """An optimiser of optax for a vector: SOAP [Vyas et al. 2025].
+
+    The gradient of a matrix W of weights is turned into the eigenvectors of the means of ``G G^T`` and ``G^T G``. Adam
+    works there: the directions in which a layer is steep and flat are apart. All other numbers are left to Adam.
+
+    Parameters
+    ----------
+    shapes : sequence of tuple of int
+        Of the arrays that the vector begins with; what is behind them is one array more.
+    rate : function from the number of a step to a number
+    """
+    import optax
+
+    ends = list(itertools.accumulate(map(math.prod, shapes)))
+    matrices = [
+        (slice(end - math.prod(shape), end), shape)
+        for end, shape in zip(ends, shapes, strict=True)
+        if len(shape) == 2 and min(shape) > 1 and max(shape) <= LARGEST
+    ]
+
+    def init(vector):
+        zero = jnp.zeros_like(vector)
+        sides = [[(jnp.eye(n), jnp.zeros((n, n))) for n in shape] for _, shape in matrices]
+        return jnp.zeros((), int), zero, zero, sides
+
+    def update(slope, state, vector=None):
+        count, mean, square, sides = state
+        means = [[MEMORY * S + (1.0 - MEMORY) * P for (_, S), P in zip(pair, _products(slope[at].reshape(shape)),
+                  strict=True)] for (at, shape), pair in zip(matrices, sides, strict=True)]  # fmt: skip
+        turned, mean = _turned(slope, matrices, sides), MEMORY * mean + (1.0 - MEMORY) * slope
+        square = MEMORY * square + (1.0 - MEMORY) * turned**2
+        share = 1.0 - MEMORY ** (count + 1.0)
+        step = _turned(mean / share, matrices, sides) / (jnp.sqrt(square / share) + TINY)
+        step = _turned(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
+
+        def refreshed(_):
+            return [[_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, own, strict=True)]
+                    for pair, own in zip(sides, means, strict=True)]  # fmt: skip
+
+        def kept(_):
+            return [[Q for Q, _ in pair] for pair in sides]
+
+        turns = jax.lax.cond(count % REFRESHED == 0, refreshed, kept, None)
+        sides = [list(zip(*both, strict=True)) for both in zip(turns, means, strict=True)]
+        return -rate(count) * step, (count + 1, mean, square, sides)
+
+    return optax.GradientTransformation(init, update)
+
+
+def _products(G: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return G @ G.T, G.T @ G
+
+
+def _turned(vector: jax.Array, matrices: Sequence, sides: Sequence) -> jax.Array:
+    """``Q^T G R`` in place of each matrix G."""
+    for (at, shape), ((Q, _), (R, _)) in zip(matrices, sides, strict=True):
+        vector = vector.at[at].set((Q.T @ vector[at].reshape(shape) @ R).ravel())
+    return vector
+
+
+def _eigenvectors(count: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
+    """Those of S: at first, and then one step of orthogonal iteration from those so far."""
+    return jax.lax.cond(count == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])
