@@ -54,7 +54,7 @@ def write(results: Path, page: Path) -> None:
         raise ValueError(f"{results} holds no results; run the measurements first")
     reports = {result["name"]: Report.from_dict(result["report"]) for result in found}
     targets = [target for report in reports.values() for target in report.targets]
-    from .figures import beside, work_precision
+    from .figures import beside, magnet, work_precision
 
     beside(front.compare(reports), page.parent / "benchmarks.svg")
     first, *themes = front.sections(reports)
@@ -69,6 +69,9 @@ def write(results: Path, page: Path) -> None:
         if report.series:
             work_precision(report.series, figure := page.parent / f"{name}.svg")
             parts.append(f"![Time against error]({figure.name})")
+        if name == "magnet":
+            magnet(report.tables[0], page.parent / "magnet.svg")
+            parts.append("![Magnetisation, specific heat and Binder's cumulant against the temperature](magnet.svg)")
     _save(page.parent / f"{RUNS}.md", parts)
 
 

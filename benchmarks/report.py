@@ -135,6 +135,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {
     "number": lambda a: f"{a:.3g}",
     "count": lambda a: f"{a:,}",
     "error": lambda a: f"{a:.1e}",
+    "precise": lambda a: f"{a:.4f}",
     "gigabytes": lambda a: f"{a / 1e9:.2f} GB",
 }
 

@@ -15,7 +15,8 @@ from benchmarks import child, front, laws, native, page, reference, simulators
 from benchmarks.__main__ import RESULTS, main
 from benchmarks.contest import difference
 from benchmarks.laws import Laws
-from benchmarks.measurements import memory, spin, tumbling, variational
+from benchmarks.heat_bath import heat_bath
+from benchmarks.measurements import magnet, memory, spin, tumbling, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
@@ -93,6 +94,42 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
     assert "faster in 0 of 1 tasks" in sentence
     assert "1 of 1 runs of this library and in 0 of theirs" in laws
     assert front._compared(report, dataclasses.replace(pair, theirs="nobody")) is None
+
+
+def test_the_statistics_of_the_magnet():
+    """Autocorrelation and error of a process that is known; the weights of other states; two lattices that cross."""
+    random, rho, n = np.random.default_rng(0), 0.9, 60_000
+    x = random.standard_normal(n)
+    for i in range(1, n):
+        x[i] = rho * x[i - 1] + np.sqrt(1 - rho**2) * x[i]
+    time = magnet.autocorrelation(x)
+    assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.1
+    rows = np.column_stack([x, np.ones((n, 3))])
+    mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
+    assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
+    assert abs(mean) < 4 * error
+    # of states whose square magnetisation is 2 - E: at 1 / T = 1 + b it has the mean 2 + b
+    energy = random.standard_normal(n)
+    rows = np.column_stack([energy, np.sqrt(np.maximum(2.0 - energy, 0.0)), np.zeros((n, 2))])
+    weighed = magnet.cumulant(_series(rows), slice(None), temperature=1 / 1.1)
+    assert abs(weighed - (1.0 - (2.1**2 + 1.0) / (3 * 2.1**2))) < 2e-2
+    assert abs(weighed - magnet.cumulant(_series(rows), slice(None))) > 2e-3
+
+
+def _series(rows):
+    return magnet.Series("", 1, 1.0, len(rows), 1, rows)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("T", [10.0, 20.0])
+def test_monte_carlo_of_the_magnet_at_high_temperatures(T):
+    """The energy of a bond is Langevin's function of J / kT there, but for loops of four bonds."""
+    (rows,) = heat_bath(6, [T], 400)
+    energies = rows[:, 0].reshape(20, -1).mean(axis=1)
+    exact = -3.0 * (1.0 / np.tanh(1.0 / T) - T)
+    assert abs(energies.mean() - exact) < 4 * energies.std() / np.sqrt(19) + 4.0 / (3 * T) ** 3
+    assert abs(energies.mean()) > 10 * energies.std() / np.sqrt(19)
+    assert np.abs(np.linalg.norm(rows[:, 1:], axis=1)).max() < 0.3
 
 
 def test_the_driver_refuses_unknown_names(capsys):

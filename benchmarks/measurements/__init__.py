@@ -19,6 +19,7 @@ NAMES = (
     "bodies",
     "network",
     "lattice",
+    "magnet",
     "first_run",
     "memory",
     "studies",

@@ -29,12 +29,16 @@ class Factor(NamedTuple):
         Whether every column, at the gradients of the functions, is a field of divergence zero.
     velocity : function or None
         From w to sigma with ``B w = Pi(x) sigma``, where the construction is such: see :meth:`.Dissipation.velocity`.
+    turning : array or None
+        The numbers r, of shape () or (sites,), with ``B w = r_i w_i x s_i`` at every spin, where it is such and w has
+        three components for each: see :class:`.Fluctuating`.
     """
 
     size: int
     times: Callable[[jax.Array], jax.Array]
     solenoidal: bool = False
     velocity: Callable[[jax.Array], jax.Array] | None = None
+    turning: jax.Array | None = None
 
     def transposed(self, alpha) -> jax.Array:
         """``B^T alpha``, shape (size,)."""
@@ -44,7 +48,8 @@ class Factor(NamedTuple):
         """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
         scale = root(rate)
         velocity = None if (along := self.velocity) is None else lambda w: scale * along(w)
-        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity)
+        turning = None if self.turning is None else scale * self.turning
+        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity, turning=turning)
 
 
 def root_of(form) -> Any:

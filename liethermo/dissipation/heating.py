@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import root
 from ..functions.indices import Indices
+from ..functions.with_baths import temperature_slopes
 from .base import Carried, Dissipation, Several, There
 from .geometry import Geometry
 
@@ -69,7 +70,8 @@ class Heating(Carried):
 
         along = B.velocity
         velocity = None if along is None else lambda w: body.at_sites(scale, along(w))
-        return B._replace(times=times, velocity=velocity, solenoidal=False)
+        turning = None if B.turning is None else scale * B.turning
+        return B._replace(times=times, velocity=velocity, turning=turning, solenoidal=False)
 
     def divergence(self, system, x):
         """``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' the derivative of T by y: no matrix is formed."""
@@ -79,11 +81,13 @@ class Heating(Carried):
         assert B is not None
         if self.by_site and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
-        warmer = jax.jvp(system.energy.gradient, (x,), (jnp.zeros_like(x).at[n:].set(1.0),))[1]
-        T, slope = jnp.abs(self._of(dH[n:])), self._of(warmer[n:])
-        share = jnp.where(T > 0.0, 0.5 * slope / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        found = B.transposed(body.at_sites(share, dH[:n]))
-        return found if B.solenoidal else found + jnp.sqrt(T) * self.part.divergence(body, x[:n])
+        T = jnp.abs(self._of(dH[n:]))
+        own = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.part.divergence(body, x[:n])
+        warmer = temperature_slopes(system.energy, x, n)
+        if warmer is None:
+            return own
+        share = jnp.where(T > 0.0, 0.5 * self._of(warmer) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        return own + B.transposed(body.at_sites(share, dH[:n]))
 
     def there(self, system, x) -> There:
         return _of_body(system, x)

@@ -91,10 +91,11 @@ class LandauLifshitz(Dissipation):
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
-        s, rate = spins.spins(x), self.rate.reshape(-1)
+        s, scale = spins.spins(x), root(self.rate.reshape(-1))
 
         def times(w):
             pull = planes(w.reshape(spins.count, 3))
-            return spins.joined(scaled(root(rate), cross_planes(pull, s)), jnp.zeros(0))
+            return spins.joined(scaled(scale, cross_planes(pull, s)), jnp.zeros(0))
 
-        return Factor(3 * spins.count, times, solenoidal=True)  # as w x s is, of any w that does not depend on s
+        # solenoidal, as w x s is, of any w that does not depend on s
+        return Factor(3 * spins.count, times, solenoidal=True, turning=scale.reshape(self.rate.shape and (-1,)))

@@ -14,6 +14,7 @@ from .energy import Energy, Pullback
 from .frames import total
 from .indices import as_pattern
 from .path import Path
+from .warmth import Reservoir
 
 
 class WithBaths(Energy):
@@ -101,3 +102,16 @@ class WithBaths(Energy):
 
     def __neg__(self) -> Energy:
         return WithBaths(-self.body, -self.baths, self.size, self.dim)
+
+
+def temperature_slopes(energy: Energy, x, size: int) -> jax.Array | None:
+    """The derivative of each bath's temperature by its own entropy, shape (m,); None where temperatures are constant.
+
+    The baths are the components behind the first ``size``.
+    """
+    if not isinstance(energy, WithBaths):
+        return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[size:].set(1.0),))[1][size:]
+    if isinstance(energy.baths, Reservoir):
+        return None
+    y = x[size:]
+    return jax.jvp(energy.baths.gradient, (y,), (jnp.ones_like(y),))[1]

@@ -1,4 +1,4 @@
-"""Ideal magnetohydrodynamics on the sphere, with the Casimirs of its matrices [Modin & Roop 2024]."""
+"""Ideal magnetohydrodynamics on the sphere, with the Casimirs of its matrices [Modin & Roop 2025]."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def flow(
     """
     x, table = system.state(x0), Timetable(t_span, step, save_every)
     n, shown = system.dim, system
-    system, method = of_steps(system, DEFAULT_METHOD if method is None else method, attitude=attitude is not None)
+    system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
     x = jnp.asarray(begun(system, x, table.start, attitude))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])

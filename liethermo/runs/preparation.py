@@ -55,9 +55,10 @@ def as_run(
             raise InputError(f"{method} follows no attitude, and the torque {system.pushed_by} depends on it")
         return driven(system, unit=1.0), method  # its errors are measured component by component
     method = method if noise is None else noise.on(driven(system), method)
-    return of_steps(system, method, tolerance, attitude=True)
+    return of_steps(system, method, tolerance, True)
 
 
+@remembered
 def of_steps(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:

@@ -13,7 +13,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds.structures.poisson import Beside
-from manifolds.structures.spins import added, dotted, scaled
+from manifolds.structures.spins import added, cross_planes, dotted, planes, scaled
 
 from ..dissipation.base import Dissipation
 from ..dissipation.heating import Heating
@@ -103,6 +103,17 @@ class SpinSystem(System):
         spins = self._spins
         assert spins is not None
         return dotted(spins.covectors(alpha), spins.covectors(v))
+
+    def turned_back(self, angles, v) -> jax.Array:
+        """The u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3); behind them it is v.
+
+        ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
+        """
+        spins = self._spins
+        assert spins is not None
+        a, r = planes(angles), spins.covectors(v)
+        u = added(added(r, cross_planes(a, r)), scaled(dotted(a, r), a))
+        return spins.joined(scaled(1.0 / (1.0 + dotted(a, a)), u), v[self.body_dim :])
 
     def numbers(self, x, batch: bool = False):
         """A state in one row; also the spins alone, shape ``(*sites, 3)``."""

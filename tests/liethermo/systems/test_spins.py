@@ -371,3 +371,52 @@ def test_ratios_and_sites_of_the_structure_are_checked():
         mf.Spins(3, ratio=np.ones(2))
     assert mf.Spins((2, 3), 1).tensor(RANDOM.standard_normal(19)).shape == (19, 19)
     assert float(mf.Spins(2, 1, [1.0, 3.0]).jacobi_residual(RANDOM.standard_normal(7))) < 1e-14
+
+
+class Unsolved(lt.LandauLifshitz):
+    """Control: noise that does not say how it turns the spins."""
+
+    def factor(self, system, x, dH, dL):
+        return super().factor(system, x, dH, dL)._replace(turning=None)
+
+
+def test_what_noise_turns_a_step_solves_for_at_once():
+    """The same step, in a fraction of the iterations: without, the spin that is turned farthest decides."""
+    sites, bath = (4, 4, 4), lt.HeatBaths(np.inf, 1.4)
+    runs = []
+    for damping in (lt.LandauLifshitz(2.0), Unsolved(2.0)):
+        system = lt.SpinSystem(sites, lt.magnetism.exchange(sites, 1.0), damping, bath)
+        start = system.state(unit(*sites))
+        runs.append(lt.integrate(system, start, (0.0, 0.05), 0.01, noise=lt.Fluctuations(1.0, 3), engine="array"))
+    at_once, control = runs
+    assert np.abs(at_once.x - control.x).max() < 1e-13
+    assert np.ptp(at_once.x[:, 0]) > 0.05
+    assert at_once.stats.newton_iterations == 0
+    assert 2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
+    angles, v = RANDOM.standard_normal((64, 3)), RANDOM.standard_normal(system.dim)
+    u = np.asarray(system.turned_back(angles, v))
+    left = u[:-1] - np.cross(angles, u[:-1].reshape(-1, 3)).ravel()
+    assert np.abs(left - v[:-1]).max() < 1e-14
+    assert u[-1] == v[-1]
+
+
+FIELDS = np.array([0.5, 2.0, 5.0])
+
+
+@pytest.mark.parametrize("damping", [lt.LandauLifshitz, pytest.param(Unsolved, marks=pytest.mark.slow)])
+def test_free_spins_in_a_bath_have_langevins_magnetisation(damping):
+    """Within three standard errors, in steps of a fifth of the time that a spin forgets its direction in.
+
+    Control: noise that does not make up for what a midpoint step turns too little misses it.
+    """
+    sites, T = (30, 32, 3), 1.0
+    fields = np.zeros((*sites, 3))
+    fields[..., 2] = FIELDS
+    system = lt.SpinSystem(sites, lt.magnetism.zeeman(sites, fields), damping(1.0), lt.HeatBaths(np.inf, T))
+    start = system.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
+    run = lt.integrate(system, start, (0.0, 12.0), 0.1, noise=lt.Fluctuations(1.0, 5), save_every=2, engine="array")
+    assert np.ptp(run.energy) < 1e-12 * np.abs(run.energy).max()
+    mean = np.asarray(system.spins(run.x))[run.t > 4.0, ..., 2].mean(axis=0).reshape(-1, 3)
+    off = mean.mean(axis=0) - (1.0 / np.tanh(FIELDS / T) - T / FIELDS)
+    off /= mean.std(axis=0) / np.sqrt(len(mean))
+    assert (np.abs(off).max() < 3.0) == (damping is lt.LandauLifshitz), off
