@@ -14,8 +14,8 @@ import pytest
 from benchmarks import child, front, laws, native, page, reference, simulators
 from benchmarks.__main__ import RESULTS, main
 from benchmarks.contest import difference
-from benchmarks.laws import Laws
 from benchmarks.heat_bath import heat_bath
+from benchmarks.laws import Laws
 from benchmarks.measurements import magnet, memory, spin, tumbling, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
