@@ -97,7 +97,7 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
 
 
 def test_the_statistics_of_the_magnet():
-    """Autocorrelation and error of a process that is known; the weights of other states; two lattices that cross."""
+    """Autocorrelation and error of a process that is known; where two lattices cross."""
     random, rho, n = np.random.default_rng(0), 0.9, 60_000
     x = random.standard_normal(n)
     for i in range(1, n):
@@ -108,12 +108,11 @@ def test_the_statistics_of_the_magnet():
     mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
-    # of states whose square magnetisation is 2 - E: at 1 / T = 1 + b it has the mean 2 + b
-    energy = random.standard_normal(n)
-    rows = np.column_stack([energy, np.sqrt(np.maximum(2.0 - energy, 0.0)), np.zeros((n, 2))])
-    weighed = magnet.cumulant(_series(rows), slice(None), temperature=1 / 1.1)
-    assert abs(weighed - (1.0 - (2.1**2 + 1.0) / (3 * 2.1**2))) < 2e-2
-    assert abs(weighed - magnet.cumulant(_series(rows), slice(None))) > 2e-3
+    small, large = [(0.65, 0.001), (0.62, 0.001), (0.58, 0.001)], [(0.66, 0.001), (0.622, 0.001), (0.5, 0.001)]
+    T, error = magnet.crossing((1.3, 1.4, 1.5), small, large)
+    assert abs(T - (1.4 + 0.1 * 0.002 / 0.082)) < 1e-12
+    assert 0.5 < error / (0.1 * 0.001 * np.sqrt(2) / 0.082) < 2.0
+    assert np.isnan(magnet.crossing((1.3, 1.4, 1.5), large, [(0.7, 0.0)] * 3)[0])
 
 
 def _series(rows):

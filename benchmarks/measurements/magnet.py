@@ -6,7 +6,6 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 import liethermo as lt
 
@@ -29,8 +28,8 @@ AWAY, SHARE = (1.30, 1.37, 1.50, 1.60), 0.1
 
 PORTION, EVERY, SWEEPS = 2000, 20, {8: 6000, 12: 2500, 16: 1200}
 
-NEAR = (1.38, 1.50)
-"""Temperatures between which the crossings are looked for."""
+NEAR = (1.37, CRITICAL, 1.50)
+"""Temperatures between which cumulants are taken to be straight, to find where they cross."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +87,10 @@ def specific_heat(series: Series, chosen) -> float:
     return float(series.energy[chosen].var() * series.length**3 / series.temperature**2)
 
 
-def cumulant(series: Series, chosen, temperature: float | None = None) -> float:
-    """``1 - <m^4> / 3 <m^2>^2``; at another temperature by the weights of the states there [Ferrenberg & Swendsen]."""
-    energy, square = series.energy[chosen] * series.length**3, series.square[chosen]
-    other = 0.0 if temperature is None else 1.0 / temperature - 1.0 / series.temperature
-    weights = np.exp(-other * (energy - energy.mean()))
-    return 1.0 - np.average(square**2, weights=weights) / (3.0 * np.average(square, weights=weights) ** 2)
+def cumulant(series: Series, chosen) -> float:
+    """``1 - <m^4> / 3 <m^2>^2``."""
+    square = series.square[chosen]
+    return float(1.0 - (square**2).mean() / (3.0 * square.mean() ** 2))
 
 
 def with_error(quantity, series: Series) -> tuple[float, float]:
@@ -103,22 +100,24 @@ def with_error(quantity, series: Series) -> tuple[float, float]:
     return quantity(series, everything), float(np.sqrt((len(blocks) - 1) * np.var(left)))
 
 
-def crossing(small: Series, large: Series) -> tuple[float, float]:
-    """The temperature at which the cumulants of two lattices are equal, and its standard error."""
+def crossing(temperatures, small, large, draws: int = 2000) -> tuple[float, float]:
+    """Where the cumulants of two lattices are equal, on straight lines between temperatures, and its standard error.
+
+    ``small`` and ``large`` have a cumulant and its error for each temperature; the error of the crossing is found by
+    drawing from these. NaN where the lines do not cross.
+    """
+    (of_small, of_large), random = np.swapaxes([small, large], 1, 2), np.random.default_rng(0)
 
     def at(a, b) -> float:
-        return brentq(lambda T: cumulant(small, a, T) - cumulant(large, b, T), *NEAR)
+        off = np.asarray(a) - np.asarray(b)
+        changes = np.flatnonzero((off[:-1] < 0.0) & (off[1:] >= 0.0))
+        if not len(changes):
+            return np.nan
+        i = changes[-1]
+        return temperatures[i] - off[i] * (temperatures[i + 1] - temperatures[i]) / (off[i + 1] - off[i])
 
-    whole = [np.arange(len(series.rows)) for series in (small, large)]
-    variance = 0.0
-    for i, series in enumerate((small, large)):
-        blocks, found = series.blocks(), []
-        for block in blocks:
-            chosen = list(whole)
-            chosen[i] = np.delete(whole[i], block)
-            found.append(at(*chosen))
-        variance += (len(blocks) - 1) * np.var(found)
-    return at(*whole), float(np.sqrt(variance))
+    drawn = [at(*(random.normal(*values) for values in (of_small, of_large))) for _ in range(draws)]
+    return at(of_small[0], of_large[0]), float(np.nanstd(drawn))
 
 
 def by_noise(length: int, temperature: float, steps: int, seed: int) -> Series:
@@ -150,8 +149,7 @@ def run(quick: bool) -> Report:
     sizes = {4: 400, 6: 400} if quick else SIZES
     for seed, (length, steps) in enumerate(sizes.items(), start=21):
         found.append(by_noise(length, CRITICAL, steps, seed))
-        if length >= 8:
-            found += [by_noise(length, T, int(SHARE * steps), 10 * seed + i) for i, T in enumerate(AWAY)]
+        found += [by_noise(length, T, int(SHARE * steps), 10 * seed + i) for i, T in enumerate(AWAY)]
     temperatures = sorted([CRITICAL, *AWAY])
     for length, sweeps in ({4: 200} if quick else SWEEPS).items():
         chains = heat_bath(length, temperatures, sweeps)
@@ -161,13 +159,13 @@ def run(quick: bool) -> Report:
 
 def report(found: list[Series]) -> Report:
     """The table of all runs, and the crossings of those at the transition."""
-    rows, lattices = [], {}
+    rows, cumulants = [], {}
     for series in sorted((series.settled() for series in found), key=lambda s: (s.by, s.length, s.temperature)):
         quantities = [with_error(f, series) for f in (magnetisation, specific_heat, cumulant)]
         times = series.autocorrelation * series.between
         rows.append([series.by, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())])
-        if series.by == NOISE and series.temperature == CRITICAL:
-            lattices[series.length] = series
+        if series.by == NOISE:
+            cumulants[series.length, series.temperature] = quantities[2]
     columns = {"By": "text", "Edge": "count", "kT / J": "text", "Steps or sweeps": "count", "Autocorrelation": "number"}
     for name in ("m", "c", "U"):
         columns |= {name: "precise", f"± of {name}": "error"}
@@ -175,10 +173,10 @@ def report(found: list[Series]) -> Report:
         "Magnetisation m and specific heat c of a spin, Binder's cumulant U, with a standard error each; steps of "
         f"{STEP} with the rate {RATE:g}. The autocorrelation of m² is in steps, or sweeps."
     )
+    lengths = [n for n in sorted({length for length, _ in cumulants}) if all((n, T) in cumulants for T in NEAR)]
     crossings = [
-        [f"{a}³ and {b}³", *crossing(lattices[a], lattices[b])]
-        for a, b in itertools.combinations(sorted(lattices), 2)
-        if b >= 2 * a or b > 12
+        [f"{a}³ and {b}³", *crossing(NEAR, *([cumulants[n, T] for T in NEAR] for n in (a, b)))]
+        for a, b in itertools.combinations(lengths, 2)
     ]
     crossed = Table(
         "Where Binder's cumulants of two lattices are equal.",
@@ -189,7 +187,8 @@ def report(found: list[Series]) -> Report:
         "The classical Heisenberg magnet on a simple cubic lattice, `lt.models.spin_lattice` in a bath of constant "
         "temperature, beside a heat bath with over-relaxation (Monte Carlo, in NumPy). Errors are those of blocks of "
         f"at least eight autocorrelation times. The transition is at kT = {CRITICAL} J, where U = {UNIVERSAL} of "
-        "large cubes (Holm and Janke 1993). Cumulants near it follow from those at it by the weights of the states."
+        "large cubes (Holm and Janke 1993). Between the runs next to it cumulants are taken to be straight lines, and "
+        "the error of a crossing is found by drawing from theirs."
     )
     best = min(crossings, key=lambda c: c[2], default=None)
     distance = None if best is None else abs(best[1] / CRITICAL - 1.0)
