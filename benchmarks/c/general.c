@@ -9,7 +9,6 @@
 
 #include <math.h>
 
-#include "gonzalez.h"
 #include "rules.h"
 
 #define N 3
@@ -18,10 +17,6 @@ typedef struct {
     double inverse_inertia[N];
     double rate, stiffness;
 } Problem;
-
-typedef struct {
-    double energy, size;
-} Start;
 
 static inline double dot(const double u[N], const double v[N]) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
 
@@ -41,16 +36,8 @@ static inline void energy_gradient(const Problem *p, const double x[N], double o
         out[i] = x[i] * (p->inverse_inertia[i] + p->stiffness * x[i] * x[i]);
 }
 
-static inline Start start(const Problem *p, const double x[N])
-{
-    return (Start){.energy = energy_of(p, x), .size = sqrt(dot(x, x))};
-}
-
-static inline void at(const double x[N], const double low[N], double c, const double d[N], double out[N])
-{
-    EACH(i)
-        out[i] = x[i] + (low[i] + c * d[i]);
-}
+#define DERIVATIVES energy_gradient
+#include "predicted.h"
 
 #ifdef TEXTBOOK
 
@@ -65,41 +52,6 @@ static inline void discrete_gradient(const Problem *p, const Start *s, const dou
     const double factor = square > TINY ? (energy_of(p, end) - s->energy - dot(out, d)) / square : 0.0;
     EACH(i)
         out[i] += factor * d[i];
-}
-
-#else
-
-static inline void discrete_gradient(const Problem *p, const Start *s, const double x[N], const double low[N],
-                                     const double d[N], double out[N])
-{
-    double point[N], left[N], middle[N], right[N];
-    at(x, low, NODE, d, point);
-    energy_gradient(p, point, left);
-    at(x, low, 0.5, d, point);
-    energy_gradient(p, point, middle);
-    at(x, low, 1.0 - NODE, d, point);
-    energy_gradient(p, point, right);
-    at(x, low, 1.0, d, point);
-    const double end = energy_of(p, point);
-
-    double second = 0.0, left_out = 0.0; /* what the values at x and at the end leave out */
-    EACH(i) {
-        const double back = point[i] - x[i], whole = low[i] + d[i];
-        left_out += middle[i] * ((x[i] - (point[i] - back)) + (whole - back) - low[i]);
-        second += (left[i] + right[i] - 2.0 * middle[i]) * d[i];
-    }
-    const double square = dot(d, d), slope = sqrt(dot(middle, middle));
-    double defect = (end - s->energy) + left_out - (dot(middle, d) + (5.0 / 18.0) * second);
-    double opened = gate(second, CURVATURE_SWITCH * slope * sqrt(square));
-    if (opened < 1.0) {
-        const double noise = DIFFERENCE_NOISE * (fabs(s->energy) + fabs(end)) + 4.0 * EPS * slope * s->size;
-        const double by_size = gate(defect, noise);
-        opened = by_size > opened ? by_size : opened;
-    }
-    defect *= opened;
-    const double factor = square > TINY ? ((5.0 / 18.0) * second + defect) / square : 0.0;
-    EACH(i)
-        out[i] = middle[i] + factor * d[i];
 }
 
 #endif

@@ -3,42 +3,14 @@
        H = -a (s_3^2/2 + s_3^4/4) - b . s + exp(S),   s' = s x dH + K dS,   K(dS) = rate (|dH|^2 dS - (dH . dS) dH),
 
    by the midpoint scheme in the space around the sphere: every sphere is an invariant of it, and the end of a step is
-   brought back by what rounding has moved it. Gonzalez's gradient is that of general.c. */
+   brought back by what rounding has moved it. Gonzalez's gradient is that of predicted.h. */
 
-#include <math.h>
-
-#include "gonzalez.h"
+#include "axis_spin.h"
 #include "rules.h"
 
-#define N 4
 #define OWN_MOVE
-
-typedef struct {
-    double axis, field[3], rate;
-} Problem;
-
-typedef struct {
-    double energy, size;
-} Start;
-
-#define SPIN(i) _Pragma("GCC unroll 3") for (int i = 0; i < 3; i++)
-
-static inline double dot3(const double u[N], const double v[N]) { return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]; }
-static inline double dot(const double u[N], const double v[N]) { return dot3(u, v) + u[3] * v[3]; }
-
-static inline double energy_of(const Problem *p, const double x[N])
-{
-    const double square = x[2] * x[2];
-    return exp(x[3]) - p->axis * square * (0.5 + 0.25 * square) - dot3(p->field, x);
-}
-
-static inline void derivatives(const Problem *p, const double x[N], double out[N])
-{
-    SPIN(i)
-        out[i] = -p->field[i];
-    out[2] -= p->axis * x[2] * (1.0 + x[2] * x[2]);
-    out[3] = exp(x[3]);
-}
+#define DERIVATIVES derivatives
+#include "predicted.h"
 
 /* What of the derivatives is along the spheres. */
 static inline void energy_gradient(const Problem *p, const double x[N], double out[N])
@@ -47,50 +19,6 @@ static inline void energy_gradient(const Problem *p, const double x[N], double o
     const double off = dot3(x, out) / dot3(x, x);
     SPIN(i)
         out[i] -= off * x[i];
-}
-
-static inline Start start(const Problem *p, const double x[N])
-{
-    return (Start){.energy = energy_of(p, x), .size = sqrt(dot(x, x))};
-}
-
-static inline void at(const double x[N], const double low[N], double c, const double d[N], double out[N])
-{
-    EACH(i)
-        out[i] = x[i] + (low[i] + c * d[i]);
-}
-
-static inline void discrete_gradient(const Problem *p, const Start *s, const double x[N], const double low[N],
-                                     const double d[N], double out[N])
-{
-    double point[N], left[N], middle[N], right[N];
-    at(x, low, NODE, d, point);
-    derivatives(p, point, left);
-    at(x, low, 0.5, d, point);
-    derivatives(p, point, middle);
-    at(x, low, 1.0 - NODE, d, point);
-    derivatives(p, point, right);
-    at(x, low, 1.0, d, point);
-    const double end = energy_of(p, point);
-
-    double second = 0.0, left_out = 0.0; /* what the values at x and at the end leave out */
-    EACH(i) {
-        const double back = point[i] - x[i], whole = low[i] + d[i];
-        left_out += middle[i] * ((x[i] - (point[i] - back)) + (whole - back) - low[i]);
-        second += (left[i] + right[i] - 2.0 * middle[i]) * d[i];
-    }
-    const double square = dot(d, d), slope = sqrt(dot(middle, middle));
-    double defect = (end - s->energy) + left_out - (dot(middle, d) + (5.0 / 18.0) * second);
-    double opened = gate(second, CURVATURE_SWITCH * slope * sqrt(square));
-    if (opened < 1.0) {
-        const double noise = DIFFERENCE_NOISE * (fabs(s->energy) + fabs(end)) + 4.0 * EPS * slope * s->size;
-        const double by_size = gate(defect, noise);
-        opened = by_size > opened ? by_size : opened;
-    }
-    defect *= opened;
-    const double factor = square > TINY ? ((5.0 / 18.0) * second + defect) / square : 0.0;
-    EACH(i)
-        out[i] = middle[i] + factor * d[i];
 }
 
 static inline void slopes(const Problem *p, const Start *s, const double x[N], const double low[N], double h,
