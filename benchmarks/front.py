@@ -110,7 +110,7 @@ THEMES: dict[str, list[Pair]] = {
 }
 """Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
 
-COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body")
+COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body", "large", "magnet")
 """Measurements without another program: their targets that are no ratios are a table of their own."""
 
 NOTES = {"The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."}

@@ -19,6 +19,7 @@ NAMES = (
     "bodies",
     "network",
     "lattice",
+    "large",
     "magnet",
     "first_run",
     "memory",
