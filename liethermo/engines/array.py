@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -145,8 +147,13 @@ def _ends(system: System, method: OneStepMethod, x, h, rules: Rules):
 
 
 def rows(noise) -> jax.Array | None:
-    """Increments, shape (..., steps, increments), with as many steps as a power of two: few shapes, few programs."""
+    """Increments, shape (..., steps, increments), with as many steps as a power of two: few shapes, few programs.
+
+    Short calls share one program: as many steps as :data:`KEPT_NUMBERS` increments are for cost nothing.
+    """
     if noise is None:
         return None
-    missing = (1 << max(0, noise.shape[-2] - 1).bit_length()) - noise.shape[-2]
+    *members, steps, increments = noise.shape
+    short = KEPT_NUMBERS // max(1, math.prod(members) * increments)
+    missing = (1 << max(0, max(steps, short) - 1).bit_length()) - steps
     return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, missing), (0, 0)]))
