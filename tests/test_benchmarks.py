@@ -103,7 +103,7 @@ def test_the_statistics_of_the_magnet():
     for i in range(1, n):
         x[i] = rho * x[i - 1] + np.sqrt(1 - rho**2) * x[i]
     time = magnet.autocorrelation(x)
-    assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.1
+    assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, np.ones((n, 3))])
     mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
