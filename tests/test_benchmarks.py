@@ -104,7 +104,7 @@ def test_the_statistics_of_the_magnet():
         x[i] = rho * x[i - 1] + np.sqrt(1 - rho**2) * x[i]
     time = magnet.autocorrelation(x)
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
-    rows = np.column_stack([x, np.ones((n, 3))])
+    rows = np.column_stack([x, x, np.zeros((n, 2))])
     mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
