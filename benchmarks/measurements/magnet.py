@@ -117,7 +117,8 @@ def crossing(temperatures, small, large, draws: int = 2000) -> tuple[float, floa
         return temperatures[i] - off[i] * (temperatures[i + 1] - temperatures[i]) / (off[i + 1] - off[i])
 
     drawn = [at(*(random.normal(*values) for values in (of_small, of_large))) for _ in range(draws)]
-    return at(of_small[0], of_large[0]), float(np.nanstd(drawn))
+    found = np.array(drawn)[np.isfinite(drawn)]
+    return at(of_small[0], of_large[0]), float(found.std()) if len(found) else np.nan
 
 
 def by_noise(length: int, temperature: float, steps: int, seed: int) -> Series:
