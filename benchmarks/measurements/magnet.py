@@ -20,7 +20,7 @@ UNIVERSAL = 0.6217
 
 RATE, STEP = 2.0, 0.025
 
-SIZES = {6: 50_000, 8: 60_000, 12: 40_000, 16: 50_000}
+SIZES = {6: 50_000, 8: 100_000, 12: 64_000, 16: 70_000}
 """Steps at the transition, by the number of sites along an edge."""
 
 AWAY = {1.30: 0.1, 1.37: 0.1, 1.50: 0.5, 1.60: 0.1}
