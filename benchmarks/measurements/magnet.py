@@ -176,10 +176,10 @@ def report(found: list[Series]) -> Report:
         f"{STEP} with the rate {RATE:g}. The autocorrelation of m² is in steps, or sweeps."
     )
     lengths = [n for n in sorted({length for length, _ in cumulants}) if all((n, T) in cumulants for T in NEAR)]
-    crossings = [
-        [f"{a}³ and {b}³", *crossing(NEAR, *([cumulants[n, T] for T in NEAR] for n in (a, b)))]
-        for a, b in itertools.combinations(lengths, 2)
-    ]
+    crossings: list[tuple[str, float, float]] = []
+    for a, b in itertools.combinations(lengths, 2):
+        small, large = ([cumulants[n, T] for T in NEAR] for n in (a, b))
+        crossings.append((f"{a}³ and {b}³", *crossing(NEAR, small, large)))
     crossed = Table(
         "Where Binder's cumulants of two lattices are equal.",
         {"Lattices": "text", "kT / J": "precise", "±": "error", "From the transition": "number"},
