@@ -78,11 +78,11 @@ from .structures.contact import (
     ContactForm,
     ContactStructure,
     Cosymplectic,
-    ExtendedPhaseSpace,
     LagrangianContact,
     SplitContact,
 )
 from .structures.density import DensityMatrices
+from .structures.extended import ExtendedPhaseSpace
 from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
 from .structures.spins import Spins
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
-from manifolds.structures.contact import Places
+from manifolds.structures.extended import Places
 
 from ..functions.edges import Edges
 from ..functions.indices import Indices, as_pattern, cliques

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._module import Module
+from manifolds.algebras._null_space import row_echelon
 
 from .base import Dissipation
 from .factor import Factor
@@ -91,18 +92,9 @@ class MatterExchange(Dissipation):
 
 
 def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:
-    """Combinations of particle numbers that no process changes, shape (combinations, count): reduced by elimination."""
+    """Combinations of particle numbers that no process changes, shape (combinations, count), reduced by rows."""
     rows = np.array([e.stoichiometry for e in processes]).reshape(-1, count)
     _, singular, basis = np.linalg.svd(rows, full_matrices=True)
-    kernel = basis[int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum()) :]
-    place = 0
-    for row in range(len(kernel)):
-        while place < count and np.abs(kernel[row:, place]).max() < 1e-9:
-            place += 1
-        best = row + int(np.abs(kernel[row:, place]).argmax())
-        kernel[[row, best]] = kernel[[best, row]]
-        kernel[row] /= kernel[row, place]
-        others = np.arange(len(kernel)) != row
-        kernel[others] -= np.outer(kernel[others, place], kernel[row])
-        place += 1
+    rank = int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum())
+    kernel, _ = row_echelon(basis[rank:], tolerance=1e-9)
     return np.where(np.abs(kernel) < 1e-12, 0.0, kernel)

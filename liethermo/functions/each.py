@@ -14,7 +14,7 @@ from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import settled
 from .checks import check_scalar, recognised
-from .energy import Energy, Function
+from .energy import Energy, Function, real
 from .indices import Indices, cliques
 from .path import Path
 
@@ -81,9 +81,9 @@ class Each(Energy):
         return jnp.sum(jax.vmap(lambda y, *a: self._at(a).value(y))(self._gathered(x), *self.parameters))
 
     def gradient(self, x) -> jax.Array:
-        return self._spread(
-            jax.vmap(lambda y, *a: self._at(a).gradient(y))(self._gathered(x), *self.parameters), x.shape[0]
-        )
+        x = real(x)
+        found = jax.vmap(lambda y, *a: self._at(a).gradient(y))(self._gathered(x), *self.parameters)
+        return self._spread(found, x.shape[0])
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         def one(y, step, kept, *a):

@@ -44,7 +44,7 @@ class Energy(Module):
 
     def gradient(self, x) -> jax.Array:
         """The gradient at one state, shape (n,)."""
-        return jax.grad(self.value)(x)
+        return jax.grad(self.value)(real(x))
 
     def sensitivity(self, x) -> jax.Array:
         """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.
@@ -157,6 +157,11 @@ class Energy(Module):
         return -self + other
 
 
+def real(x) -> jax.Array:
+    """A state that may be given as a list, or in integers."""
+    return jnp.asarray(x, dtype=jnp.float64)
+
+
 class Quadratic(Energy):
     """``x @ A @ x / 2 + b @ x + c``.
 
@@ -209,7 +214,8 @@ class Quadratic(Energy):
         return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
 
     def gradient(self, x) -> jax.Array:
-        return self.linear_part(x) if self.b is None else self.linear_part(x) + self.b
+        along = self.linear_part(real(x))
+        return along if self.b is None else along + self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
@@ -362,7 +368,7 @@ class Pullback(Energy):
         return self.term.value(self.coordinates(x))
 
     def gradient(self, x) -> jax.Array:
-        y, back = jax.vjp(self.coordinates, x)
+        y, back = jax.vjp(self.coordinates, real(x))
         return back(self.term.gradient(y))[0]  # in its own way, where it has one
 
     def sensitivity(self, x) -> jax.Array:

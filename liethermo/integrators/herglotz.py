@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..errors import InputError
 from ..functions.energy import Energy, as_energy
-from ..systems import EvolutionSystem, System
-from .base import ONE_SIZE, OneStepMethod
+from ..functions.surface import OnLevels
+from ..systems import EmbeddedSystem, EvolutionSystem, System
+from .base import ONE_SIZE, OneStepMethod, moved
 
 _OUTER = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _PROPORTIONS = {2: (1.0,), 4: (_OUTER, _OUTER, 1.0 - 4.0 * _OUTER, _OUTER, _OUTER)}
@@ -48,9 +50,13 @@ class DiscreteHerglotz(OneStepMethod):
     is a variational integrator. One equation of the size of q a part, solved by Newton's method; explicit where L_d is
     quadratic in q_2.
 
+    On a manifold Q of an evolution system with ``space=`` the equations hold along Q, and q_2 is a point of it to
+    rounding. L_d is then a function of two arrays of the shape of Q; :meth:`midpoint` looks at the middle of their
+    chord, so its Lagrangian has to be defined near Q too.
+
     Parameters
     ----------
-    discrete_lagrangian : function of (q_0, q_1, S_0, h), q of shape (n,), to a scalar
+    discrete_lagrangian : function of (q_0, q_1, S_0, h), q of shape (n,) or of a space, to a scalar
         The action of a step, such as ``h L``; :meth:`midpoint` makes one from a Lagrangian.
     order : {1, 2, 4}
         Orders 2 and 4 need the action of a step of size -h too.
@@ -99,7 +105,7 @@ class DiscreteHerglotz(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the state is a (q, p, S)."""
-        if not isinstance(system, EvolutionSystem):
+        if not isinstance(_on_manifold(system), EvolutionSystem):
             raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
 
     def weights(self, theta) -> np.ndarray:
@@ -110,9 +116,12 @@ class DiscreteHerglotz(OneStepMethod):
         return np.array([share for share, _ in PARTS[self.composed]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        y, found, n = x + compensation, [], len(x) // 2
+        system = _on_manifold(system)
+        assert isinstance(system, EvolutionSystem)
+        space, y, found, n = system.configurations, x + compensation, [], len(x) // 2
+        action = self.discrete_lagrangian if space is None else _OfPoints(self.discrete_lagrangian, space)
         for (share, forward), guess in zip(PARTS[self.composed], k, strict=True):
-            slope = (self._forward if forward else self._backward)(y, share * h, guess[:n])
+            slope = (_forward if forward else _backward)(action, system.contact, y, share * h, guess[:n])
             found.append(slope)
             y = y + (share * h) * slope
         return jnp.stack(found)
@@ -120,40 +129,71 @@ class DiscreteHerglotz(OneStepMethod):
     def increment(self, h, k) -> jax.Array:
         return h * (self._shares @ k)
 
-    def _forward(self, y, h, guess) -> jax.Array:
-        """The slope of a step of (40) and (41), after one step of Newton's method for its velocity."""
-        n = len(guess)
-        q, p, S = y[:n], y[n : 2 * n], y[2 * n]
-
-        def misfit(q1):
-            by_q, by_S = jax.grad(self.discrete_lagrangian, argnums=(0, 2))(q, q1, S, h)
-            return by_q + (1.0 + by_S) * p
-
-        velocity = _improved(misfit, q, h, guess)
-        p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q, q + h * velocity, S, h)
-        return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
-
-    def _backward(self, y, h, guess) -> jax.Array:
-        """The same of the adjoint."""
-        n = len(guess)
-        q, p, S = y[:n], y[n : 2 * n], y[2 * n]
-
-        def end(q1):
-            return q1, q, S + jnp.dot(q1 - q, p), -h
-
-        velocity = _improved(lambda q1: jax.grad(self.discrete_lagrangian, argnums=1)(*end(q1)) - p, q, h, guess)
-        by_q, by_S = jax.grad(self.discrete_lagrangian, argnums=(0, 2))(*end(q + h * velocity))
-        return jnp.concatenate([velocity, (-by_q / (1.0 + by_S) - p) / h, jnp.dot(velocity, p)[None]])
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
+        return moved(self, system, x, compensation, self.increment(h, k), settles=True)
 
 
-def _improved(misfit: Callable, q, h, velocity) -> jax.Array:
-    """A velocity after one step of Newton's method for ``misfit(q + h velocity) = 0``."""
+def _forward(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
+    """The slope of a step of (40) and (41), after one step of Newton's method for its velocity."""
+    n = len(guess)
+    q, p, S = y[:n], y[n : 2 * n], y[2 * n]
+
+    def misfit(q1):
+        by_q, by_S = jax.grad(action, argnums=(0, 2))(q, q1, S, h)
+        return by_q + (1.0 + by_S) * p
+
+    velocity = _improved(misfit, on, q, h, guess)
     q1 = q + h * velocity
-    return velocity - solve(h * jax.jacfwd(misfit)(q1), misfit(q1)[:, None])[:, 0]
+    p1 = on.along(q1, jax.grad(action, argnums=1)(q, q1, S, h))
+    return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
+
+
+def _backward(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
+    """The same of the adjoint."""
+    n = len(guess)
+    q, p, S = y[:n], y[n : 2 * n], y[2 * n]
+
+    def end(q1):
+        return q1, q, S + jnp.dot(q1 - q, p), -h
+
+    velocity = _improved(lambda q1: jax.grad(action, argnums=1)(*end(q1)) - p, on, q, h, guess)
+    q1 = q + h * velocity
+    by_q, by_S = jax.grad(action, argnums=(0, 2))(*end(q1))
+    p1 = on.along(q1, -by_q / (1.0 + by_S))
+    return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p)[None]])
+
+
+def _improved(misfit: Callable, on: mf.SplitContact, q, h, velocity) -> jax.Array:
+    """A velocity after one step of Newton's method for ``misfit(q + h velocity) = 0``, on a manifold along it."""
+    A, missed = h * jax.jacfwd(misfit)(q + h * velocity), misfit(q + h * velocity)
+    if isinstance(on.bundle, mf.TangentBundle):
+        surface, mass = OnLevels(on.bundle.base, tangent=True), jnp.max(jnp.abs(A))
+
+        def off(v):  # how far its end is off Q, as a momentum
+            return mass * surface._moved(q, surface._change(q, 0.0, h * v) / h)
+
+        A = jax.vmap(lambda column: on.along(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(off)(velocity)
+        missed = on.along(q, missed) + off(velocity)
+    return velocity - solve(A, missed[:, None])[:, 0]
+
+
+def _on_manifold(system: System) -> System:
+    return system.manifold if isinstance(system, EmbeddedSystem) else system
+
+
+class _OfPoints(Module):
+    """An action of two points of a space, as one of their numbers in a row."""
+
+    action: Callable
+    space: mf.Space = eqx.field(static=True)
+
+    def __call__(self, q0, q1, S0, h):
+        return self.action(self.space.from_vector(q0), self.space.from_vector(q1), S0, h)
 
 
 class _Midpoint(Module):
     lagrangian: Energy
 
     def __call__(self, q0, q1, S0, h):
-        return h * self.lagrangian.value(jnp.concatenate([0.5 * (q0 + q1), (q1 - q0) / h, jnp.reshape(S0, 1)]))
+        middle, velocity = 0.5 * (q0 + q1), (q1 - q0) / h
+        return h * self.lagrangian.value(jnp.concatenate([middle.ravel(), velocity.ravel(), jnp.reshape(S0, 1)]))

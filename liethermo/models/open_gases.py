@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from manifolds._module import Module
 
+from ..functions.conditions import require
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Membrane, Reaction, Subsystem
@@ -116,17 +118,31 @@ def porous_piston(
 
 
 def porous_piston_state(
-    left: tuple[float, float], right: tuple[float, float], q: float = 1.0, T: float = 1.0
+    left: tuple[float, float], right: tuple[float, float], q: float = 1.0, T: float = 1.0, **parameters
 ) -> np.ndarray:
-    """The state of the default piston at rest at q, at the temperature T itself.
+    """The state of a porous piston at rest at q, at the temperature T itself.
 
     Parameters
     ----------
     left, right : (particles, temperature)
+    q : float
+        Between 0 and the length.
+    T : float, > 0
+    **parameters
+        Those of :func:`porous_piston` that are not its defaults.
     """
-    gas = IdealMixture(jnp.array([1.5]), jnp.zeros(1), jnp.zeros(1))
-    S = [float(gas.entropy_at(t, jnp.array([n]), V)) for (n, t), V in ((left, q), (right, 2.0 - q))]
-    return np.array([S[0], left[0], q, 0.0, np.log(T), S[1], right[0]])
+    given = inspect.signature(porous_piston).bind(**parameters)
+    given.apply_defaults()
+    area, length, capacity, heat_capacity = (
+        given.arguments[name] for name in ("area", "length", "capacity", "heat_capacity")
+    )
+    require(q, lambda q: 0.0 < q < length, f"the piston is between 0 and {length:g}, not at {{value:g}}")
+    gas = IdealMixture(positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
+    S = [
+        float(gas.entropy_at(positive(t, "a temperature"), positive([n], "a number of particles", 1), area * width))
+        for (n, t), width in ((left, q), (right, length - q))
+    ]
+    return np.array([S[0], left[0], q, 0.0, capacity * np.log(positive(T, "T")), S[1], right[0]])
 
 
 class _Vessel(Module):

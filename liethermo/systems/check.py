@@ -74,7 +74,9 @@ def check_system(
         if samples < 1:
             raise InputError(f"samples must be a positive integer, not {samples}")
         points = system.samples(samples, seed, scale)
-    points = np.asarray(system.state(points, batch=True)).reshape(-1, system.dim)
+    else:
+        points = np.asarray(system.state(points, batch=True))
+    points = points.reshape(-1, system.dim)
     if system.is_driven:
         times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
         points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
@@ -164,8 +166,9 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
     found = _of_dissipations(system, x)
     given = around = system
     if system.space is not None:
-        velocity = system.vector_field(x)
-        found["tangent"] = relative(size(velocity - system.tangent(x, velocity)), size(velocity))
+        if matrices:  # else it is tangent by form
+            velocity = system.vector_field(x)
+            found["tangent"] = relative(size(velocity - system.tangent(x, velocity)), size(velocity))
         around, _ = system.local(x)
         system, x = system.local(x, centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)

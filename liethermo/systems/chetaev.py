@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._module import Module
 
@@ -18,7 +20,9 @@ from ..errors import FunctionError, InputError
 from ..functions.arguments import Steady, needed_arguments
 from ..functions.checks import check_shape
 from ..tracing.interpret import at_points
-from .simple_closed import Forces, SimpleClosedSystem, lagrangian_of
+from .herglotz import random_states
+from .ledger import ForcesAndHeat
+from .simple_closed import InOneRow, SimpleClosedSystem, lagrangian_of
 
 NEWTON_STEPS, SOLVED = 12, 1e-12
 """For S' where the form depends on it; and the share of its terms that the constraint may miss then."""
@@ -37,7 +41,7 @@ class ChetaevSystem(SimpleClosedSystem):
     ``S' = -eta_q . v / eta_S``; where it is not negative at random points, the second law is stated, and held to.
 
     For ``eta = dS - L_v dq`` this is :class:`liethermo.ThermodynamicHerglotz` [SML Prop. 3.3], and for
-    ``eta = T dS - F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.
+    ``eta = T dS + F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.
 
     The metriplectic schemes keep the energy, and the sign of S' in each step, exactly.
     :class:`liethermo.VariationalIntegrator` discretises the principle itself: D_1 L_d + D_2 L_d is a multiple of eta at
@@ -45,11 +49,12 @@ class ChetaevSystem(SimpleClosedSystem):
 
     Parameters
     ----------
-    lagrangian, dim, momentum_maps, validate
+    lagrangian, dim, momentum_maps, validate, space
         As for :class:`liethermo.SimpleClosedSystem`.
     eta : function of (q, v, S), q and v of shape (n,), to shape (n + 1,), or to shape (n,)
         The components (eta_q, eta_S), or eta_q alone where ``eta_S = 1``. It may be a function of (q, v, S, S'): the
-        constraint is then solved for S' by Newton's method, from S' = 0.
+        constraint is then solved for S' by Newton's method, from S' = 0. With a space q, v and eta_q are of its shape,
+        and (eta_q, eta_S) is all of them in one row; what eta_q does across Q counts for nothing.
 
     Raises
     ------
@@ -60,16 +65,24 @@ class ChetaevSystem(SimpleClosedSystem):
 
     production_name: ClassVar[str] = "S'"
 
-    def __init__(self, lagrangian, eta: Callable, dim: int | None = None, momentum_maps=(), validate: bool = True):
-        structure, size, energy = self._prepare(lagrangian_of(lagrangian), dim)
+    def __init__(
+        self,
+        lagrangian,
+        eta: Callable,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        structure, size, energy = self._prepare(lagrangian_of(lagrangian, space), dim, space)
         self.friction = self.external = self.heat_power = None
-        self.form = Form.of(eta, size // 2)
-        forces = ChetaevForces(None, None, None, _law_of(self.form, size))
+        self.form = Form.of(eta, (size // 2,) if space is None else space.shape)
+        forces = ChetaevForces(None, None, None, _law_of(self.form, structure.contact))
         self._assemble(structure, size, energy, forces, momentum_maps, validate)
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         del t
-        return T * self.form.covector(q, v, S)
+        return T * self.along(q, self.form.covector(q, v, S))
 
     def friction_force(self, q, v, S, t) -> jax.Array:
         """The force ``T eta_q / eta_S``, shape (n,)."""
@@ -79,7 +92,7 @@ class ChetaevSystem(SimpleClosedSystem):
         return super().own_residuals(x) if self.entropy_law == "nondecreasing" else {}
 
 
-class ChetaevForces(Forces):
+class ChetaevForces(ForcesAndHeat):
     """The force of a one-form, with the law of the entropy that it has."""
 
     law: Law | None = eqx.field(static=True)
@@ -96,21 +109,22 @@ class Form(Module):
     implicit: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, eta, n: int) -> Form:
-        """From what a user gives, checked."""
+    def of(cls, eta, at: tuple[int, ...]) -> Form:
+        """From what a user gives, checked; q and v of shape ``at``."""
         if not callable(eta):
             raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
-        implicit, at = needed_arguments(eta) == 4, "(q, v, S, S')"
+        implicit, n, what = needed_arguments(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
         given = eta if implicit else Steady(eta)
+        given = given if len(at) == 1 else InOneRow(given, at)
         shapes = (n,), (n,), (), ()
         try:
             arguments = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
             size = jax.eval_shape(lambda *a: jnp.asarray(given(*a)), *arguments).shape
         except (TypeError, ValueError, IndexError) as error:
-            raise FunctionError(f"eta could not be evaluated at {at}: {type(error).__name__}: {error}") from error
+            raise FunctionError(f"eta could not be evaluated at {what}: {type(error).__name__}: {error}") from error
         if size not in ((n,), (n + 1,)):
-            raise FunctionError(f"eta has shape ({n + 1},), or ({n},) where eta_S = 1, not {size}")
-        return cls(check_shape(given if size == (n + 1,) else _Unit(given), shapes, (n + 1,), "eta", at), implicit)
+            raise FunctionError(f"eta has shape ({n + 1},), or {at} where eta_S = 1, not {size}")
+        return cls(check_shape(given if size == (n + 1,) else _Unit(given), shapes, (n + 1,), "eta", what), implicit)
 
     def rate(self, q, v, S) -> jax.Array:
         """S' with ``eta_q . v + eta_S S' = 0``; NaN where none is found."""
@@ -144,11 +158,11 @@ class _Unit(Module):
         return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
 
 
-def _law_of(form: Form, size: int) -> Law | None:
+def _law_of(form: Form, contact: mf.LagrangianContact) -> Law | None:
     """What a form says of the entropy, from its production at random points."""
     if is_traced(form):
         return None
-    rates, sizes = at_points(_production, form, np.random.default_rng(0).standard_normal((POINTS, size)))
+    rates, sizes = at_points(_production, form, random_states(contact, POINTS))
     if (np.abs(rates) <= ROUNDED * sizes).all():
         return "conserved"
     return "nondecreasing" if (rates >= -ROUNDED * sizes).all() else None

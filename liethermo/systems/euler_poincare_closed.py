@@ -96,7 +96,7 @@ class EulerPoincareClosedSystem(WithLedger):
             if singular_everywhere(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
         given = (self.friction, self.external, self.heat_power)
-        forces = None if given == (None, None, None) else AlgebraForces(*given)
+        forces = None if given == (None, None, None) else ForcesAndHeat(*given)
         whole, total, energy = self._beside_ledger(structure, n + 1, recognised(ReducedEnergy(lagrangian), n + 1))
         self._build(whole, total, energy, entropy_component(total, n), forces, momentum_maps, validate)
 
@@ -125,6 +125,16 @@ class EulerPoincareClosedSystem(WithLedger):
     def heating(self, xi, S, t=0.0) -> jax.Array:
         """P_H."""
         return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(xi, S, t))
+
+    first_velocity: ClassVar[int] = 0
+
+    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
+        return self.structure.rates(x[: self.own_size])[1:]
+
+    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+        del T
+        _, S, t = self.parts(x)
+        return self.friction_force(v, S, t), self.external_force(v, S, t), self.heating(v, S, t)
 
     def temperature(self, x) -> jax.Array:
         """``T = -l_S`` at a state or a batch of states, shape (...)."""
@@ -191,20 +201,6 @@ class OnAlgebra(PoissonBySharp):
         mu, W, _ = self.rates(x)
         xi = solve(W, alpha[:-1, None])[:, 0]
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
-
-
-class AlgebraForces(ForcesAndHeat):
-    """Friction, external force and heat power, as they act on (xi, S), for discrete gradients too."""
-
-    def force(self, system, x, dH, dS, dL):
-        n = system.algebra.dim
-        _, S, t = system.parts(x)
-        _, W, by_S = system.structure.rates(x[: n + 1])
-        xi = solve(W, dH[:n, None])[:, 0]  # the velocity and the temperature that the gradient stands for
-        T = dH[n] - jnp.dot(by_S, xi)
-        friction, push, power = (f(xi, S, t) for f in (system.friction_force, system.external_force, system.heating))
-        xi_dot, S_dot = self.slopes(W, by_S, xi, T, friction, push, power)
-        return jnp.concatenate([xi_dot, S_dot[None], system.entries(jnp.dot(push, xi), power)])
 
 
 def _temperature(system: EulerPoincareClosedSystem, x):

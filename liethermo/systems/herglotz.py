@@ -32,6 +32,8 @@ from .evolution import (
     decay,
     degrees_of_freedom,
     entropy_component,
+    in_one_array,
+    states_on,
     tangency,
 )
 
@@ -58,9 +60,17 @@ class OnVelocities(OnContactManifold):
         dim = components(dim, space)
         n = degrees_of_freedom(dim)
         self.lagrangian = L = recognised(check_scalar(L, dim, "the Lagrangian"), dim)
-        contact = mf.LagrangianContact(L.value, n, bundle_of(space))
+        contact = mf.LagrangianContact(_Values(L), n, bundle_of(space))
         _need_regular(contact)
         return mf.Cosymplectic(contact), dim, _energy(L, dim)
+
+    def _hamiltonian(self) -> Energy:
+        if self.configurations is not None:
+            raise InputError(
+                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}: "
+                "give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
+            )
+        return _hamiltonian(self.lagrangian, self.dim)
 
     def legendre(self, x) -> jax.Array:
         """``FL(q, v, S) = (q, L_v, S)``, a state of :meth:`hamiltonian_system`, or a batch, shape (..., dim)."""
@@ -74,16 +84,18 @@ class ThermodynamicHerglotz(OnVelocities):
     ``eta_L = dS - L_v dq`` and of the energy ``E_L = v . L_v - L``, which it conserves; its Legendre transform is the
     :class:`EvolutionSystem` of ``H = E_L o FL^-1``. The temperature is ``T = -L_S``.
 
+    Q is R^n, or a ``space``, as for :class:`EvolutionSystem`; a state has the arrays of q and v in one row.
+
     For ``L = lt.Kinetic(g) - lt.Potential(V)``, g semidefinite, the entropy falls at no step of the metriplectic
     schemes, as there; otherwise :meth:`check` reports the sign of ``Delta(L) = v . L_v``.
 
     Parameters
     ----------
-    lagrangian : function from (q, v, S) in one array, shape (dim,), to a scalar, or an Energy
+    lagrangian : function of (q, v, S), or of all in one array, shape (dim,), to a scalar, or an Energy
         Regular: ``L_vv`` has an inverse.
     dim : int
-        Number of state components, 2n + 1; known by itself of an ``lt.Quadratic``.
-    momentum_maps, validate
+        Number of state components, 2n + 1; known by itself of an ``lt.Quadratic``, and with a space.
+    momentum_maps, validate, space
         As for :class:`EvolutionSystem`.
 
     Raises
@@ -98,14 +110,22 @@ class ThermodynamicHerglotz(OnVelocities):
 
     production_name: ClassVar[str] = "Delta(L)"
 
-    def __init__(self, lagrangian, dim: int | None = None, momentum_maps=(), validate: bool = True):
-        structure, dim, energy = self._prepare(lagrangian, dim)
-        friction = LiouvilleFriction(is_mechanical(self.lagrangian, dim))
-        self._build(structure, dim, energy, entropy_component(dim), friction, momentum_maps, validate)
+    def __init__(
+        self,
+        lagrangian,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
+        friction = LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
+        entropy, states = entropy_component(dim), states_on(space)
+        self._build(structure, dim, energy, entropy, friction, momentum_maps, validate, states)
 
     def hamiltonian_system(self) -> EvolutionSystem:
-        """The same dynamics on T*Q x R, in the state (q, p, S)."""
-        return EvolutionSystem(_hamiltonian(self.lagrangian, self.dim), self.dim, validate=False)
+        """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
+        return EvolutionSystem(self._hamiltonian(), self.dim, validate=False)
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         return tangency(self, x)
@@ -118,17 +138,24 @@ class Herglotz(OnVelocities):
 
     Parameters
     ----------
-    lagrangian, dim, momentum_maps, validate
+    lagrangian, dim, momentum_maps, validate, space
         As for :class:`ThermodynamicHerglotz`.
     """
 
-    def __init__(self, lagrangian, dim: int | None = None, momentum_maps=(), validate: bool = True):
-        structure, dim, energy = self._prepare(lagrangian, dim)
-        self._build(structure, dim, energy, None, ReebDrift(), momentum_maps, validate)
+    def __init__(
+        self,
+        lagrangian,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
+        self._build(structure, dim, energy, None, ReebDrift(), momentum_maps, validate, states_on(space))
 
     def hamiltonian_system(self) -> ContactSystem:
-        """The same dynamics on T*Q x R, in the state (q, p, S)."""
-        return ContactSystem(_hamiltonian(self.lagrangian, self.dim), self.dim, validate=False)
+        """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
+        return ContactSystem(self._hamiltonian(), self.dim, validate=False)
 
     def own_residuals(self, x) -> dict[str, jax.Array]:
         return decay(self, x)
@@ -168,6 +195,15 @@ class _LegendreEnergy(Energy):
     def value(self, x) -> jax.Array:
         n = len(x) // 2
         return jnp.dot(x[n : 2 * n], self.lagrangian.gradient(x)[n : 2 * n]) - self.lagrangian.value(x)
+
+
+class _Values(Module):
+    """An energy as a function of one state."""
+
+    energy: Energy
+
+    def __call__(self, x):
+        return self.energy.value(x)
 
 
 # -- the Hamiltonian --------------------------------------------------------------------------------------------------
@@ -248,15 +284,20 @@ class _OfVelocity(Energy):
 def _need_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
-    points = np.random.default_rng(0).standard_normal((4, contact.dim))
-    if isinstance(contact.bundle, mf.TangentBundle):
-        on = contact.bundle
-        points = np.concatenate([np.asarray(on.to_vector(on.random(0, (4,)))), points[:, -1:]], axis=1)
-    if singular_everywhere(at_points(_hessian, contact, points)):
+    if singular_everywhere(at_points(_hessian, contact, random_states(contact, 4))):
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
             "does not determine the velocity"
         )
+
+
+def random_states(contact: mf.SplitContact, count: int) -> np.ndarray:
+    """Random states (q, v, S), shape (count, dim); those of a space of positions are points of it."""
+    points = np.random.default_rng(0).standard_normal((count, contact.dim))
+    if isinstance(contact.bundle, mf.TangentBundle):
+        on = contact.bundle
+        points[:, :-1] = on.to_vector(on.random(0, (count,)))
+    return points
 
 
 def _hessian(contact: mf.LagrangianContact, x):

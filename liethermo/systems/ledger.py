@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import jax
@@ -58,6 +59,26 @@ class WithLedger(System):
         """The time in one state; 0 where it has none."""
         return x[-1] if len(x) > self.own_size else jnp.zeros(())
 
+    # what ForcesAndHeat asks for
+
+    @property
+    @abstractmethod
+    def first_velocity(self) -> int:
+        """The component of the state where velocities begin."""
+
+    @abstractmethod
+    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
+        """The derivatives of the momentum by v and S at a state, shapes (n, n) and (n,)."""
+
+    @abstractmethod
+    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Friction and external force, shape (n,), and heat power at a state, for a velocity and a temperature."""
+
+    def along_at(self, x, covector) -> jax.Array:
+        """What of a covector acts on velocities, shape (n,)."""
+        del x
+        return covector
+
     def entries(self, work, heat) -> jax.Array:
         """The rates of the ledger, shape (3,), or none of an isolated system."""
         return jnp.stack([work, heat, jnp.ones(())])[: self.dim - self.own_size]
@@ -70,7 +91,12 @@ class WithLedger(System):
 
 
 class ForcesAndHeat(SkewFriction):
-    """Friction and the heat that it makes, an external force and a heat power: what such a system is driven by."""
+    """Friction and the heat that it makes, an external force and a heat power, on states (…, v, S) [GBY 2.4].
+
+    ``d/dt l_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the energy
+    ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too. The system says where v
+    begins (``first_velocity``), how its momentum changes with v and S (``inertia_at``), and how it is ``acted_on``.
+    """
 
     friction: Callable | None
     external: Callable | None
@@ -82,11 +108,15 @@ class ForcesAndHeat(SkewFriction):
             return None
         return "conserved" if self.friction is None else "nondecreasing"
 
-    @staticmethod
-    def slopes(W, by_S, v, T, friction, push, power) -> tuple[jax.Array, jax.Array]:
-        """``v'`` and ``S'`` by them, where the momentum changes by ``W v' + by_S S'``; NaN unless T is positive."""
+    def force(self, system, x, dH, dS, dL):
+        first, S = system.first_velocity, system.own_size - 1
+        W, by_S = system.inertia_at(x)
+        v = solve(W, system.along_at(x, dH[first:S])[:, None])[:, 0]  # the velocity and temperature of the gradient
+        T = dH[S] - jnp.dot(by_S, v)
+        friction, push, power = system.acted_on(x, v, T)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
-        return solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0], S_dot
+        v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
+        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
 
 
 # -- functions of a state and the time --------------------------------------------------------------------------------

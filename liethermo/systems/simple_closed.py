@@ -13,7 +13,6 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._module import Module
-from manifolds.matrices.linear import solve
 from manifolds.structures.poisson import Beside
 
 from ..dissipation.checks import semidefinite
@@ -25,26 +24,6 @@ from ..tracing.interpret import at_points
 from .evolution import configurations, entropy_component, in_one_array, states_on
 from .herglotz import OnVelocities
 from .ledger import ForcesAndHeat, WithLedger, field
-
-
-class Forces(ForcesAndHeat):
-    """Friction, external force and heat power, as they act on (q, v, S) [GBY 2.4].
-
-    ``d/dt L_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the
-    energy ``v . L_v - L - W - Q`` of system and surroundings is constant, for discrete gradients too.
-    """
-
-    def force(self, system, x, dH, dS, dL):
-        n = system.degrees_of_freedom
-        q, _, S, t = system.parts(x)
-        _, W, by_S = system.contact.rates(x[: 2 * n + 1])
-        by_S = by_S[:, 0]
-        v = solve(W, system.along(q, dH[n : 2 * n])[:, None])[:, 0]  # the velocity and the temperature of the gradient
-        T = dH[2 * n] - jnp.dot(by_S, v)
-        friction, push = system.friction_at(q, v, S, t, T), system.external_force(q, v, S, t)
-        power = system.heating(q, v, S, t)
-        v_dot, S_dot = self.slopes(W, by_S, v, T, friction, push, power)
-        return jnp.concatenate([jnp.zeros(n), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
 
 
 class SimpleClosedSystem(WithLedger, OnVelocities):
@@ -124,10 +103,12 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         self.external = None if external is None else _field(external, at, at, "the external force")
         self.heat_power = None if heat_power is None else _field(heat_power, at, (), "the heat power")
         given = (self.friction, self.external, self.heat_power)
-        forces = None if given == (None, None, None) else Forces(*given)
+        forces = None if given == (None, None, None) else ForcesAndHeat(*given)
         self._assemble(structure, size, energy, forces, momentum_maps, validate)
 
-    def _assemble(self, structure, size: int, energy: Energy, forces: Forces | None, momentum_maps, validate) -> None:
+    def _assemble(
+        self, structure, size: int, energy: Energy, forces: ForcesAndHeat | None, momentum_maps, validate
+    ) -> None:
         whole, total, energy = self._beside_ledger(structure, size, energy)
         entropy = entropy_component(total, size - 1)
         states = states_on(configurations(structure.contact), total - size)
@@ -194,6 +175,24 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         """P_H."""
         return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(q, v, S, t))
 
+    # -- what ForcesAndHeat asks for ----------------------------------------------------------------------------------
+
+    @property
+    def first_velocity(self) -> int:
+        return self.degrees_of_freedom
+
+    def along_at(self, x, covector) -> jax.Array:
+        return self.along(x[: self.degrees_of_freedom], covector)
+
+    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
+        _, W, by_S = self.contact.rates(x[: self.own_size])
+        return W, by_S[:, 0]
+
+    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+        q, _, S, t = self.parts(x)
+        at = q, v, S, t
+        return self.friction_at(*at, T), self.external_force(*at), self.heating(*at)
+
     # -- checks -----------------------------------------------------------------------------------------------------
 
     def outside(self, x) -> str:
@@ -248,8 +247,8 @@ def _force(friction, at: tuple[int, ...], what: str) -> Callable | None:
     return _Linear(R)
 
 
-class _Flat(Module):
-    """A function of arrays q and v as one of their entries in a row."""
+class InOneRow(Module):
+    """A function of arrays q and v as one of their entries in a row; and so are its values."""
 
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -262,4 +261,4 @@ class _Flat(Module):
 def _field(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
     """As a function of (q, v, S, t), whose shape has been checked; q and v of shape ``at``, and flat in the result."""
     checked = field(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
-    return checked if len(at) == 1 else _Flat(checked, at)
+    return checked if len(at) == 1 else InOneRow(checked, at)

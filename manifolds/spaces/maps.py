@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import is_traced
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 
@@ -310,12 +310,21 @@ class Maps(ABC):
         return jnp.expand_dims(v, -1 - len(self.shape))
 
     def _compiled(self, kernel: str, *arrays, static: tuple = ()):
-        return run(self, kernel, static, *arrays)
+        few = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= FEW
+        hasty = few and not any(is_traced(array) for array in arrays)  # a part of another program has no options
+        return (run_hastily if hasty else run)(self, kernel, static, *arrays)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def run(space: Maps, kernel: str, static: tuple, *arrays) -> Any:
+FEW = 10_000
+"""Numbers up to which a compiler that does not optimise is the faster one, as long as a kernel is run a few times."""
+
+
+def _of_kernel(space: Maps, kernel: str, static: tuple, *arrays) -> Any:
     return getattr(space, kernel)(*arrays, *static)
+
+
+run = jax.jit(_of_kernel, static_argnums=(0, 1, 2))
+run_hastily = jax.jit(_of_kernel, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0})
 
 
 def safe_sqrt(z):

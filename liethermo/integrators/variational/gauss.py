@@ -12,7 +12,8 @@ from manifolds.matrices.linear import solve
 from ...systems import SimpleClosedSystem, System
 from ..base import ONE_SIZE, GaussMethod, checked_stages, register
 from ..tableaus import gauss
-from .schemes import need_simple_closed, velocity_slope
+from .equations import velocity_slope
+from .schemes import need_simple_closed
 
 
 class VariationalGauss(GaussMethod):

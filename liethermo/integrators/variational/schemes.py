@@ -12,17 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrices.linear import solve
 
 from ...errors import InputError
-from ...functions.gradients import compensated
-from ...functions.surface import OnLevels
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
-from ...tracing.interpret import polynomial_degree
 from ...tracing.programs import program
-from ..base import ONE_SIZE, OneStepMethod, register
+from ..base import ONE_SIZE, OneStepMethod, moved, register
 from .composed import OnBodies
 from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
+from .equations import solved, velocity_of, velocity_slope
 
 CONSTRAINT_TOLERANCE = 1e-10
 """Largest misfit of a given first step, relative to the heat ``T |S_1 - S_0|`` and the work that make it up."""
@@ -195,7 +192,7 @@ class VariationalIntegrator(OneStepMethod):
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.parts(x + compensation)
         discrete, p0 = self.discrete(system, h, t), system.momentum(q0, v0, S0)
-        V, s = _solved(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
+        V, s = solved(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
         v_dot = velocity_slope(
             system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.force(p0, pair), h
@@ -210,10 +207,7 @@ class VariationalIntegrator(OneStepMethod):
         return h * k[0]
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
-        if system.surface is None:
-            return super().move(system, x, compensation, h, k)
-        d = self.increment(h, k)  # which ends on the surface by itself
-        return system.surface.settled(*compensated(x, compensation + d))
+        return moved(self, system, x, compensation, self.increment(h, k), settles=True)
 
     # -- starts and records -------------------------------------------------------------------------------------------
 
@@ -257,7 +251,7 @@ class VariationalIntegrator(OneStepMethod):
                 )
             )
         p0 = discrete.momenta(q0, q1, S0, found)[0]
-        v0 = _velocity(system, q0, S0, p0, (q1 - q0) / h)
+        v0 = velocity_of(system, q0, S0, p0, (q1 - q0) / h)
         if not bool(jnp.isfinite(v0).all()):
             raise InputError(f"no velocity was found that has the momentum {np.asarray(p0)} of this first step")
         rest = jnp.array([0.0, 0.0, t]) if system.receives else jnp.zeros(0)
@@ -296,97 +290,6 @@ class VariationalIntegrator(OneStepMethod):
             f"the regularity matrix (3.13) is singular: of its singular values, rows scaled to 1, the least is "
             f"{singular[-1]:.2g}. The discrete Lagrangian does not determine the step: take another step size or scheme"
         )
-
-
-# -- the step equations -----------------------------------------------------------------------------------------------
-
-
-def _solved(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
-    """V and s after one step of Newton's method for (3.12), from a guess or, where that is exact, from nothing."""
-    n, (q0, V, S0, s) = len(guess.V), guess
-    mass = size_of_mass(discrete.system, q0, v0, S0)
-    outright = discrete.curve is None and (
-        polynomial_degree(_motion_by_V, (discrete, p0, guess), n) <= 1
-        and polynomial_degree(_motion_by_s, (discrete, p0, guess), 1) == 0
-    )
-    if outright:
-        A, misfit = _with_jacobian(lambda V: discrete.motion(p0, Pair(q0, V, S0, jnp.zeros(()))), jnp.zeros(n))
-        V = -solve(A, misfit[:, None])[:, 0]
-    else:  # (3.15), s eliminated
-
-        def both(V, s):
-            pair = Pair(q0, V, S0, s)
-            return discrete.motion(p0, pair, mass), discrete.production(pair)
-
-        ((A, B), (C, D)), (misfit, gain) = _with_jacobian(both, V, s)
-        V = V - solve(A - jnp.outer(B, C) / D, (misfit - B * (gain / D))[:, None])[:, 0]
-    s = jnp.zeros(()) if polynomial_degree(_production_by_s, (discrete, p0, guess), 1) <= 1 else s
-    slope, gain = _with_jacobian(lambda s: discrete.production(Pair(q0, V, S0, s)), s)
-    return V, s - gain / slope
-
-
-def _with_jacobian(function: Callable, *at):
-    """The derivatives of a function by all arguments, and its value."""
-    return jax.jacfwd(
-        lambda *a: (lambda y: (y, y))(function(*a)), argnums=tuple(range(len(at))) if len(at) > 1 else 0, has_aux=True
-    )(*at)
-
-
-def _motion_by_V(model, V):
-    discrete, p0, guess = model
-    return discrete.motion(p0, guess._replace(V=V))
-
-
-def _motion_by_s(model, s):
-    discrete, p0, guess = model
-    return discrete.motion(p0, guess._replace(s=s[0]))
-
-
-def _production_by_s(model, s):
-    discrete, _, guess = model
-    return discrete.production(guess._replace(s=s[0]))
-
-
-def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Array:
-    """``(v_1 - v_0)/h`` with ``L_v(q_1, v_1, S_1) = p_0 + h force``, one step of Newton's method.
-
-    Parameters
-    ----------
-    start : (q_0, v_0, S_0, p_0)
-    end : (q_1, slope, S_1)
-        With a guess of the result.
-    """
-    (_, v0, _, p0), (q1, slope, S1) = start, end
-    affine = polynomial_degree(_momentum_by_v, (system, q1, S1), len(v0)) <= 1
-    slope = jnp.zeros_like(v0) if affine else slope
-    W, p = _with_jacobian(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
-    W, missed = _with_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
-    return slope - solve(W, missed[:, None])[:, 0]
-
-
-def _with_tangents(system: SimpleClosedSystem, q, v, W, missed, h=1.0) -> tuple[jax.Array, jax.Array]:
-    """The matrix and the misfit, over h, of an equation for a momentum at v; on a manifold along Q, and v tangent."""
-    space = system.configurations
-    if space is None:
-        return W, missed
-    surface, mass = OnLevels(space, tangent=True), jnp.max(jnp.abs(W))
-
-    def across(w):
-        return surface._moved(q, jax.jvp(space._constraints, (space.from_vector(q),), (space.from_vector(w),))[1])
-
-    along = jax.vmap(lambda w: system.along(q, w), in_axes=1, out_axes=1)
-    W = along(W) + mass * jax.vmap(across, out_axes=1)(jnp.eye(len(v)))
-    return W, system.along(q, missed) + mass / h * across(v)
-
-
-def size_of_mass(system: SimpleClosedSystem, q, v, S) -> jax.Array:
-    """The size of ``L_vv``."""
-    return jnp.max(jnp.abs(jax.jacfwd(system.momentum, argnums=1)(q, v, S)))
-
-
-def _momentum_by_v(model, v):
-    system, q, S = model
-    return system.momentum(q, v, S)
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
@@ -434,20 +337,6 @@ def _misfit(discrete: DiscreteSystem, q0, q1, S0, S1):
     misfit, slope = jax.jvp(lambda s: discrete.production(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
     heat = jnp.abs(slope * pair.s)
     return discrete.h * jnp.abs(misfit), discrete.h * (heat + jnp.abs(misfit - slope * pair.s)) + 1e-300
-
-
-@program
-def _velocity(system: SimpleClosedSystem, q, S, p, v):
-    """v with ``L_v(q, v, S) = p``, near a guess; NaN where Newton's method finds none."""
-
-    def newton(_, v):
-        W, found = _with_jacobian(lambda v: system.momentum(q, v, S), v)
-        W, missed = _with_tangents(system, q, v, W, found - p)
-        return v - solve(W, missed[:, None])[:, 0]
-
-    v = jax.lax.fori_loop(0, 20, newton, v)
-    defect = jnp.max(jnp.abs(system.along(q, system.momentum(q, v, S) - p)))
-    return jnp.where(defect <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
 
 
 @program

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._module import Module
-from manifolds.structures.contact import Matter
+from manifolds.structures.extended import Matter
 
 from ...dissipation.matter import Process
 from ...errors import InputError

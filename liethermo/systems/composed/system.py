@@ -14,7 +14,7 @@ import scipy
 import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._module import Module
-from manifolds.structures.contact import Places
+from manifolds.structures.extended import Places
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction

@@ -54,7 +54,7 @@ def test_the_equations_and_their_laws():
 
 
 def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
-    """SML Prop. 3.3; and for ``T dS - F dq`` a simple closed system with that friction."""
+    """SML Prop. 3.3; and for ``T dS + F dq`` a simple closed system with that friction."""
     points = np.random.default_rng(2).standard_normal((8, 5))
     field = lambda system: at_points(lambda system, x: system.vector_field(x), system, points)  # noqa: E731
     by_L = lt.ChetaevSystem(L, lambda q, v, S: jnp.append(-jax.grad(L, argnums=1)(q, v, S), 1.0), 5, validate=False)

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.tracing.interpret import at_points
 
 GRAVITY, MASS, RATE, CAPACITY = 9.81, 1.3, 0.4, 5.0
 V = lt.VariationalIntegrator
@@ -195,7 +196,7 @@ def check(case: Case, method, order: float, counts=(20, 40, 80), keeps_energy: b
     for run in runs:
         space = case.system.space
         assert np.asarray(space.residual(case.system.points(run.x))).max() < 1e-14  # 2e-15 measured
-        if case.system.heat_power is None:
+        if getattr(case.system, "heat_power", None) is None:
             assert np.diff(run.entropy).min() > 0.0
         if keeps_energy:
             assert np.ptp(run.energy) < 1e-14 * np.abs(run.energy).max()  # 1e-15 measured
@@ -287,6 +288,92 @@ def test_an_evolution_field_keeps_its_laws():
     assert run.audit().passed
 
 
+# -- the other principles of SML: a one-form, and Herglotz' equations, on the sphere -----------------------------------
+
+GAMMA = 0.7
+
+
+@functools.cache
+def constrained() -> lt.ChetaevSystem:
+    """The pendulum by ``eta = T dS + F_fr dq``."""
+    L = lambda q, v, S: 0.5 * MASS * v @ v - MASS * GRAVITY * q[2] - heat(S)  # noqa: E731
+    form = lambda q, v, S: jnp.append(pendulum_friction(q, v, S), 300.0 * jnp.exp(S / CAPACITY))  # noqa: E731
+    return lt.ChetaevSystem(L, form, space=mf.Sphere(2))
+
+
+def lagrangian(q, v, S):
+    return 0.5 * MASS * v @ v - MASS * GRAVITY * q[2] - GAMMA * S
+
+
+def in_angles_by_herglotz(t, y):
+    """(12): a friction ``L_v L_S = -GAMMA L_v``, and ``S' = v . L_v``."""
+    theta, _, w, u, _ = y
+    sin, cos = np.sin(theta), np.cos(theta)
+    w_dot = sin * cos * u * u + GRAVITY * sin - GAMMA * w
+    return [w, u, w_dot, -2.0 * cos / sin * w * u - GAMMA * u, MASS * (w * w + sin * sin * u * u)]
+
+
+@functools.cache
+def by_herglotz() -> Case:
+    y0 = [2.0, 0.3, 0.2, 1.5, 0.1]
+    system = lt.ThermodynamicHerglotz(lagrangian, space=mf.Sphere(2))
+    return Case(system, on_the_sphere(y0), on_the_sphere(solved(in_angles_by_herglotz, y0, 1.0)), 1.0)
+
+
+def fields(system, points) -> np.ndarray:
+    return at_points(lambda system, x: system.vector_field(x), system, np.asarray(points))
+
+
+def discrete_errors(order: int, counts=(20, 40, 80)) -> np.ndarray:
+    """Of discrete Herglotz integrators on the sphere, in (q, p, S)."""
+    H = lambda q, p, S: 0.5 * p @ p / MASS + MASS * GRAVITY * q[2] + GAMMA * S  # noqa: E731
+    case, mass = by_herglotz(), np.repeat([1.0, MASS, 1.0], (3, 3, 1))
+    system = lt.EvolutionSystem(H, space=mf.Sphere(2))
+    action = lambda q0, q1, S0, h: h * lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)  # noqa: E731
+    method = lt.DiscreteHerglotz(action, order=order)
+    found, runs = errors(Case(system, mass * case.x0, mass * case.end, case.duration), method, counts)
+    for run in runs:
+        assert np.abs((run.x[:, :3] ** 2).sum(axis=1) - 1.0).max() < 1e-14
+    return found
+
+
+def test_a_one_form_on_the_sphere():
+    """Its field is that of the friction; the law of its entropy is found at points of the sphere."""
+    x = np.asarray(pendulum().system.samples(4))
+    expected = fields(pendulum().system, x)
+    assert np.abs(fields(constrained(), x) - expected).max() < 1e-13 * np.abs(expected).max()
+    assert constrained().entropy_law == "nondecreasing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "order"), [(lt.MetriplecticGauss(2), 4.0), (V.midpoint(), 2.0)], ids=str)
+def test_orders_of_a_one_form_on_the_sphere(method, order):
+    check(pendulum()._replace(system=constrained()), method, order, keeps_energy=order == 4.0)
+
+
+def test_herglotz_equations_on_the_sphere():
+    """``v' = -g grad z - GAMMA v - |v|^2 q`` of both, ``S' = v . L_v`` of (12) and ``S' = L`` of (10)."""
+    x = by_herglotz().x0
+    q, v, S = x[:3], x[3:6], x[6]
+    along = np.array([0.0, 0.0, -GRAVITY]) + GRAVITY * q[2] * q
+    expected = np.concatenate([v, along - GAMMA * v - (v @ v) * q, [MASS * v @ v]])
+    assert np.abs(fields(by_herglotz().system, x[None]) - expected).max() < 1e-13 * np.abs(expected).max()
+    contact = lt.Herglotz(lagrangian, space=mf.Sphere(2), validate=False)
+    expected[-1] = lagrangian(q, v, S)
+    assert np.abs(fields(contact, x[None]) - expected).max() < 1e-13 * np.abs(expected).max()
+
+
+@pytest.mark.slow
+def test_laws_and_order_of_herglotz_equations_on_the_sphere():
+    check(by_herglotz(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
+
+
+@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
+def test_orders_of_discrete_herglotz_on_the_sphere(order):
+    found = discrete_errors(order, (640, 1280) if order == 1 else (20, 40))
+    assert abs(np.log2(found[0] / found[1]) - order) < 0.2, found
+
+
 def test_units():
     """In units of mass 1e20 times smaller the motion is the same: the equations of the space are not drowned."""
     case, unit = pendulum(), 1e20
@@ -311,6 +398,8 @@ def test_units():
         (lambda: lt.integrate(flat(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, V.midpoint(retraction="exp")), "leave it out"),
         (lambda: run(lt.VariationalGauss(2)), r"VariationalGauss runs on R\^n: on a manifold take"),
         (lambda: run(V(Lazy(0.5))), "no subclass of it"),
+        (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "not a SimpleClosedSystem"),
+        (lambda: by_herglotz().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
         (lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))), r"one of S\^3.*positions are in S\^2"),
         (lambda: run(V.midpoint(), np.array([1.0, 0, 0, 0.5, 1.0, 0, 0])), r"T S\^2.*off the space"),
     ],
