@@ -158,7 +158,7 @@ class _Unit(Module):
         return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
 
 
-def _law_of(form: Form, contact: mf.LagrangianContact) -> Law | None:
+def _law_of(form: Form, contact: mf.SplitContact) -> Law | None:
     """What a form says of the entropy, from its production at random points."""
     if is_traced(form):
         return None

@@ -86,9 +86,12 @@ class ContactStructure(Module):
     def cartan_bracket(self, f: Callable, g: Callable) -> Callable:
         """The function ``[f, g] = Lambda(df, dg)``: obeys Leibniz' rule, but not the Jacobi identity [SML §2.1]."""
 
+        return self._bracket(self.bivector_sharp, f, g)
+
+    def _bracket(self, sharp: Callable, f: Callable, g: Callable) -> Callable:
         def value(x):
             x = real_components(x, self.dim, "x")
-            return jnp.dot(self.bivector_sharp(x, jax.grad(f)(x)), jax.grad(g)(x))
+            return jnp.dot(sharp(x, jax.grad(f)(x)), jax.grad(g)(x))
 
         return value
 
@@ -238,13 +241,6 @@ class SplitContact(ContactStructure):
     def liouville_bracket(self, f: Callable, g: Callable) -> Callable:
         """The function ``{f, g}_Delta = R(g) Delta(f) - R(f) Delta(g)`` [SML §2.1]."""
         return self._bracket(self.liouville_sharp, f, g)
-
-    def _bracket(self, sharp, f, g):
-        def value(x):
-            x = real_components(x, self.dim, "x")
-            return jnp.dot(sharp(x, jax.grad(f)(x)), jax.grad(g)(x))
-
-        return value
 
     def _split(self, x):
         """The parts (q, p, S) or (q, v, S) of a point, a vector or a covector; S has shape (1,)."""
