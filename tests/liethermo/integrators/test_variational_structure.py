@@ -74,6 +74,12 @@ def _flat(q0, q1, S0, S1):
     return jnp.concatenate([q0, q1, jnp.stack([S0, S1])])
 
 
+def forms_of_two_steps(kind, name) -> np.ndarray:
+    """Minus the two-forms of a pair and of the next: shape (pair, form, component, component)."""
+    z, discrete = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2]), SCHEMES[name].discrete(OPEN[kind], H)
+    return np.asarray(two_forms(discrete, discrete, z, *values(discrete, z)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name"),
@@ -85,9 +91,7 @@ def _flat(q0, q1, S0, S1):
 )
 def test_the_structure_identity(kind, name):
     """(4.7) with N = 2: ``F* Omega^+ - Omega^- = -d (omega + F* omega)``, omega = omega^(fr + ext) + omega^tau."""
-    z = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2])
-    discrete = SCHEMES[name].discrete(OPEN[kind], H)
-    forms = np.asarray(two_forms(discrete, discrete, z, *values(discrete, z)))
+    forms = forms_of_two_steps(kind, name)
     ends = forms[1, 1] - forms[0, 0]
     forces, heat = forms[0, 2] + forms[1, 2], forms[0, 3] + forms[1, 3]
     assert np.abs(ends - forces - heat).max() < 1e-12 * np.abs(forms[:, :2]).max()

@@ -121,8 +121,11 @@ def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
     solution = lt.integrate(system, random_state(seed), (0.0, 40 * h), h, on_failure="return", engine="array")
     if solution.stats.steps:
         assert_both_laws(solution)
-    assert solution.status.ok or (h > 0.2 and solution.status.message)
     assert solution.entropy[-1] >= solution.entropy[0]
+    if not solution.status.ok:  # some of these motions are so fast that the equations of a coarse step have no solution
+        assert "smaller step" in solution.status.message
+        end = solution.t[-1] + min(h, 0.2)
+        assert lt.integrate(system, random_state(seed), (0.0, end), min(h, 0.2) / 16, engine="array").status.ok
 
 
 @pytest.mark.slow
@@ -174,15 +177,21 @@ def closed_form_39(q, p, S, h, gamma):
     return q1, p1, S1 + ((16 * S * gamma + 16 * p**2) * h + 16 * S) / D**2
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("engine", ["array", "compiled"])
-def test_39(engine):
-    """The generic scheme is (39): 1000 steps, against (39) in extended precision."""
+def thousand_steps() -> np.ndarray:
+    """Of (39) in extended precision, from (0, 10, 0)."""
     h = gamma = np.longdouble("0.1")
     expected = [tuple(map(np.longdouble, (0, 10, 0)))]
     for _ in range(1000):
         expected.append(closed_form_39(*expected[-1], h, gamma))
+    return np.array(expected)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("engine", ["array", "compiled"])
+def test_39(engine):
+    """The generic scheme is (39): 1000 steps, against (39) in extended precision."""
     solution = lt.integrate(oscillator(), [0.0, 10.0, 0.0], (0.0, 100.0), 0.1, engine=engine)
+    expected = thousand_steps()
     sizes = np.abs(expected).max(axis=0).astype(float)
     assert np.abs(solution.x[1] - [0.99255583, 9.85111663, 9.85167078]).max() < 1e-8
     assert (np.abs((solution.x - expected).astype(float)) <= 1e-14 * sizes).all()

@@ -1,0 +1,150 @@
+"""The papers formula by formula: what the library and a calculation of its own differ by, as figures.
+
+``python -m tests.papers`` computes every figure and writes them into ``docs/reference/verification.md``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+from liethermo.tracing.interpret import at_points
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "verification.md"
+
+ROUNDING = 1e-12
+"""Largest difference of a formula without a step: at most 3e-14 seen, in sums of some hundred products."""
+
+
+class Order(float):
+    """A measured order of convergence."""
+
+    def __str__(self) -> str:
+        return f"order {float(self):.2f}"
+
+
+class Value(float):
+    """A figure that is not rounding, and that both calculations have."""
+
+    def __str__(self) -> str:
+        return _power(self, 2) if self < 0.01 else f"{float(self):.2g}"
+
+
+class Difference(float):
+    """What two calculations differ by, relative to the largest number of theirs."""
+
+    def __str__(self) -> str:
+        return "0" if self == 0.0 else _power(self, 1)
+
+
+Figure = Order | Value | Difference
+
+
+class Row(NamedTuple):
+    """A line of the tables: a place of a paper, what is there, in the library, and beside what it was compared."""
+
+    paper: str
+    where: str
+    what: str
+    beside: str
+    figure: Callable[[], Figure]
+
+
+ROWS: dict[str, Row] = {}
+
+
+def row(paper: str, where: str, what: str, beside: str) -> Callable:
+    """Decorator: the figure of a line."""
+
+    def enter(figure: Callable[[], Figure]) -> Callable[[], Figure]:
+        ROWS[f"{paper} {where}: {figure.__name__}"] = Row(paper, where, what, beside, figure)
+        return figure
+
+    return enter
+
+
+def agree(found: Figure, kept: str) -> bool:
+    """Whether a figure is that of the page: orders and values to their digits, rounding within a power of ten."""
+    if isinstance(found, Order):
+        return kept.startswith("order ") and abs(found - float(kept.removeprefix("order "))) < 0.02
+    number = float(re.sub(r"\$(.*) \\cdot 10\^\{(.*)\}\$", r"\1e\2", kept))
+    if isinstance(found, Value):
+        return abs(found - number) < 0.05 * abs(number)
+    return 0.0 <= found <= max(10.0 * number, 1e-15)
+
+
+def tables(figures: dict[str, Figure]) -> dict[str, str]:
+    """The table of each paper, from the figures by the names of their lines."""
+    found: dict[str, list[str]] = {}
+    for name, line in ROWS.items():
+        lines = found.setdefault(line.paper, ["| where | what | beside | figure |", "|---|---|---|---|"])
+        lines.append(f"| {line.where} | {line.what} | {line.beside} | {figures[name]} |")
+    return {paper: "\n".join(lines) for paper, lines in found.items()}
+
+
+def marked(text: str, paper: str) -> re.Match[str]:
+    """The table of a paper in the text of the page."""
+    found = re.search(rf"(?<=<!-- {paper}: python -m tests.papers -->\n\n).*?(?=\n\n<!-- end -->)", text, re.S)
+    assert found is not None, f"the page has no place for the table of {paper}"
+    return found
+
+
+class Tests:
+    """A module of tests, read when something of it is asked for: reading a module of lines builds nothing."""
+
+    def __init__(self, name: str):
+        self._name = f"tests.liethermo.{name}"
+
+    def __getattr__(self, name: str):
+        return getattr(importlib.import_module(self._name), name)
+
+
+# -- what lines are computed with -------------------------------------------------------------------------------------
+
+
+def fields(system, points) -> np.ndarray:
+    """The vector field of a system at points, shape (m, n)."""
+    return at_points(_field, system, np.atleast_2d(np.asarray(points, dtype=float)))
+
+
+def _field(system, x):
+    return system.vector_field(x)
+
+
+def apart(found, expected) -> Difference:
+    """The largest difference of two arrays, relative to the largest entry of the second."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    return Difference(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+def worst(*figures: Difference) -> Difference:
+    return Difference(max(figures))
+
+
+def solved(rate: Callable, y0, t: float) -> np.ndarray:
+    """SciPy, to its rounding."""
+    return solve_ivp(rate, (0.0, t), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+
+
+def order(system, x0, t: float, exact, method, counts: Sequence[int] = (20, 40), laws: bool = True) -> Order:
+    """The order of a method between two numbers of steps, against a state at the end; its laws hold on the way."""
+    errors = []
+    for count in counts:
+        run = lt.integrate(system, x0, (0.0, t), t / count, method)
+        assert run.status.ok, run.status
+        assert run.audit().passed or not laws
+        errors.append(np.abs(run.x[-1] - exact).max())
+    return Order(math.log2(errors[0] / errors[1]))
+
+
+def _power(value: float, digits: int) -> str:
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return rf"${mantissa} \cdot 10^{{{int(exponent)}}}$"

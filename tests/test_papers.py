@@ -1,0 +1,46 @@
+"""The figures of the page of verification: computed again, and those that the page has."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.papers import PAGE, ROUNDING, ROWS, Difference, Order, Value, agree, bfm, gby, marked, sml  # noqa: F401
+
+
+def kept() -> dict[str, str]:
+    """The figures on the page by the names of their lines, and nothing else in its tables."""
+    text, found = PAGE.read_text(), {}
+    for paper in dict.fromkeys(line.paper for line in ROWS.values()):
+        names = [name for name, line in ROWS.items() if line.paper == paper]
+        lines = marked(text, paper).group().splitlines()[2:]
+        for name, text_line in zip(names, lines, strict=True):
+            *cells, figure = [cell.strip() for cell in re.split(r"(?<!\\)\|", text_line)[1:-1]]
+            assert cells == [ROWS[name].where, ROWS[name].what, ROWS[name].beside], name
+            found[name] = figure
+    return found
+
+
+def test_every_line_is_on_the_page():
+    assert set(kept()) == set(ROWS)
+    assert len(ROWS) >= 39
+
+
+@pytest.mark.sampled(6)
+@pytest.mark.parametrize("name", ROWS)
+def test_the_figures(name):
+    found = ROWS[name].figure()
+    assert agree(found, kept()[name]), f"{found}, and the page has {kept()[name]}: python -m tests.papers"
+    if isinstance(found, Difference):
+        assert found <= ROUNDING
+
+
+def test_figures_that_are_not_those_of_the_page():
+    assert agree(Order(2.004), str(Order(2.0)))
+    assert not agree(Order(1.9), str(Order(2.0)))
+    assert agree(Value(2.81e-4), str(Value(2.8e-4)))
+    assert not agree(Value(2.3e-4), str(Value(2.8e-4)))
+    assert agree(Difference(3e-16), str(Difference(2e-16)))
+    assert not agree(Difference(1e-13), str(Difference(2e-16)))
+    assert not agree(Difference(float("nan")), str(Difference(2e-16)))
