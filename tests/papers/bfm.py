@@ -64,7 +64,7 @@ def projected_metric():
     return apart(friction(lt.LiePoissonSystem(mf.so(3), H, BALL, lt.ProjectedMetric(G))), expected)
 
 
-@row("BFM", "Remark 2.1", "`ProjectedMetric(preserve=...)`, normalised: several functions", "the formula")
+@row("BFM", "Remark 2.1", "`ProjectedMetric` with `preserve=`, normalised", "the formula")
 def several_functions():
     L, weights = lt.Quadratic([1.0, 1.0, 0.0]), np.array([1.0, 1.0, 0.0])
     metric = lt.ProjectedMetric(G, preserve=(L,), normalized=True)
@@ -214,7 +214,7 @@ def retractions():
     return worst(apart(by_exp.point(z, v), circle(size)), apart(of_midpoint[0], z), apart(of_midpoint[1], v))
 
 
-@row("BFM", "(4.9), (4.10)", "`MetriplecticMidpoint(retraction=...)` on a sphere", "SciPy at $10^{-13}$")
+@row("BFM", "(4.9), (4.10)", "`MetriplecticMidpoint` with `retraction=` on a sphere", "SciPy at $10^{-13}$")
 def on_a_sphere() -> Order:
     system = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), H, space=mf.Sphere(2))
     x0 = np.array([0.6, 0.0, 0.8])

@@ -125,7 +125,7 @@ def alpha_family() -> Order:
     return order(open_system(), chetaev.X0, 2.0, exact, V.midpoint(0.3), (320, 640), laws=False)
 
 
-@row("GBY", "(3.13)–(3.15)", "`regularity_matrix`, scheme 2", "(5.3) as it should be")
+@row("GBY", "(3.13)–(3.15)", "the matrix of regularity, scheme 2", "(5.3) as it should be")
 def regularity():
     m, k, friction, h, heat = 5.0, 5.0, 10.0, 0.1, 1.5 * 8.31446261815324
     x0, x1, S0, S1 = 0.3, 0.35, 0.1, 0.2

@@ -58,7 +58,7 @@ def _bivector(structure, x):
     return structure.bivector(x)
 
 
-@row("SML", "(5)", "`jacobi_bracket`: the generalised rule of Leibniz", "both sides")
+@row("SML", "(5)", "the Jacobi bracket: the generalised rule of Leibniz", "both sides")
 def leibniz():
     M = mf.CanonicalContact(2)
     f, g, h = (lambda x: jnp.sin(x @ x)), (lambda x: x[0] * x[3] + x[4]), (lambda x: jnp.exp(0.3 * x[1]) * x[2])
@@ -229,12 +229,12 @@ def recursion():
     return apart(run.x[:, [0, 2]] / np.abs(expected).max(axis=0), expected / np.abs(expected).max(axis=0))
 
 
-@row("SML", "§6.3, its question", "`DiscreteHerglotz(order=4)`, any first action", "SciPy at $10^{-13}$")
+@row("SML", "§6.3, its question", "`DiscreteHerglotz(..., order=4)`, any first action", "SciPy at $10^{-13}$")
 def higher_order() -> Order:
     return Order(np.log2(np.divide(*herglotz.errors_of_order(4, 3.7))))
 
 
-@row("SML", "§6.3 on a manifold", "`DiscreteHerglotz(order=2)` on a sphere", "SciPy, in angles")
+@row("SML", "§6.3 on a manifold", "`DiscreteHerglotz(..., order=2)` on a sphere", "SciPy, in angles")
 def herglotz_on_a_sphere() -> Order:
     return Order(np.log2(np.divide(*configurations.discrete_errors(2, (20, 40)))))
 
