@@ -11,7 +11,7 @@ from manifolds._arrays import real_array
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 from ..functions.indices import Indices
 from .geometry import Geometry
 
@@ -77,7 +77,7 @@ def not_a_rate(form, dissipation: object, what: str) -> None:
 
 def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
     """A form as a positive semidefinite matrix (or a traced one): symmetric, or with a symmetric part that is."""
-    matrix = real_array(form)
+    matrix = numbers(form, what)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
@@ -85,14 +85,14 @@ def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
         allowed = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
         require(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE}")
         return matrix
-    numbers = np.asarray(matrix)
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{what} must be finite, not {numbers.tolist()}")
-    scale = float(np.abs(numbers).max())
-    asymmetry = float(np.abs(numbers - numbers.T).max())
+    entries = np.asarray(matrix)
+    if not np.isfinite(entries).all():
+        raise InputError(f"{what} must be finite, not {entries.tolist()}")
+    scale = float(np.abs(entries).max())
+    asymmetry = float(np.abs(entries - entries.T).max())
     if symmetric and not asymmetry <= 1e-12 * scale:
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
-    lowest = float(np.linalg.eigvalsh(0.5 * (numbers + numbers.T))[0])
+    lowest = float(np.linalg.eigvalsh(0.5 * (entries + entries.T))[0])
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
             f"{what} {NEGATIVE}".format(value=lowest),

@@ -7,10 +7,11 @@ import contextvars
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arrays import is_traced
+from manifolds._arrays import is_traced, real_array
 
 from ..errors import InputError
 
@@ -64,6 +65,21 @@ def require(value, test: Callable, message: str) -> None:
             noted.append(Condition(jnp.all(test(value)), value, message))
     elif not bool(np.all(test(np.asarray(value)))):
         raise InputError(refusal(message, value))
+
+
+def numbers(value, what: str) -> jax.Array:
+    """What a user gives as numbers, as an array of doubles.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    try:
+        return real_array(value)
+    except (TypeError, ValueError) as error:
+        shown = repr(value) if isinstance(value, str | complex) else type(value).__name__
+        raise InputError(f"{what} is made of real numbers, not {shown}") from error
 
 
 def refusal(message: str, value) -> str:

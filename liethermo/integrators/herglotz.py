@@ -71,6 +71,8 @@ class DiscreteHerglotz(OneStepMethod):
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
         if order not in PARTS:
             raise InputError(f"the order is 1, 2 or 4, not {order!r}")
+        if not callable(discrete_lagrangian):
+            raise InputError(f"a discrete Lagrangian is a function of (q_0, q_1, S_0, h), not {discrete_lagrangian!r}")
         self.discrete_lagrangian, self.composed = discrete_lagrangian, order
 
     @classmethod

@@ -78,6 +78,8 @@ class EulerPoincareClosedSystem(WithLedger):
         external=None,
         heat_power=None,
     ):
+        if not isinstance(algebra, mf.LieAlgebra):
+            raise InputError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}")
         n, at = algebra.dim, "(xi, S)"
         check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = settled(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())

@@ -200,13 +200,18 @@ def configurations(contact: mf.SplitContact) -> mf.Space | None:
     return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
 
 
+def checked_space(space) -> mf.Space:
+    """A space of positions; InputError where it is none."""
+    if not isinstance(space, mf.Space):
+        raise InputError(f"space is a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
+    return space
+
+
 def components(dim: int | None, space: mf.Space | None) -> int:
     """The number of components of (q, p, S)."""
     if space is None:
         return 2 * degrees_of_freedom(dim) + 1
-    if not isinstance(space, mf.Space):
-        raise InputError(f"space is a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
-    if dim not in (None, found := 2 * space.size + 1):
+    if dim not in (None, found := 2 * checked_space(space).size + 1):
         raise InputError(f"on {space.name} a state (q, p, S) has {found} components, not {dim}: leave dim out")
     return found
 
@@ -227,7 +232,7 @@ def in_one_array(function, space: mf.Space | None = None):
     """A function of (q, p, S) as one of one array, and other things as they are."""
     if not callable(function) or isinstance(function, Energy) or needed_arguments(function) != 3:
         return function
-    return Joined(function, None if space is None else space.shape)
+    return Joined(function, None if space is None else checked_space(space).shape)
 
 
 def degrees_of_freedom(dim: int | None) -> int:

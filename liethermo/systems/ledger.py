@@ -16,6 +16,7 @@ from manifolds.structures.poisson import Beside
 from ..dissipation.base import Law, SkewFriction
 from ..functions.arguments import Constant, Steady, needed_arguments
 from ..functions.checks import check_shape
+from ..functions.conditions import numbers
 from ..functions.energy import Energy, Quadratic
 from .base import System
 
@@ -72,10 +73,10 @@ class WithLedger(System):
 
     @abstractmethod
     def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Friction and external force, shape (n,), and heat power at a state, for a velocity and a temperature."""
+        """Friction and external force, shape (n,), and heat power at a state x, with a velocity v and T."""
 
     def along_at(self, x, covector) -> jax.Array:
-        """What of a covector acts on velocities, shape (n,)."""
+        """What of a covector acts on velocities at a state x, shape (n,)."""
         del x
         return covector
 
@@ -139,5 +140,5 @@ def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], 
     what, at : str
         For messages: what it is, and of what.
     """
-    found = timed(function, len(parts)) if callable(function) else Constant(jnp.asarray(function, dtype=jnp.float64))
+    found = timed(function, len(parts)) if callable(function) else Constant(numbers(function, what))
     return check_shape(found, (*parts, ()), shape, what, at)

@@ -18,7 +18,7 @@ from manifolds.structures.poisson import Beside
 from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.arguments import needed_arguments
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 from ..functions.energy import Energy
 from ..tracing.interpret import at_points
 from .evolution import configurations, entropy_component, in_one_array, states_on
@@ -235,7 +235,7 @@ def lagrangian_of(lagrangian, space: mf.Space | None = None):
 def _force(friction, at: tuple[int, ...], what: str) -> Callable | None:
     if friction is None or callable(friction):
         return None if friction is None else _field(friction, at, at, what)
-    R, n = jnp.asarray(friction, dtype=jnp.float64), math.prod(at)
+    R, n = numbers(friction, f"a coefficient of {what}"), math.prod(at)
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.shape not in ((n,), (n, n)):
         raise InputError(f"a coefficient of {what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 from manifolds._module import Module
@@ -53,10 +54,10 @@ class FiniteDifference(Module):
     def __init__(self, alpha: float, beta: float | None = None, weight: float = 1.0):
         beta = alpha if beta is None else beta
         for name, value in (("alpha", alpha), ("beta", beta)):
-            if not 0.0 <= value <= 1.0:
-                raise InputError(f"{name} says where between two points a map looks: from 0 to 1, not {value}")
-        if not weight > 0.0:
-            raise InputError(f"the weight of a finite difference map must be > 0, not {weight}")
+            if not isinstance(value, int | float | np.number) or not 0.0 <= value <= 1.0:
+                raise InputError(f"{name} says where between two points a map looks: from 0 to 1, not {value!r}")
+        if not 0.0 < weight < np.inf:
+            raise InputError(f"the weight of a finite difference map must be > 0 and finite, not {weight}")
         self.alpha, self.beta, self.weight = float(alpha), float(beta), float(weight)
 
     def position(self, q0, V, h) -> jax.Array:

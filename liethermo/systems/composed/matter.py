@@ -14,7 +14,7 @@ from manifolds.structures.extended import Matter
 
 from ...dissipation.matter import Process
 from ...errors import InputError
-from ...functions.conditions import require
+from ...functions.conditions import numbers, require
 
 
 class Membrane(Module):
@@ -45,9 +45,12 @@ class Membrane(Module):
     def __init__(self, first, second, permeability, species: int | tuple[int, int] = 0, carries: float = 0.0):
         self.first, self.second = first, second
         self.permeability = _coefficient(permeability, "the permeability of a membrane")
-        of_first, of_second = (species, species) if isinstance(species, int) else species
-        self.species = (of_first, of_second)
-        self.carries = jnp.asarray(carries, dtype=jnp.float64)
+        pair = (species, species) if isinstance(species, int) else species
+        if not (isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(kind, int) for kind in pair)):
+            raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
+        self.species = pair
+        self.carries = numbers(carries, "the entropy that a particle carries")
+        require(self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}")
 
     def process(self, names: Sequence[str], matter: Matter) -> Process:
         """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
@@ -83,7 +86,10 @@ class Reaction(Module):
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
         self.body, self.rate = body, _coefficient(rate, "the rate of a reaction")
-        self.stoichiometry = tuple(float(nu) for nu in stoichiometry)
+        found = numbers(stoichiometry, "the stoichiometry of a reaction")
+        if found.ndim != 1 or not (np.isfinite(found).all() and np.any(found)):
+            raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {found.tolist()}")
+        self.stoichiometry = tuple(found.tolist())
 
     def process(self, names: Sequence[str], matter: Matter) -> Process:
         """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
@@ -102,7 +108,7 @@ class Reaction(Module):
 def _coefficient(given, what: str) -> jax.Array | Callable:
     if callable(given):
         return given
-    value = jnp.asarray(given, dtype=jnp.float64)
+    value = numbers(given, what)
     if value.shape != ():
         raise InputError(f"{what} is one number, or a function of the state, not an array of shape {value.shape}")
     require(value, lambda L: L >= 0.0, what + " must be >= 0, not {value}: entropy would fall")

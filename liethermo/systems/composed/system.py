@@ -119,7 +119,11 @@ class ComposedSystem(System):
         energy = check_scalar(self._energy(structure, coupling), structure.dim, "the energy", timed=True)
         entropy = entropy_component(structure.dim, structure.places.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected, conduction)
-        given: list[Membrane | Reaction] = [*membranes, *reactions]
+        given = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
+        given += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
+        for one in given:
+            if not isinstance(one, Membrane | Reaction):
+                raise InputError(f"membranes and reactions are lt.Membrane and lt.Reaction, not {type(one).__name__}")
         processes = [one.process(self.names, structure.matter) for one in given]
         if processes:
             exchange = MatterExchange(processes)
