@@ -25,7 +25,7 @@ from .scalarize import UnsupportedPrimitive, scalarize
 from .traced import settled
 
 LIMIT = 30_000
-"""Instructions up to which interpreting is faster than compiling: to unroll one takes a third of the time of XLA."""
+"""Instructions up to which unrolling and interpreting are faster than compiling."""
 
 LIMIT_FOR_DEGREES = 8_000
 """The same for degrees, which are known of whole arrays too, if less sharply."""
