@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +14,13 @@ from ..integrators import OneStepMethod
 from ..integrators.fluctuating import driven_by
 from ..systems import System
 from ..tracing.programs import program
-from .codes import Code
+from .codes import UNTAKEN, Code
 from .rules import RULES, Rules
-from .stages import Solved
+from .stages import given_up
 from .stepping import State, begin, first_state, in_order, take_step
 
 
+@program
 def advance(
     system: System,
     method: OneStepMethod,
@@ -32,28 +35,12 @@ def advance(
 ):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
-    Returns the new state and, for each of ``capacity`` saves, the state vector, energy and entropy, and whether it was
-    reached. ``noise`` has the increments of each step, shape (steps, increments); steps without any where it is None.
-    Without ``newton`` a step fails where fixed-point iteration does not solve its equations.
+    The three are arrays, so that one program serves all. Returns the new state and, for each of ``capacity`` saves, the
+    state vector, energy and entropy, and whether it was reached. ``noise`` has the increments of each step, shape
+    (steps, increments); steps without any where it is None. Without ``newton`` a step fails where fixed-point iteration
+    does not solve its equations.
     """
-    h, saves, every = (jnp.asarray(number) for number in (h, saves, every))  # arguments, not constants, to the compiler
-    return _advance(system, method, state, h, saves, every, capacity, rules, noise, newton)
-
-
-@program
-def _advance(
-    system: System,
-    method: OneStepMethod,
-    state: State,
-    h,
-    saves,
-    every,
-    capacity: int,
-    rules: Rules,
-    noise,
-    newton: bool,
-):
-    first, second = state.step, None if newton else _none
+    first, second = state.step, None if newton else given_up
     system, method, state, back = in_order(system, method, state, rules)
 
     def step(s: State) -> State:
@@ -77,11 +64,6 @@ def _advance(
     return back(state), kept
 
 
-def _none(first: Solved, *_) -> Solved:
-    """No second attempt at the equations of a step."""
-    return first
-
-
 KEPT_STATES, KEPT_NUMBERS = 1024, 2**16
 """States that one call keeps at most, and their components: enough to hide the cost of a call, few enough to show
 progress."""
@@ -92,32 +74,43 @@ def portion_of(system: System) -> int:
     return min(KEPT_STATES, max(1, KEPT_NUMBERS // system.dim))
 
 
-class ArrayEngine:
-    """The array engine for one system and method: an :class:`.choice.Engine`.
+class OnDemand:
+    """Calls of programs that take steps, without Newton's method until a step needs it.
 
-    Newton's method is two thirds of what there is to compile. Its program is made when a step first needs it: the call
-    that step is in begins again with it, and so do those that follow.
+    It is two thirds of what there is to compile. The call that the step is in begins again with it, and so do those
+    that follow.
     """
+
+    def __init__(self, method: OneStepMethod):
+        # Where there are no equations it makes no difference; a reference solver has none of its own.
+        self.newton = not isinstance(method, OneStepMethod) or method.explicit
+
+    def __call__(self, steps: Callable[[bool], Any], code: Callable = lambda found: found[0].status) -> Any:
+        """What ``steps(newton)`` finds, in which ``code`` tells how steps ended, of one trajectory or of many."""
+        if not self.newton:
+            found = steps(False)
+            if not np.isin(code(found), UNTAKEN).any():
+                return found
+            self.newton = True
+        return steps(True)
+
+
+class ArrayEngine:
+    """The array engine for one system and method: an :class:`.choice.Engine`."""
 
     name = "array"
 
     def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
         self.system, self.method, self.rules = system, method, rules
         self.portion = portion_of(system)
-        # Where there are no equations it makes no difference; a reference solver has none of its own.
-        self._newton = not isinstance(method, OneStepMethod) or method.explicit
+        self._on_demand = OnDemand(method)
 
     def begin(self, x) -> State:
         return begin(self.system, self.method, x)
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
-        given = self.system, self.method, state, h, saves, every, self.portion, self.rules, rows(noise)
-        if not self._newton:
-            found = advance(*given, newton=False)
-            if int(found[0].status) not in (Code.NOT_CONVERGED, Code.NON_FINITE):
-                return found
-            self._newton = True
-        return advance(*given)
+        given = self.system, self.method, state, jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), self.portion
+        return self._on_demand(lambda newton: advance(*given, self.rules, rows(noise), newton))
 
     def step(self, state: State, h, noise=None) -> State:
         return self.advance(state, h, 1, 1, noise)[0]

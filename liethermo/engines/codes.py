@@ -23,5 +23,8 @@ class Code(enum.IntEnum):
         return self.name.lower()
 
 
+UNTAKEN = (Code.NOT_CONVERGED, Code.NON_FINITE)
+"""How a step ends that could not be taken."""
+
 TEXTS = tuple(code.text for code in Code)
 """The names, each at the place of its number."""

@@ -15,6 +15,7 @@ from ..systems import System
 from ..tracing.interpret import at_points
 from ..tracing.programs import program
 from . import searching
+from .array import OnDemand
 from .codes import Code
 from .compiled.form import Form
 from .growth import FEW
@@ -31,7 +32,6 @@ from .pacing import (
     fastest,
     follow,
     follow_by,
-    followed,
     rate_of,
     reach,
 )
@@ -109,6 +109,7 @@ class SinglePaces(_ArrayPaces):
 
     def __init__(self, system: System, method: OneStepMethod, pacing: Pacing, step: Callable | None = None):
         self.system, self.method, self.pacing, self._step, self.number = system, method, pacing, step, 1
+        self._on_demand = OnDemand(method)
 
     def begin(self, x, t: float, stop: float, length: float) -> SinglePaces:
         times = (jnp.asarray(float(time)) for time in (t, stop, length))
@@ -128,7 +129,8 @@ class SinglePaces(_ArrayPaces):
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         del most  # one, which nothing else follows
         if self._step is None:
-            self.pace = follow(self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES)
+            given = self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES
+            self.pace = self._on_demand(lambda newton: follow(*given, newton), last_cause)
         else:
             self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
         return {name: self.read(name) for name in TOLD}
@@ -139,13 +141,18 @@ class VmapPaces(_ArrayPaces):
 
     def __init__(self, form: Form, parameters, axes, method: OneStepMethod, pacing: Pacing, x, t, stop, length):
         self.form, self.parameters, self.axes, self.method, self.pacing = form, parameters, axes, method, pacing
-        self.number = len(x)
+        self.number, self._on_demand = len(x), OnDemand(method)
         times = (jnp.asarray(float(time)) for time in (t, stop, length))
         self.pace = _begin_all(form, parameters, axes, method, pacing, jnp.asarray(x), *times)
 
     def follow(self, most: int) -> None:
-        given = self.form, self.parameters, self.axes, self.method, self.pacing
-        self.pace = _follow_all(*given, self.pace, jnp.asarray(most))
+        given = self.form, self.parameters, self.axes, self.method, self.pacing, self.pace, jnp.asarray(most)
+        self.pace = self._on_demand(lambda newton: _follow_all(*given, newton), last_cause)
+
+
+def last_cause(pace: Pace) -> jax.Array:
+    """How the last attempt ended, of one trajectory or of each."""
+    return pace.cause
 
 
 @program
@@ -157,9 +164,9 @@ def _begin_all(form, parameters, axes, method, pacing, x, t, stop, length):
 
 
 @program
-def _follow_all(form, parameters, axes, method, pacing, paces, most):
+def _follow_all(form, parameters, axes, method, pacing, paces, most, newton: bool):
     def one(p, own):
-        return followed(form.rebuild(p), method, pacing, own, most, RULES)
+        return follow(form.rebuild(p), method, pacing, own, most, RULES, newton)
 
     return jax.vmap(one, in_axes=(axes, 0))(parameters, paces)
 

@@ -28,6 +28,7 @@ from . import searching
 from .codes import Code
 from .growth import FEW, growing, stretch
 from .rules import EPS, RULES, Rules
+from .stages import given_up
 from .stepping import State, first_state, take_step
 
 GROWTH, EXPLICIT_GROWTH = 3.0, 10.0
@@ -450,19 +451,19 @@ def begin(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
 
 
 @program
-def follow(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules) -> Pace:
-    """The pace after so many attempts, or where it pauses."""
-    return followed(system, method, pacing, pace, most, rules)
+def follow(
+    system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules, newton: bool = True
+) -> Pace:
+    """The pace after so many attempts, or where it pauses; without ``newton`` also where a step fails that lacks it."""
+    second = None if newton else given_up
 
-
-def followed(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules) -> Pace:
     def goes_on(carry):
         pace, attempts = carry
-        return (pace.state.status == Code.COMPLETED) & (attempts < most)
+        return (pace.state.status == Code.COMPLETED) & (attempts < most) & (newton | (pace.cause == Code.COMPLETED))
 
     def again(carry):
         pace, attempts = carry
-        return attempted(system, method, pacing, pace, rules), attempts + 1
+        return attempted(system, method, pacing, pace, rules, second), attempts + 1
 
     return jax.lax.while_loop(goes_on, again, (pace, jnp.zeros((), dtype=jnp.int64)))[0]
 

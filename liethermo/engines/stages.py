@@ -128,6 +128,11 @@ def solve_stages(equations: Equations, rules: Rules = RULES) -> Solved:
     return jax.lax.cond(first.converged, lambda: first, lambda: by_newton(equations, rules, first))
 
 
+def given_up(first: Solved, *_) -> Solved:
+    """No second attempt."""
+    return first
+
+
 def by_newton(equations: Equations, rules: Rules, first: Solved | None = None) -> Solved:
     """The second attempt; of trajectories side by side it does nothing for those that the first has solved."""
     slopes, guess, scale, inverted, noise = equations

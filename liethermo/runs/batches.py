@@ -17,10 +17,10 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import COMPILED_DIM
-from ..engines.codes import Code
 from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
-from ..engines.stepping import TELLING, begin, take_step
+from ..engines.rules import RULES
+from ..engines.stepping import TELLING, State, begin
 from ..integrators import OneStepMethod
 from ..tracing.programs import program
 from .family import Family
@@ -36,6 +36,9 @@ BATCH = 8192
 
 ARRAY_BATCH = 65_536
 """Trajectories that the array engine takes at once: bounded memory."""
+
+ARRAY_NUMBERS = 2**26
+"""Numbers of states that a call of it keeps, about."""
 
 KEPT_BEFORE = ("x", "energy", "entropy")
 """Fields of the states before a batch that its record is made from; after it those of :data:`.stepping.TELLING`."""
@@ -178,25 +181,25 @@ def in_whole_vectors(first: int, last: int, dim: int) -> np.ndarray:
 def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tally, noise: Paths | None = None) -> None:
     """All trajectories of a batch in one program, by ``vmap``."""
     size, course, interrupted = len(record.x0), record.course, False
-    portion = min(ARRAY_BATCH, size)
+    portion, on_demand = min(ARRAY_BATCH, size), array.OnDemand(method)
     limit = CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // portion)  # bounded memory for the increments
+    most = max(1, min(array.KEPT_STATES, ARRAY_NUMBERS // (portion * record.x0.shape[1])))
     for start in range(0, size, portion):
         number = min(portion, size - start)
         chosen = in_whole_vectors(start, start + number, record.x0.shape[1])
-        parameters, axes = family.batched(chosen)
-        state = before = begin_all(family.form, parameters, axes, method, jnp.asarray(record.x0[chosen]))
+        given = family.form, *family.batched(chosen), method
+        state = before = begin_all(*given, jnp.asarray(record.x0[chosen]))
         first = {name: np.asarray(value) for name, value in before._asdict().items()}
         record.begin(chosen, first["x"], first["energy"], first["entropy"])
         taken, place = 0, 1
         try:
-            for h, saves, every, keep in course.calls(limit):
-                numbers = jnp.asarray(h), saves, jnp.asarray(every)  # the step an argument of the program, no constant
+            for h, saves, every, keep in course.calls(limit, most):
                 increments = None if noise is None else array.rows(noise.rows(chosen, taken, saves * every, h))
-                state, kept = advance_all(family.form, parameters, axes, method, state, *numbers, increments)
+                sizes, capacity = np.full(len(chosen), h), 1 << (saves - 1).bit_length()  # few shapes, few programs
+                state, kept = advanced(on_demand, given, state, sizes, saves, every, capacity, increments)
                 taken += saves * every
                 if keep:
-                    columns = [kept[0], *(np.asarray(v)[..., None] for v in kept[1:3])]
-                    record.keep(chosen, place, np.concatenate(columns, axis=-1))
+                    record.keep(chosen, place, kept)
                     place += saves
                 tally.add(number * saves * every / course.steps)
         except KeyboardInterrupt:
@@ -206,37 +209,18 @@ def run_array(family: Family, method: OneStepMethod, record: Record, tally: Tall
             return
 
 
-def follow_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> Followed:
-    """All members of a small family after so many steps, each of its own size."""
-    parameters, axes = family.batched(slice(None))
-    state, found = begin_all(family.form, parameters, axes, method, jnp.asarray(x)), []
-    for done in range(0, steps, TOGETHER):
-        number = min(TOGETHER, steps - done)
-        state, states = follow_all(family.form, parameters, axes, method, state, jnp.asarray(h), jnp.asarray(number))
-        found.append(np.asarray(states)[:, :number])
-    return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(found, axis=1)
-
-
 TOGETHER = 32
 """Steps that one call follows at most."""
 
 
-@program
-def follow_all(form, parameters, axes, method, state, h, steps):
-    """So many steps of all, each of its own size, and the states after each."""
-
-    def one(p, state, h):
-        system = form.rebuild(p)
-
-        def step(i, carry):
-            state, states = carry
-            after = take_step(system, method, state, h)
-            state = jax.tree_util.tree_map(lambda a, b: jnp.where(state.status == Code.COMPLETED, a, b), after, state)
-            return state, states.at[i].set(state.x)
-
-        return jax.lax.fori_loop(0, steps, step, (state, jnp.zeros((TOGETHER, *state.x.shape))))
-
-    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, h)
+def follow_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> Followed:
+    """All members of a small family after so many steps, each of its own size."""
+    given, on_demand = (family.form, *family.batched(slice(None)), method), array.OnDemand(method)
+    state, found = begin_all(*given, jnp.asarray(x)), []
+    for done in range(0, steps, TOGETHER):
+        state, kept = advanced(on_demand, given, state, h, min(TOGETHER, steps - done), 1, TOGETHER)
+        found.append(kept[..., :-2])
+    return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(found, axis=1)
 
 
 @program
@@ -244,9 +228,23 @@ def begin_all(form, parameters, axes, method, x):
     return jax.vmap(lambda p, x: begin(form.rebuild(p), method, x), in_axes=(axes, 0))(parameters, x)
 
 
-@program
-def advance_all(form, parameters, axes, method, state, h, saves: int, every, noise=None):
-    def one(p, state, noise):
-        return array.advance(form.rebuild(p), method, state, h, saves, every, saves, noise=noise)
+def advanced(
+    on_demand: array.OnDemand, given: tuple, state: State, h, saves: int, every: int, capacity: int, noise=None
+):
+    """States after steps of sizes h, one each, and all that are kept: shape (trajectories, saves, n + 2).
 
-    return jax.vmap(one, in_axes=(axes, 0, 0))(parameters, state, noise)
+    ``given`` is form, parameters, their axes, and method.
+    """
+    form, parameters, axes, method = given
+    own = form, parameters, axes, method, state, jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), capacity, noise
+    state, kept = on_demand(lambda newton: advance_all(*own, newton))
+    x, energy, entropy = (np.asarray(values)[:, :saves] for values in kept[:3])
+    return state, np.concatenate([x, energy[..., None], entropy[..., None]], axis=-1)
+
+
+@program
+def advance_all(form, parameters, axes, method, state, h, saves, every, capacity: int, noise, newton: bool):
+    def one(p, state, h, noise):
+        return array.advance(form.rebuild(p), method, state, h, saves, every, capacity, RULES, noise, newton)
+
+    return jax.vmap(one, in_axes=(axes, 0, 0, 0))(parameters, state, h, noise)

@@ -41,7 +41,7 @@ def _program(function: Function, options: dict | None) -> Function:
     @functools.wraps(function)
     def call(*arguments):
         leaves, structure = jax.tree_util.tree_flatten(arguments)
-        dynamic = tuple(leaf if eqx.is_array(leaf) else None for leaf in leaves)
+        dynamic = tuple(_strong(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
         static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
         shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
         key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
@@ -51,6 +51,12 @@ def _program(function: Function, options: dict | None) -> Function:
         return _programs.find(key, lambda: jax.jit(whole, compiler_options=options))(dynamic)
 
     return call  # type: ignore[return-value]
+
+
+def _strong(array):
+    """An array whose type is no longer that of a number of Python, for which JAX would compile another program."""
+    weak = getattr(array, "weak_type", False) and not isinstance(array, jax.core.Tracer)
+    return np.asarray(array) if weak else array
 
 
 class _Whole:

@@ -104,8 +104,8 @@ def test_newtons_method_is_compiled_when_a_step_needs_it():
         engine = array.ArrayEngine(system, lt.MetriplecticMidpoint())
         start = engine.begin(jnp.array([0.1, 1.0, 0.1]))
         after, kept = engine.advance(start, h, 4, 2)
-        assert engine._newton is needed
-        whole, of_whole = array.advance(system, engine.method, start, h, 4, 2, engine.portion)
+        assert engine._on_demand.newton is needed
+        whole, of_whole = array.advance(system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.portion)
         assert int(after.step) == int(whole.step) == 8
         assert np.abs(np.asarray(kept[0]) - np.asarray(of_whole[0])).max() <= 1e-15
 

@@ -244,7 +244,7 @@ def test_control_a_wrong_order_is_seen():
     system = ring()
     found = system.arranged()
     first = begin(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
-    right = array.advance(system, lt.MetriplecticMidpoint(), first, 0.05, 1, 1, 1)[0]
+    right = array.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     wrong = first._replace(x=found.there(first.x))
-    other = array.advance(system, lt.MetriplecticMidpoint(), wrong, 0.05, 1, 1, 1)[0]
+    other = array.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     assert np.abs(right.x - found.back(other.x)).max() > 1e-3

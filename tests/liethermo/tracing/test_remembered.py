@@ -1,5 +1,7 @@
 """What is kept between calls for systems and methods: found again for the same objects, and for no others."""
 
+from collections import Counter
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.remembered import KEPT, fingerprint, remembered
+from liethermo.tracing import programs
+from liethermo.tracing.remembered import KEPT, Latest, fingerprint, remembered
 
 
 def counted():
@@ -86,3 +89,33 @@ def test_a_method_with_arrays_of_its_own_can_be_compiled():
     method = lt.MetriplecticGauss(1, preserve=lt.Quadratic(np.ones(3)))
     a, b = (lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, method, engine=e) for e in ("array", "compiled"))
     assert np.abs(a.x - b.x).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticRungeKutta(4), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
+)
+def test_one_program_serves_all_calls(method, monkeypatch):
+    """Whatever the span, the outputs and the tolerance: numbers of Python are no types of their own."""
+    traces, trace = Counter(), programs._Whole.__call__
+
+    def counted(whole, dynamic):
+        traces[whole] += 1
+        return trace(whole, dynamic)
+
+    monkeypatch.setattr(programs._Whole, "__call__", counted)
+    monkeypatch.setattr(programs, "_programs", Latest(programs.KEPT))
+    body, x0, h = lt.models.rigid_body(rate=0.2), np.array([0.1, 0.2, 1.0]), 0.05
+    for span in (1.0, 1.02):
+        given = body, x0, (0.0, span)
+        for step, options in (
+            (h, {}),
+            (np.float64(h), {"save_at": [0.33, 0.5]}),
+            (h, {"until": lt.Relaxed(1e-9)}),
+            (lt.Adaptive(1e-5 * span), {}),
+        ):
+            lt.integrate(*given, step, method, engine="array", **options)
+        for step, options in ((h, {}), (h, {"save_at": [0.33, 0.5]}), (lt.Adaptive(1e-5 * span), {})):
+            lt.ensemble(body, np.tile(x0, (8, 1)), (0.0, span), step, method, engine="array", **options)
+    names = {whole.__name__ for whole in traces}
+    assert {"advance", "follow", "advance_all", "_follow_all"} <= names
+    assert not [whole.__name__ for whole, number in traces.items() if number > 1]
