@@ -10,7 +10,7 @@ from pathlib import Path
 
 from .native import compiler
 
-PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka mujoco bsk".split()
+PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka mujoco pymanopt bsk".split()
 
 
 def description() -> dict[str, str]:

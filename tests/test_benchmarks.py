@@ -16,7 +16,7 @@ from benchmarks.__main__ import RESULTS, main
 from benchmarks.contest import difference
 from benchmarks.heat_bath import heat_bath
 from benchmarks.laws import Laws
-from benchmarks.measurements import magnet, memory, spin, tumbling, variational
+from benchmarks.measurements import magnet, manifolds, memory, spin, tumbling, variational
 from benchmarks.native import Bodies, Body
 from benchmarks.peers import scipy
 from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
@@ -287,3 +287,11 @@ def test_simulators_that_are_missing_are_told(monkeypatch):
         simulators.mujoco(tumbling.FREE, "RK4", 0.01, 1.0, 1)
     with pytest.raises(UnavailableError, match="Basilisk is not installed"):
         simulators.basilisk(tumbling.FREE, 0.01, 1.0, 1)
+
+
+def test_gradient_flows_beside_steepest_descent_of_pymanopt():
+    """The difference is that of their steps, of first order: it halves with them, and is gone where they vanish."""
+    pytest.importorskip("pymanopt")
+    for _, _, whole, half, extrapolated in manifolds.beside_pymanopt():
+        assert 1.9 < half / whole < 2.1
+        assert extrapolated < 0.02 * whole

@@ -14,7 +14,8 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import child as processes
-from ..report import Report, Table, Target, ratio
+from .. import peers
+from ..report import Report, Table, Target, ratio, take_part
 
 METHODS = {
     "RK4": lt.MetriplecticRungeKutta(4),
@@ -80,7 +81,21 @@ def run(quick: bool) -> Report:
         Table(caption, COLUMNS, rows),
         Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, beside),
     ]
-    return Report("Systems on manifolds", text, tables, targets)
+    found, skipped = take_part({"pymanopt": beside_pymanopt})
+    if found:
+        columns = {
+            "": "text",
+            "Steps": "count",
+            "Distance": "error",
+            "Half the steps": "error",
+            "Extrapolated": "error",
+        }
+        caption = (
+            "Gradient flows to t = 1 beside pymanopt's steepest descent in equal steps, which is of first order: the "
+            "distance of both ends, and that of the end that is extrapolated to steps of size zero."
+        )
+        tables.append(Table(caption, columns, found["pymanopt"]))
+    return Report("Systems on manifolds", text, tables, targets, skipped)
 
 
 def _rows(space: mf.Space, way: str, steps: int) -> list[list]:
@@ -146,7 +161,7 @@ def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
     return lt.MetriplecticSystem(None, energy, entropy, dissipation, space=space, validate=False)
 
 
-def _step(system: lt.MetriplecticSystem, x0, method, steps: int = 5_000) -> float:
+def _step(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> float:
     """Seconds that a step takes, the best of several runs."""
     best = np.inf
     for _ in range(3):
@@ -167,3 +182,77 @@ def _order(system: lt.MetriplecticSystem, x0, method, exact) -> str:
     ends = [lt.integrate(system, x0, (0.0, 1.0), 1.0 / n, method).x[-1] for n in (few, many)]
     errors = [np.abs(end - exact).max() for end in ends]
     return f"{np.log(errors[0] / errors[1]) / np.log(many / few):.2f}" if errors[1] > 1e-13 else "–"
+
+
+# -- pymanopt ---------------------------------------------------------------------------------------------------------
+
+DESCENTS = 200
+"""Steps of steepest descent to t = 1."""
+
+
+class _Equal:
+    """A search along a line that takes steps of one size."""
+
+    def __init__(self, h: float):
+        self.h = h
+
+    def search(self, objective, manifold, x, d, f0, df0):
+        del objective, f0, df0
+        return self.h, manifold.retraction(x, self.h * d)
+
+
+def beside_pymanopt() -> list[list]:
+    """For each space how far pymanopt's steepest descent ends from the gradient flow of the same function.
+
+    Raises
+    ------
+    UnavailableError
+        If pymanopt is not installed.
+    """
+    theirs, A = peers.module("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
+    sphere, definite, lines = mf.Sphere(2), mf.SPD(2), mf.Grassmann(3, 1)
+    of_quadratic = (lambda x: 0.5 * np.sum(x * (A @ x))), lambda x: A @ x
+    of_volume = (
+        lambda x: np.trace(x) - np.linalg.slogdet(x)[1],
+        lambda x: np.eye(2) - np.linalg.inv(x),
+    )
+    column = np.asarray(sphere.random(1))[:, None]
+    cases = [
+        (sphere, lambda x: 0.5 * x @ A @ x, column[:, 0], 1.0, theirs.manifolds.Sphere(3), of_quadratic),
+        (
+            definite,
+            lambda x: jnp.trace(x) - jnp.linalg.slogdet(x)[1],
+            np.asarray(definite.random(1)),
+            1.0,
+            theirs.manifolds.SymmetricPositiveDefinite(2),
+            of_volume,
+        ),
+        # projectors change by twice the square of what the vectors do that they project to
+        (
+            lines,
+            lambda x: 0.5 * jnp.trace(A @ x),
+            column @ column.T,
+            2.0,
+            theirs.manifolds.Grassmann(3, 1),
+            of_quadratic,
+        ),
+    ]
+    rows = []
+    for space, function, x0, t_end, manifold, (cost, gradient) in cases:
+        flow = lt.MetriplecticSystem(None, function, dissipation=lt.Friction(), space=space)
+        run = lt.integrate(flow, x0, (0.0, t_end), t_end / 100, lt.MetriplecticRungeKutta(8))
+        exact = np.asarray(flow.points(run.x[-1]))
+        asked = theirs.function.numpy(manifold)
+        problem = theirs.Problem(manifold, asked(cost), euclidean_gradient=asked(gradient))
+
+        def end(steps, problem=problem, start=column if space is lines else x0):
+            optimizer = theirs.optimizers.SteepestDescent(
+                _Equal(1.0 / steps), max_iterations=steps, min_gradient_norm=0.0, min_step_size=0.0, verbosity=0
+            )
+            x = optimizer.run(problem, initial_point=start).point
+            return x @ x.T if x.shape == column.shape else x
+
+        half, whole = end(DESCENTS // 2), end(DESCENTS)
+        ends = whole, half, 2.0 * whole - half
+        rows.append([space.name, DESCENTS, *(float(np.abs(x - exact).max()) for x in ends)])
+    return rows

@@ -13,6 +13,7 @@ import manifolds as mf
 from manifolds._module import Module
 
 from ..functions.energy import Energy
+from ..tracing.programs import part
 
 
 class Geometry(Module):
@@ -74,7 +75,7 @@ class Geometry(Module):
         """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
         if self.space is None:
             return alpha
-        return self.space.to_vector(self.space._sharp(self.points(x), self.points(alpha).conj()))
+        return self.space.to_vector(_sharp(self.space, self.points(x), self.points(alpha).conj()))
 
     def lowered(self, x, v) -> jax.Array:
         """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
@@ -117,3 +118,8 @@ class Geometry(Module):
             return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
         vector = self.space.to_vector
         return self.space._changes(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
+
+
+@part
+def _sharp(space: mf.Space, x, alpha) -> jax.Array:
+    return space._sharp(x, alpha)

@@ -162,7 +162,7 @@ class Chosen:
                 )
         long = self.steps >= COMPILED_STEPS or system.spectral
         if self.asked == "compiled" or (auto and is_small(system, COMPILED_DIM if long else SMALL_DIM)):
-            compiled = CompiledEngine(system, method)
+            compiled = CompiledEngine(system, method, planned=self.steps)
             try:
                 if operations(compiled) <= SMALL_PROGRAM or not auto or long:
                     return compiled

@@ -22,11 +22,18 @@ from manifolds._module import Module, forwarded
 from manifolds._precision import by_own_settings
 
 from ..errors import FunctionError, InputError
+from ..tracing.programs import part
 from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
 from .coordinates import Choice, Components, check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
 from .rounding import with_rounding
+
+
+@part
+def _gradient(energy: Energy, x) -> jax.Array:
+    return jax.grad(energy.value)(x)
+
 
 LARGEST_CLIQUE = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
@@ -44,7 +51,7 @@ class Energy(Module):
 
     def gradient(self, x) -> jax.Array:
         """The gradient at one state, shape (n,)."""
-        return jax.grad(self.value)(real(x))
+        return _gradient(self, real(x))
 
     def sensitivity(self, x) -> jax.Array:
         """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.

@@ -72,9 +72,12 @@ def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None,
     found, plain = Frame([], [], [], []), Frame([], [], [], [])
     for j, vector in enumerate(vectors):
         rest, taken = found._split(vector)
-        square = jnp.dot(image_of(rest), rest)
-        independent = square > DEPENDENT * jnp.dot(image_of(vector), vector)
-        if like is not None:
+        image = image_of(rest)
+        square = jnp.dot(image, rest)
+        if like is None:
+            whole = square if rest is vector else jnp.dot(image_of(vector), vector)
+            independent = square > DEPENDENT * whole
+        else:
             plain_rest = plain.off(like[j])
             plain_square = jnp.dot(plain_rest, plain_rest)
             independent = (square > 0.0) & (plain_square > DEPENDENT * jnp.dot(like[j], like[j]))
@@ -86,7 +89,7 @@ def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None,
             combination = combination - along * earlier
         found.units.append(rest * scale)
         found.combinations.append(combination * scale)
-        found.images.append(image_of(found.units[-1]))
+        found.images.append(image * scale)
         found.squares.append(jnp.where(independent, square, 0.0))
     return found
 

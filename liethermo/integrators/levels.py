@@ -44,13 +44,13 @@ LAWS = {"conserved": 0.0, "nondecreasing": 1.0, "nonincreasing": -1.0}
 
 
 class Ended(NamedTuple):
-    """A displacement, what it misses of the surface and the levels, the gradients at its end, lengths of directions."""
+    """A displacement, what it misses of the surface and the levels, lengths of directions, and what is to be added."""
 
     d: jax.Array
     left: jax.Array
-    ends: list
     defect: jax.Array
     lengths: jax.Array
+    correction: jax.Array
 
 
 def corrected(
@@ -80,27 +80,27 @@ def corrected(
         found = [system.raised(end, gradient) for gradient in ends]
         return found if surface is None else [surface.along(end, v) for v in found]
 
-    def measured(d, left, ends, found) -> Ended:
-        """What is missed there, and the lengths of the directions.
+    def measured(s: Ended) -> Ended:
+        """What is missed with the correction that was found before, and the next one; and the lengths of directions.
 
         These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
         of their own, as entropies beside a momentum, those by which a function changes most in d.
         """
-        defect = misses(d, ends)
+        d, left = landed(s.d + s.correction)
+        ends = gradients(d)
+        defect, found = misses(d, ends), directions(d, ends)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
         else:
             moved = jnp.linalg.norm(d)
             most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
             lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
-        return Ended(d, left, ends, defect, lengths)
+        return Ended(d, left, defect, lengths, towards(found, defect, passes=min(len(blocks), 2)))
 
-    def nearer(s: Ended, found) -> Ended:
-        new, left = landed(s.d + towards(found, s.defect, passes=min(len(blocks), 2)))
-        return measured(new, left, gradients(new), found)
-
-    def again(s: Ended, _) -> tuple[Ended, None]:
-        return jax.lax.cond(done(s), lambda: s, lambda: nearer(s, directions(s.d, s.ends))), None
+    def again(carry, _):
+        s, ended = carry
+        s = jax.lax.cond(ended, lambda: s, lambda: measured(s))
+        return (s, done(s)), None
 
     def done(s: Ended) -> jax.Array:
         small = jnp.abs(s.defect) <= EPS * s.lengths * jnp.linalg.norm(s.d)
@@ -110,11 +110,11 @@ def corrected(
         """What rounding of the values may make of what is missed: nothing where there is a closed form."""
         return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
 
-    d, left = landed(d)
-    ends = gradients(d)
-    s = measured(d, left, ends, directions(d, ends))
-    s, _ = jax.lax.scan(again, s, length=corrections)  # of a short step one is enough
-    rounding = jax.lax.cond(done(s), lambda: jnp.zeros_like(s.defect), hidden)
+    unknown = jnp.zeros(len(laws))
+    start = Ended(d, jnp.zeros(()), unknown, unknown, jnp.zeros_like(d)), jnp.asarray(False)
+    # a loop from the first on, so that programs hold the functions once; of a short step one correction is enough
+    (s, ended), _ = jax.lax.scan(again, start, length=1 + corrections)
+    rounding = jax.lax.cond(ended, lambda: jnp.zeros_like(s.defect), hidden)
     vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
 

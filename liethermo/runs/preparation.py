@@ -93,7 +93,7 @@ def as_family(family: Family, system: System) -> Family:
     if isinstance(system, AttitudeSystem):
         return as_family(family, system.body).through(AttitudeSystem, system.reconstruction)
     if isinstance(system, EmbeddedSystem):
-        return family.through(EmbeddedSystem, system.conforming)
+        return family.through(EmbeddedSystem, *system.known)
     return as_family(family, system.body).through(DrivenSystem) if isinstance(system, DrivenSystem) else family
 
 

@@ -107,6 +107,11 @@ def check_system(
 
 _AXIOMS = {
     "tangent": ("tangent", "Pi or K leads out of the space: what they return is not a tangent vector"),
+    "classes": (
+        "functions of classes",
+        "energy, entropy or a momentum map changes along the stabilizer, where all points are one: write it by what "
+        "the stabilizer leaves alone, as the projectors of a flag are",
+    ),
     "skew": ("Pi skew", "the Poisson tensor must be antisymmetric"),
     "jacobi": ("Jacobi", "Pi is not a Poisson tensor"),
     "casimir": (
@@ -170,6 +175,8 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
             velocity = system.vector_field(x)
             found["tangent"] = relative(size(velocity - system.tangent(x, velocity)), size(velocity))
         around, _ = system.local(x)
+        if system.space.of_classes:
+            found["classes"] = _along_stabilizer(system, around, x)
         system, x = system.local(x, centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
@@ -197,6 +204,17 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
         dJ = J.gradient(x)
         found[f"momentum map {name}"] = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
     return found | system.own_residuals(x)
+
+
+def _along_stabilizer(system: Any, around: Any, x) -> jax.Array:
+    """What of the gradients is along the constraints but not the space: the largest, relative to its gradient."""
+    size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
+    functions = [f for f in (system.energy, system.entropy, *system.momentum_maps.values()) if f is not None]
+    found = []
+    for gradient in (f.gradient(x) for f in functions):
+        along, whole = around.raised(x, gradient), size(gradient)
+        found.append(size(along - system.tangent(x, along)) / jnp.where(whole > 0.0, whole, 1.0))
+    return jnp.max(jnp.stack(found))
 
 
 def _of_dissipations(system: Any, x) -> dict[str, jax.Array]:

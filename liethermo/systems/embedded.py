@@ -24,6 +24,7 @@ from ..functions.checks import recognised
 from ..functions.energy import Energy
 from ..functions.surface import OnLevels
 from ..tracing.interpret import at_points
+from ..tracing.programs import part
 from .base import System
 
 TANGENT = 1e-12
@@ -40,20 +41,23 @@ class EmbeddedSystem(System):
     ----------
     manifold : System
     conforming : bool
-        Whether the motion is along the level sets of the constraints as it is: then nothing is projected.
+        Whether the motion is along the level sets of the constraints as it is: then it is not projected.
+    untouched : bool
+        Whether projecting it would leave it as it is, so that the force is not projected either.
     """
 
     manifold: System
     conforming: bool = eqx.field(static=True)
+    untouched: bool = eqx.field(static=True)
 
-    def __init__(self, manifold: System, conforming: bool = False):
-        self.manifold, self.conforming = manifold, conforming
+    def __init__(self, manifold: System, conforming: bool = False, untouched: bool = False):
+        self.manifold, self.conforming, self.untouched = manifold, conforming, untouched
         self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
         self.energy = recognised(manifold.energy, self.dim)
         self.entropy = None if manifold.entropy is None else recognised(manifold.entropy, self.dim)
         as_they_are = conforming or isinstance(manifold.poisson, mf.NoPoisson)
         self.poisson = manifold.poisson if as_they_are else _Tangent(manifold)
-        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold)
+        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold, untouched)
         self.momentum_maps = {name: self._recognised(J) for name, J in manifold.momentum_maps.items()}
         self.preserved_as, self.decided = manifold.preserved_as, manifold.decided
 
@@ -67,6 +71,11 @@ class EmbeddedSystem(System):
         return f"a point of {_space(self.manifold).name}"
 
     ledger = forwarded("manifold")
+
+    @property
+    def known(self) -> tuple[bool, bool]:
+        """What is known of the motion, as the constructor is given it."""
+        return self.conforming, self.untouched
 
     @property
     def surface(self) -> OnLevels:
@@ -97,7 +106,7 @@ class EmbeddedSystem(System):
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def at_time(self, t) -> System:
-        return EmbeddedSystem(self.manifold.at_time(t), self.conforming) if self.is_driven else self
+        return EmbeddedSystem(self.manifold.at_time(t), *self.known) if self.is_driven else self
 
     def raised(self, x, alpha):
         """What of a gradient is along the level sets: the direction of corrections."""
@@ -130,15 +139,26 @@ class _Force(Carried):
     """
 
     manifold: System
+    untouched: bool = eqx.field(static=True)
 
     def there(self, system, x) -> There:
         """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
         along = functools.partial(_along, self.manifold, x)
         return There(self.manifold, x, along, along)
 
+    def force(self, system, x, dH, dS, dL):
+        return _forced(self, x, dH, dS, dL)
+
     def divergence(self, system, x):
         """That with the volume of the manifold."""
         return self.part.divergence(self.manifold, system.surface.returned(x))
+
+
+@part
+def _forced(force: _Force, x, dH, dS, dL) -> jax.Array:
+    at = force.there(force.manifold, x)
+    found = force.part.force(at.system, at.x, *at.lifted(dH, dS, dL))
+    return found if force.untouched else at.lower(found)
 
 
 def embedded(system: System) -> System:
@@ -149,8 +169,8 @@ def embedded(system: System) -> System:
         return EmbeddedSystem(system)
     points = _some_points(system)
     points = points * (1.0 + AWAY * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
-    across = np.nan_to_num(at_points(_across, system, points), nan=np.inf)
-    return EmbeddedSystem(system, bool(across.max() <= TANGENT))
+    conforming, untouched = (np.nan_to_num(at_points(_across, system, points), nan=np.inf) <= TANGENT).all(axis=0)
+    return EmbeddedSystem(system, bool(conforming), bool(conforming and untouched))
 
 
 def _some_points(system: System) -> np.ndarray:
@@ -171,7 +191,10 @@ def _inside(surface: OnLevels, x):
 
 
 def _across(system: System, x):
-    """What of a field is across the level sets, and what covectors across them do, relative to the field."""
+    """What of a field is across the level sets, and what covectors across them do, relative to the field.
+
+    Behind it what projecting the field would change: the projection need not be a projector off the manifold.
+    """
     constraints, pull = jax.vjp(functools.partial(_constraints, _space(system)), x)
     random, number = np.random.default_rng(1), 3 + len(system.preserved)
     covectors = random.standard_normal((number, x.shape[0]))
@@ -182,7 +205,8 @@ def _across(system: System, x):
     size = jnp.max(jnp.abs(fields[0]))
     change = jax.jvp(functools.partial(_constraints, _space(system)), (x,), (fields[0],))[1]
     defect = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(change), initial=0.0))
-    return defect / jnp.where(size > 0.0, size, 1.0)
+    changed = jnp.max(jnp.abs(_along(system, x, fields[0]) - fields[0]))
+    return jnp.stack([defect, changed]) / jnp.where(size > 0.0, size, 1.0)
 
 
 def _constraints(space: mf.Space, x):
@@ -191,7 +215,11 @@ def _constraints(space: mf.Space, x):
 
 def _along(system: System, x, w):
     """An array less what would change the constraints of the space."""
-    space = _space(system)
+    return _along_in(_space(system), x, w)
+
+
+@part
+def _along_in(space: mf.Space, x, w):
     return space.to_vector(space._along(space.from_vector(x), space.from_vector(w)))
 
 

@@ -195,6 +195,7 @@ class Builder:
         self._branches: dict[tuple[str, ...], int] = {}
         self.routines: dict[tuple, Any] = {} if around is None else around[0].routines
         self.entries_of: dict[str, tuple[str, ...]] = {}
+        self.calls: dict[tuple, tuple] = {}
 
     @property
     def real(self) -> Builder:

@@ -22,6 +22,11 @@ Function = TypeVar("Function", bound=Callable)
 
 _programs: Latest[Callable] = Latest(KEPT)
 
+PARTS = 512
+"""Parts of programs held in memory, those last used: traced, and not compiled."""
+
+_parts: Latest[Callable] = Latest(PARTS)
+
 
 HASTY = {"xla_backend_optimization_level": 0}
 """How a program is compiled that is run once: to optimise it takes longer than it would save."""
@@ -37,15 +42,30 @@ def hasty_program(function: Function) -> Function:
     return _program(function, HASTY)
 
 
+def part(function: Function) -> Function:
+    """Decorator: trace a function of pytrees once for all places of a program that it is a part of.
+
+    Called outside of one, and with what cannot be told from others, it is as it was.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments):
+        whole, dynamic, key = _split(function, arguments)
+        if not any(isinstance(leaf, jax.core.Tracer) for leaf in dynamic):
+            return whole(dynamic)
+        try:
+            hash(key)
+        except TypeError:
+            return whole(dynamic)
+        return _parts.find(key, lambda: jax.jit(whole))(dynamic)
+
+    return call  # type: ignore[return-value]
+
+
 def _program(function: Function, options: dict | None) -> Function:
     @functools.wraps(function)
     def call(*arguments):
-        leaves, structure = jax.tree_util.tree_flatten(arguments)
-        dynamic = tuple(_strong(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
-        static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-        shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
-        key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
-        whole = _Whole(function, structure, static)
+        whole, dynamic, key = _split(function, arguments)
         if options and any(isinstance(leaf, jax.core.Tracer) for leaf in dynamic):
             return whole(dynamic)  # a part of another program, which is compiled in its own way
         return _programs.find(key, lambda: jax.jit(whole, compiler_options=options))(dynamic)
@@ -57,6 +77,16 @@ def _strong(array):
     """An array whose type is no longer that of a number of Python, for which JAX would compile another program."""
     weak = getattr(array, "weak_type", False) and not isinstance(array, jax.core.Tracer)
     return np.asarray(array) if weak else array
+
+
+def _split(function: Callable, arguments: tuple) -> tuple[_Whole, tuple, tuple]:
+    """A function of the arrays among its arguments, these, and a key that tells it from others."""
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    dynamic = tuple(_strong(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
+    static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    shapes = tuple(None if leaf is None else (np.shape(leaf), leaf.dtype) for leaf in dynamic)
+    key = function, structure, tuple((type(leaf), leaf) for leaf in static), shapes
+    return _Whole(function, structure, static), dynamic, key
 
 
 class _Whole:

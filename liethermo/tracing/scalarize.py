@@ -184,7 +184,17 @@ WRAPPING = frozenset(
 
 
 def _call(b, eqn, *arguments):
+    """A function called, once for the same arguments."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+    jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
+    entries = tuple(a if type(a) is str else repr(a) for a in flat(arguments))
+    known = b.calls.get((id(jaxpr), entries))
+    if known is None:  # with the jaxpr, so that no other takes its place
+        known = b.calls[id(jaxpr), entries] = jaxpr, _called(b, eqn, inner, arguments)
+    return list(known[1])
+
+
+def _called(b, eqn, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     if not isinstance(inner, ClosedJaxpr):
         return _unroll(b, inner, (), arguments)
     if has_products(inner.jaxpr):
@@ -310,8 +320,8 @@ class _Carried:
     def arrays(self) -> list[np.ndarray]:
         return arranged(iter(self.entries), self.avals)
 
-    def released(self, results: Sequence[np.ndarray]) -> bool:
-        """Let go of what a pass has changed; whether there was any."""
+    def released(self, results: Sequence[np.ndarray]) -> str:
+        """Let go of what a pass has changed; the kinds of that, nothing where there was none."""
         changed = [
             i
             for i, (a, new) in enumerate(zip(self.entries, flat(results), strict=True))
@@ -319,7 +329,8 @@ class _Carried:
         ]
         for i in changed:
             self.entries[i] = f"x1_{i}"
-        return bool(changed)
+        found = kinds(self.avals)
+        return "".join(found[i] for i in changed)
 
     @property
     def moving(self) -> list[int]:
@@ -424,9 +435,9 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     alike = not columns
     while True:
         own, results = inside.unrolled(closed, [*given, *carried.arrays, *row])
-        if not carried.released(results[: len(start)]):
+        if not (changed := carried.released(results[: len(start)])):
             break
-        alike = False
+        alike = alike and "i" not in changed
     if len(own.instructions) * length <= (LONG if alike or length > SHORT else HEAVY):
         return None
     moving, new, rows = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])

@@ -3,9 +3,10 @@
 from .base import Space, registered_spaces
 from .correlation import Correlation
 from .euclidean import Euclidean
+from .flag import Flag
 from .grassmann import Grassmann
 from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
-from .homogeneous import Flag, Homogeneous
+from .homogeneous import Homogeneous
 from .hyperbolic import Hyperbolic
 from .level_set import LevelSet
 from .product import Oblique, Power, Product

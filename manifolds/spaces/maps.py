@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -198,6 +198,9 @@ class Maps(ABC):
     def surrounded(self) -> bool:
         """Whether systems are run in the arrays around the space where no retraction is asked for."""
         return True
+
+    of_classes: ClassVar[bool] = False
+    """Whether many points are one: functions have to be the same at all of these."""
 
     def _constraints(self, x):
         """Independent functions that vanish on the space, shape (..., m): by default what :meth:`_returned` takes off.

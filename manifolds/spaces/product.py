@@ -121,6 +121,10 @@ class Product(Space):
 
     _has_equations = True
 
+    @property
+    def of_classes(self):  # type: ignore[override]
+        return any(factor.of_classes for factor in self.factors)
+
     def _constraints(self, x):
         return self._rows_of("_constraints", x)
 
@@ -290,6 +294,10 @@ class Power(Space):
 
     def _random(self, key, size):
         return self.random(key, size)
+
+    @property
+    def of_classes(self):  # type: ignore[override]
+        return self.base.of_classes
 
     @property
     def _normals(self):

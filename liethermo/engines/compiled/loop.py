@@ -7,9 +7,11 @@ them. What a block knows stays in registers, as far as there are enough, and is 
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +48,7 @@ def step_loop(
     varies: np.ndarray,
     lanes: int,
     kept: Sequence[str],
+    hasty: bool,
 ) -> MachineCode:
     """The functions ``advance`` and ``begin`` of :class:`_Steps` as machine code.
 
@@ -61,6 +64,8 @@ def step_loop(
         Which parameters lie in the block, under the name "p"; the others are the same for all.
     kept : sequence of str
         The arrays that are written down at each save.
+    hasty : bool
+        See :class:`.machine_code.MachineCode`.
     """
     module = ir.Module("steps")
     kinds = [NUMBERS, NUMBERS, WHOLES, WHOLE, WHOLE, WHOLE, NUMBERS, WHOLE, NUMBERS, POINTER]
@@ -69,7 +74,45 @@ def step_loop(
     _Steps(function, pieces, layout, state, varies, lanes, kept).write_loops()
     begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "begin")
     _Steps(begin, pieces, layout, state, varies, lanes, kept).write_begin()
-    return MachineCode(module)
+    return MachineCode(module, hasty)
+
+
+class Loops:
+    """The functions of :func:`step_loop`: optimised once many steps are taken.
+
+    Parameters
+    ----------
+    make : function from ``hasty`` to MachineCode
+    small : bool
+        Whether there is a choice: code that is not optimised takes a place on the stack for each of its operations.
+    """
+
+    def __init__(self, make: Callable[[bool], MachineCode], small: bool):
+        self._make, self._small, self._taken, self._lock = make, small, 0, threading.Lock()
+        self._loaded: list[tuple[MachineCode, Callable, Callable]] = []  # all of them: a thread may be in any
+
+    def functions(self, steps: int, planned: int = 0) -> Sequence[Callable]:
+        """``begin`` and ``advance`` for so many steps more, and others that are planned: compiled, or found so."""
+        with self._lock:
+            self._taken += steps
+            hasty = self._small and self._taken + planned <= HASTY_STEPS
+            if not self._loaded:
+                self._load(self._make(hasty))
+            elif not hasty and self._loaded[-1][0].hasty:
+                self._load(MachineCode(self._loaded[-1][0].text))
+            return self._loaded[-1][1:]
+
+    def _load(self, code: MachineCode) -> None:
+        self._loaded.append((code, BEGIN(code.address("begin")), ADVANCE(code.address("advance"))))
+
+
+HASTY_STEPS, HASTY_SIZE = 3_000, 30_000
+"""Steps up to which the loop is not optimised, and operations."""
+
+ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
+                           ctypes.c_int64, *[ctypes.c_void_p] * 2)  # fmt: skip
+
+BEGIN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 
 
 class _Steps(Writer):

@@ -16,17 +16,33 @@ from . import kept, lapack
 
 
 class MachineCode:
-    """A module as machine code: unloaded with this object."""
+    """A module as machine code: unloaded with this object.
 
-    def __init__(self, module: ir.Module):
-        text = str(module)
+    Parameters
+    ----------
+    module : ir.Module, or its text
+    hasty : bool
+        Do not optimise it, which takes longer than a short run. Its numbers are the same.
+
+    Attributes
+    ----------
+    hasty : bool
+        Whether it is not optimised: what is found on disk may be.
+    text : str
+    """
+
+    def __init__(self, module: ir.Module | str, hasty: bool = False):
+        text = self.text = str(module)
         if lapack.PREFIX in text:
             lapack.bind()
         with _lock:
-            name = hashlib.sha256(f"{_this_machine()[-1]}\n{text}".encode()).hexdigest()[:32]
-            found = _object(kept.read(name))
-            if found is None:
-                code = _compile(text)
+            for self.hasty in (False, True) if hasty else (False,):
+                name = hashlib.sha256(f"{_this_machine()[-1]} {self.hasty}\n{text}".encode()).hexdigest()[:32]
+                found = _object(kept.read(name))
+                if found is not None:
+                    break
+            else:
+                code = _compile(text, hasty)
                 kept.write(name, code)
                 found = _object(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
@@ -60,10 +76,10 @@ def _this_machine() -> tuple[llvm.Target, str, str, str]:
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 
 
-def _machine() -> llvm.TargetMachine:
+def _machine(hasty: bool = False) -> llvm.TargetMachine:
     """A compiler for this machine; an engine that is made with one owns it."""
     target, cpu, features, _ = _this_machine()
-    return target.create_target_machine(cpu, features, opt=3, jit=True, reloc="pic")
+    return target.create_target_machine(cpu, features, opt=0 if hasty else 3, jit=True, reloc="pic")
 
 
 def _object(code: bytes | None) -> llvm.ObjectFileRef | None:
@@ -99,9 +115,11 @@ NO_BITS = 8
 """The kind of a section that takes no place in its file."""
 
 
-def _compile(text: str) -> bytes:
-    module, target = llvm.parse_assembly(text), _machine()
+def _compile(text: str, hasty: bool) -> bytes:
+    module, target = llvm.parse_assembly(text), _machine(hasty)
     module.verify()
+    if hasty:
+        return target.emit_object(module)
     options = llvm.create_pipeline_tuning_options(speed_level=3)
     options.slp_vectorization = False
     builder = llvm.create_pass_builder(target, options)

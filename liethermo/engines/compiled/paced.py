@@ -97,7 +97,7 @@ class LanePaces:
     def __init__(self, stepper: PacedStepper, first, parameters, x: np.ndarray, t, stop, length):
         self.stepper, self.first, self.number = stepper, first, len(x)
         each = {name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop", stop), ("length", length))}
-        self.blocks = stepper.begin(parameters, x, **each)
+        self.blocks = stepper.begin(parameters, x, 0, **each)
 
     def follow(self, most: int) -> None:
         self.stepper.run(self.first, self.blocks, 0.0, 1, most)

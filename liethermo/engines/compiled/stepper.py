@@ -8,7 +8,6 @@ finds it.
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import itertools
 import math
@@ -31,7 +30,7 @@ from ..rules import RULES, Rules
 from ..stages import Solved, by_newton
 from ..stepping import State, equations, first_state, take_step
 from .form import Form, numbers_of
-from .loop import DEFERRED, Layout, Piece, step_loop
+from .loop import DEFERRED, HASTY_SIZE, Layout, Loops, Piece, step_loop
 from .machine_code import MachineCode
 from .newton import solver
 
@@ -53,8 +52,8 @@ class CompiledEngine:
 
     name = "compiled"
 
-    def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES):
-        self._parameters, self.portion = numbers_of(system, method), portion_of(system)
+    def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES, planned: int = 0):
+        self._parameters, self.portion, self._planned = numbers_of(system, method), portion_of(system), planned
         self._form, self._method, self._rules = Form.of(system), method, rules
 
     @functools.cached_property
@@ -68,7 +67,7 @@ class CompiledEngine:
         return self._stepper.operations
 
     def begin(self, x) -> State:
-        return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None]))
+        return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned))
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
         new, out = self._run(state, h, saves, every, noise)
@@ -123,7 +122,6 @@ class Stepper:
         self.lanes, self._rules, self._varies = lanes, rules, varies
         self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
         self._lock = threading.Lock()
-        self._functions: tuple[Callable, Callable] | None = None
         self._newton: MachineCode | None = None
         self._form, self._own, self._own_start = form, own, form.size
         system = form.build(parameters)
@@ -145,6 +143,9 @@ class Stepper:
         self._layout = Layout(shapes)
         rows, sizes = self._layout.rows, self._layout.sizes
         self._places = [(rows[name], rows[name] + sizes[name], self.shape(name)) for name in FIELDS]
+        state = [name for name in (*self.names, "h") if name in rows]
+        make = functools.partial(step_loop, self._pieces, self._layout, state, varies, lanes, self.kept)
+        self._code = Loops(make, lanes == 1 and self.operations <= HASTY_SIZE)
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
@@ -208,16 +209,16 @@ class Stepper:
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
-    def begin(self, parameters, x: np.ndarray, **fields: np.ndarray) -> np.ndarray:
+    def begin(self, parameters, x: np.ndarray, planned: int = 0, **fields: np.ndarray) -> np.ndarray:
         """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
 
-        ``parameters`` has shape (p,), or (trajectories, p) where some vary.
+        ``parameters`` has shape (p,), or (trajectories, p) where some vary; so many steps are ``planned``.
         """
         blocks = self.blocks({"x": x, **fields}, parameters)
         first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
         status = self.part(blocks, "status")
         empty = status == EMPTY
-        self._code()[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
+        self._code.functions(0, planned)[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
         status[empty] = EMPTY
         return blocks
 
@@ -314,7 +315,8 @@ class Stepper:
         increments = self._in_blocks(noise, count, saves * every)
         arguments += [out.ctypes.data, saves * every, increments.ctypes.data]
         solve = 0 if self._newton is None else self._solver()
-        while self._code()[1](*arguments, solve) < count:
+        _, advance = self._code.functions(count * saves * every)
+        while advance(*arguments, solve) < count:
             solve = self._solver()
         return out.reshape(count, saves, width, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, width)
 
@@ -339,16 +341,6 @@ class Stepper:
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
-    def _code(self) -> tuple[Callable, Callable]:
-        """The functions ``begin`` and ``advance``, compiled or found compiled."""
-        with self._lock:
-            if self._functions is None:
-                state = [name for name in (*self.names, "h") if name in self._layout.rows]
-                code = step_loop(self._pieces, self._layout, state, self._varies, self.lanes, self.kept)
-                self._loaded = code  # unloaded with this object
-                self._functions = BEGIN(code.address("begin")), ADVANCE(code.address("advance"))
-            return self._functions
-
     def _solver(self) -> int:
         """The address of Newton's method, which is compiled when a step first needs it."""
         with self._lock:
@@ -358,11 +350,6 @@ class Stepper:
                 self._newton = solver(program, self._layout, self._varies, self.lanes)
             return self._newton.address("solve")
 
-
-ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
-                           ctypes.c_int64, *[ctypes.c_void_p] * 2)  # fmt: skip
-
-BEGIN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 
 EMPTY = 9.0
 """Status of a lane without a trajectory."""

@@ -120,6 +120,30 @@ def test_every_engine_goes_by_the_rules_it_is_given():
         assert np.array_equal(state_of_engine.x, x0)
 
 
+def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
+    """Not for a few, nor for those that are found on disk; and the numbers are the same to the bit."""
+    made = []
+    monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
+    compile_it = machine_code._compile
+    monkeypatch.setattr(machine_code, "_compile", lambda text, hasty: made.append(hasty) or compile_it(text, hasty))
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda x: jnp.sum((1.3 + x**2) ** 1.37) + jnp.exp(0.3 * x[0]) * jnp.sin(x[1]) + (0.5 + x[2] ** 2) ** 0.5,
+        mf.so(3).casimirs(2)[0],
+        lt.ProjectedMetric(rate=0.1),
+    )
+
+    def run(steps):
+        return lt.integrate(system, X0, (0.0, 20.0), 20.0 / steps, lt.MetriplecticRungeKutta(4), engine="compiled").x
+
+    few = run(400)
+    assert made == [True]
+    run(4_000)
+    assert made == [True, False]
+    assert np.array_equal(run(400), few)
+    assert made == [True, False]
+
+
 @pytest.mark.slow
 def test_parameters_are_arguments(monkeypatch):
     """A sweep over inertias and rates compiles once; another pattern of zeros is another program."""

@@ -150,6 +150,40 @@ def test_a_step_out_of_the_domain_ends_the_run():
     assert len(run.t) == 2
 
 
+def on_a_sphere(energy):
+    return lt.MetriplecticSystem(None, energy, lambda x: x[1], lt.ProjectedMetric(), space=mf.Sphere(2))
+
+
+@pytest.mark.parametrize(
+    ("build", "error", "message"),
+    [
+        (lambda: on_a_sphere(lambda x: jnp.log(x[0] - 2.0)), lt.InputError, "not finite at any of the 4 test points"),
+        (lambda: on_a_sphere(lambda x: x[0] * x[:2]), lt.FunctionError, r"the energy must return one number.*\(2,\)"),
+        (
+            lambda: lt.integrate(on_a_sphere(lambda x: x[0]), [1.0, 1.0, 0.0], (0.0, 1.0), 0.1, RK4),
+            mf.OffManifoldError,
+            r"S\^2: .*is off the space: residual 0\.414.*project=True",
+        ),
+        (
+            lambda: lt.integrate(on_a_sphere(lambda x: x[0]), [1.0, np.nan, 0.0], (0.0, 1.0), 0.1, RK4),
+            ValueError,
+            "not finite",
+        ),
+    ],
+)
+def test_what_is_no_system_or_no_point_is_refused_in_one_line(build, error, message):
+    with pytest.raises(error, match=message) as refusal:
+        build()
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_start_where_the_energy_is_not_finite_ends_the_run_with_a_reason():
+    system = on_a_sphere(lambda x: jnp.log(x[0]) + x[1])
+    with pytest.raises(lt.IntegrationError, match="energy") as refusal:
+        lt.integrate(system, [-1.0, 0.0, 0.0], (0.0, 1.0), 0.1, RK4)
+    assert "not finite" in str(refusal.value)
+
+
 def test_a_point_near_the_space_stays_as_near():
     """What passes as a point is not moved: it stays on the level that it begins on."""
     system = relaxing(mf.Sphere(2))

@@ -81,6 +81,23 @@ def test_a_run_depends_on_the_class_alone():
     assert not close(runs[0].x[-1], runs[1].x[-1])
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_functions_that_are_not_of_classes_are_refused(many):
+    """An entry of the rotation, which a turn within a piece changes; in a product too. The square of a row does not."""
+    space = mf.Flag(1, 2) * mf.Euclidean(1) if many else mf.Flag(1, 2)
+
+    def rotation(x):
+        return space.split(x)[0] if many else x
+
+    def build(energy):
+        return lt.MetriplecticSystem(None, energy, lambda x: rotation(x)[2, 0] ** 2, lt.ProjectedMetric(), space=space)
+
+    assert build(lambda x: rotation(x)[0, 0] + jnp.sum(rotation(x)[1, 1:] ** 2)).check().passed
+    with pytest.raises(lt.AxiomError, match=r"functions of classes fails: residual 0.*projectors of a flag") as refusal:
+        build(lambda x: rotation(x)[0, 1])
+    assert "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
