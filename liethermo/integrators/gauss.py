@@ -209,15 +209,17 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if not functions:
             return part.force(system, u, dH, dS, dL)
         gradients = [known[name] for name in functions] + [known[key] for key, name in own if name not in functions]
-        if part.energy_law != "conserved":
+        if part.energy_law == "nonincreasing":
             off = _projector(system, u, gradients)
             return off(part.force(system, u, off(dH), dS, dL))
-        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
+        if part.energy_law == "conserved":
+            gradients = [Gradients(dH, system.energy.gradient(u)), *gradients]
+        off = _projector(system, u, gradients)
         return off(part.force(system, u, dH, off(dS), dL))
 
     def _imposed(self, part: Dissipation, own: set[str], system: System) -> dict[str, Energy]:
         """The functions that a dissipation has to keep, by name, where it does not keep them all by construction."""
-        functions = self._kept(system) | (_made_of(system) if part.energy_law != "conserved" else {})
+        functions = self._kept(system) | (_made_of(system) if part.energy_law == "nonincreasing" else {})
         exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
         casimirs = {ENTROPY, *self._casimirs(system)} if part.keeps_casimirs else set()
 

@@ -148,11 +148,11 @@ def test_the_entropy_has_a_discrete_gradient_in_closed_form():
 METHODS = {
     "midpoint": (lt.MetriplecticMidpoint(), 2, (0.4, 0.2, 0.1)),
     "Gauss 2": (lt.MetriplecticGauss(2), 4, (0.8, 0.4, 0.2)),
-    "Gauss 3": (lt.MetriplecticGauss(3), 6, (1.2, 0.6, 0.3)),
+    "Gauss 3": (lt.MetriplecticGauss(3), 6, (0.3, 0.2, 0.15)),
     "explicit 4": (lt.MetriplecticRungeKutta(4), 4, (0.4, 0.2, 0.1)),
     "explicit 6": (lt.MetriplecticRungeKutta(6), 6, (0.8, 0.4, 0.2)),
     "explicit 8": (lt.MetriplecticRungeKutta(8), 8, (0.6, 0.3)),
-    "Taylor 5": (lt.MetriplecticTaylor(5), 5, (0.4, 0.2, 0.1)),
+    "Taylor 5": (lt.MetriplecticTaylor(5), 5, (0.1, 0.05, 0.025)),
 }
 
 
@@ -255,6 +255,24 @@ def test_noise_without_a_bath():
     assert turning.energy_law is None
     assert turning.entropy_law == "nondecreasing"
     assert np.abs(motion(turning, RHO) - lindblad(RHO, QUBIT, [(X, 0.3)])).max() <= 1e-15
+
+
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(1), lt.MetriplecticGauss(2)], ids=str
+)
+def test_noise_without_a_bath_at_the_order_of_the_method(method):
+    """Nothing but the trace is kept: neither the energy nor the entropy is taken off the force."""
+    q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(X, 0.3)]))
+
+    def field(t, y):
+        rate = lindblad(y.reshape(2, 2), QUBIT, [(X, 0.3)])
+        return rate.ravel()
+
+    exact = scipy.integrate.solve_ivp(field, (0.0, 1.6), RHO.ravel(), method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    runs = [lt.integrate(q, q.state(RHO), (0.0, 1.6), h, method) for h in (0.2, 0.1)]
+    assert all(run.audit().passed for run in runs)
+    errors = [np.abs(q.density(run.x[-1]) - exact.reshape(2, 2)).max() for run in runs]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.2)
 
 
 def test_products_and_partial_traces():
