@@ -86,7 +86,7 @@ class OnDemand:
         self.newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def __call__(self, steps: Callable[[bool], Any], code: Callable = lambda found: found[0].status) -> Any:
-        """What ``steps(newton)`` finds, in which ``code`` tells how steps ended, of one trajectory or of many."""
+        """What ``steps(newton)`` finds; ``code`` reads from it how steps ended, those of one trajectory or of many."""
         if not self.newton:
             found = steps(False)
             if not np.isin(code(found), UNTAKEN).any():

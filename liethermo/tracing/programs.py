@@ -74,7 +74,7 @@ def _program(function: Function, options: dict | None) -> Function:
 
 
 def _strong(array):
-    """An array whose type is no longer that of a number of Python, for which JAX would compile another program."""
+    """An array of a type of its own: for one made from a Python number, JAX would compile another program."""
     weak = getattr(array, "weak_type", False) and not isinstance(array, jax.core.Tracer)
     return np.asarray(array) if weak else array
 

@@ -106,7 +106,7 @@ class Loops:
         self._loaded.append((code, BEGIN(code.address("begin")), ADVANCE(code.address("advance"))))
 
 
-HASTY_STEPS, HASTY_SIZE = 3_000, 30_000
+HASTY_STEPS, HASTY_SIZE = 1_000, 30_000
 """Steps up to which the loop is not optimised, and operations."""
 
 ADVANCE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
