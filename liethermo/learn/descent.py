@@ -9,9 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 MEMORY = 0.95
 """The share of a mean of gradients, of their squares or of their products that is kept from step to step."""
+
+ADAM = 0.9, 0.99
+"""The same of means of gradients and of their squares, of numbers outside matrices, for which Adam is run."""
 
 REFRESHED = 10
 """Steps between two looks at the eigenvectors."""
@@ -44,6 +48,12 @@ def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
         if len(shape) == 2 and min(shape) > 1 and max(shape) <= LARGEST
     ]
 
+    def memories(size: int) -> tuple[np.ndarray, np.ndarray]:
+        first, second = (np.full(size, memory) for memory in ADAM)
+        for at, _ in matrices:
+            first[at] = second[at] = MEMORY
+        return first, second
+
     def init(vector):
         zero = jnp.zeros_like(vector)
         sides = [[(jnp.eye(n), jnp.zeros((n, n))) for n in shape] for _, shape in matrices]
@@ -53,10 +63,11 @@ def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
         count, mean, square, sides = state
         means = [[MEMORY * S + (1.0 - MEMORY) * P for (_, S), P in zip(pair, _products(slope[at].reshape(shape)),
                   strict=True)] for (at, shape), pair in zip(matrices, sides, strict=True)]  # fmt: skip
-        turned, mean = _turned(slope, matrices, sides), MEMORY * mean + (1.0 - MEMORY) * slope
-        square = MEMORY * square + (1.0 - MEMORY) * turned**2
-        share = 1.0 - MEMORY ** (count + 1.0)
-        step = _turned(mean / share, matrices, sides) / (jnp.sqrt(square / share) + TINY)
+        first, second = memories(slope.size)
+        turned, mean = _turned(slope, matrices, sides), first * mean + (1.0 - first) * slope
+        square = second * square + (1.0 - second) * turned**2
+        step = _turned(mean / (1.0 - first ** (count + 1.0)), matrices, sides)
+        step = step / (jnp.sqrt(square / (1.0 - second ** (count + 1.0))) + TINY)
         step = _turned(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
 
         def refreshed(_):

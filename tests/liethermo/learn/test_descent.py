@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from liethermo.learn.descent import descent
+from liethermo.learn.descent import ADAM, descent
 
 optax = pytest.importorskip("optax")
 
@@ -51,6 +51,6 @@ def test_without_matrices_it_is_adam():
         return jnp.sum(jnp.array([1.0, 10.0, 100.0]) * x**2)
 
     x, own = _descended(descent([(2,)], schedule), loss, start)
-    other, values = _descended(optax.adam(schedule, b1=0.95, b2=0.95), loss, start)
+    other, values = _descended(optax.adam(schedule, *ADAM), loss, start)
     np.testing.assert_allclose(own, values, rtol=1e-9)
     np.testing.assert_allclose(x, other, atol=1e-12)
