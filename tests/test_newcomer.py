@@ -45,7 +45,6 @@ def test_3_an_energy_of_my_own():
     assert lt.integrate(system, [0.3, 0.5, 0.8], (0.0, 20.0), 0.1).audit().passed
 
 
-@pytest.mark.slow
 def test_4_a_method_and_a_step():
     body, x0 = lt.models.rigid_body((3.0, 2.0, 1.0)), [0.1, 0.2, 1.0]
     suggestion = lt.suggest_method(body, x0, rtol=1e-8)

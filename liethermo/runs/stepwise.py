@@ -77,6 +77,7 @@ def follow(
     keep: Keep,
     most_kept: float = MOST_KEPT,
     watch: Watch | None = None,
+    together: int = TOGETHER,
 ) -> Outcome:
     """Follow a run from its start to its end, an event, a failure or Ctrl-C.
 
@@ -90,16 +91,20 @@ def follow(
         Steps after which there is no room for more.
     watch : Watch, optional
         Looks at each step, and may end the run in it.
+    together : int
+        Attempts between looks, at most.
     """
     outcome = Outcome(paces.state())
     try:
-        _follow(engine, paces, pacing, outcome, stops, keep, most_kept, watch)
+        _follow(engine, paces, pacing, outcome, stops, keep, most_kept, watch, 1 if watch else together)
     except STOPPED as error:
         outcome.stopped = stopped_by(error)
     return outcome
 
 
-def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None) -> None:
+def _follow(
+    engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None, together: int
+) -> None:
     guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
     outcome.jumps = guide.jumps
 
@@ -118,7 +123,7 @@ def _follow(engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_
             outcome.limit = "memory"
             return
         before = outcome.state
-        rows = paces.attempts(int(min(1 if watch else TOGETHER, max(1.0, most_kept - int(before.step)))))
+        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
         outcome.rejected = int(scalar("rejected"))
         after: Any = paces.state()
         outcome.state = after._replace(status=np.int64(0))

@@ -178,7 +178,8 @@ def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) ->
         iterations[1:] = []
         length = 1e6 / rate
         pacing = pacing_of(Adaptive(rtol), used, length, None)
-        return follow(engine, engine.paces(pacing, x, 0.0, length, length), pacing, np.array([length]), keep)
+        paces = engine.paces(pacing, x, 0.0, length, length)
+        return follow(engine, paces, pacing, np.array([length]), keep, together=1)  # since iterations are counted
 
     with contextlib.suppress(_EnoughError):
         engine, rate = Chosen(system, used, "auto", 1), speed / max(size, 1e-300)
