@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, cast
 
@@ -14,6 +15,7 @@ from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.matrices.linear import inverse
 
+from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, Quadratic, as_energy
@@ -77,7 +79,26 @@ class OnVelocities(OnContactManifold):
         return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.state(x, batch=True))
 
 
-class ThermodynamicHerglotz(OnVelocities):
+class OfLagrangian(OnVelocities):
+    """A system that a Lagrangian makes alone, without forces beside it."""
+
+    def __init__(
+        self,
+        lagrangian,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
+        self._build(structure, dim, energy, *self._terms(dim, space), momentum_maps, validate, states_on(space))
+
+    @abstractmethod
+    def _terms(self, dim: int, space: mf.Space | None) -> tuple[Energy | None, Dissipation]:
+        """The entropy and the dissipation."""
+
+
+class ThermodynamicHerglotz(OfLagrangian):
     """Thermodynamic Herglotz equations: the evolution field of a Lagrangian L(q, v, S) [SML 12].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = v . L_v``, in the state (q, v, S). It is the field ``Gamma_L`` of
@@ -110,18 +131,8 @@ class ThermodynamicHerglotz(OnVelocities):
 
     production_name: ClassVar[str] = "Delta(L)"
 
-    def __init__(
-        self,
-        lagrangian,
-        dim: int | None = None,
-        momentum_maps=(),
-        validate: bool = True,
-        space: mf.Space | None = None,
-    ):
-        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
-        friction = LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
-        entropy, states = entropy_component(dim), states_on(space)
-        self._build(structure, dim, energy, entropy, friction, momentum_maps, validate, states)
+    def _terms(self, dim, space):
+        return entropy_component(dim), LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
 
     def hamiltonian_system(self) -> EvolutionSystem:
         """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
@@ -131,7 +142,7 @@ class ThermodynamicHerglotz(OnVelocities):
         return tangency(self, x)
 
 
-class Herglotz(OnVelocities):
+class Herglotz(OfLagrangian):
     """Herglotz' equations of 1930, the contact field of a Lagrangian, for comparison [SML 10].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = L``, in the state (q, v, S): S is the action, and ``E_L' = L_S E_L``.
@@ -142,16 +153,8 @@ class Herglotz(OnVelocities):
         As for :class:`ThermodynamicHerglotz`.
     """
 
-    def __init__(
-        self,
-        lagrangian,
-        dim: int | None = None,
-        momentum_maps=(),
-        validate: bool = True,
-        space: mf.Space | None = None,
-    ):
-        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
-        self._build(structure, dim, energy, None, ReebDrift(), momentum_maps, validate, states_on(space))
+    def _terms(self, dim, space):
+        return None, ReebDrift()
 
     def hamiltonian_system(self) -> ContactSystem:
         """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""

@@ -50,9 +50,9 @@ def part(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*arguments):
+        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(arguments)):
+            return function(*arguments)
         whole, dynamic, key = _split(function, arguments)
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in dynamic):
-            return whole(dynamic)
         try:
             hash(key)
         except TypeError:

@@ -51,6 +51,7 @@ class Homogeneous(Space):
     horizontal: tuple[tuple[float, ...], ...]
     name: str = "G/H"
     metric = "normal"
+    searched = True
     of_classes = True
 
     def __init__(self, group, stabilizer, name: str | None = None):
@@ -133,12 +134,6 @@ class Homogeneous(Space):
         """The horizontal c, with b in H, for which ``exp(c) exp(b)`` is the way from x to y."""
         reach = self.injectivity_radius() * (1.0 - CUT_MARGIN)
         return factored(self.upstairs.group, self._m, self._h, self.upstairs._relative(x, y), reach)
-
-    def _why_no_log(self, x, y):
-        return (
-            f"no geodesic shorter than {self.injectivity_radius():.6g} from x to y was found, and a longer one might "
-            "not be the shortest; go by a point between them"
-        )
 
 
 def _space_of(group) -> BiInvariantSpace:

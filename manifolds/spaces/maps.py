@@ -29,6 +29,8 @@ class Maps(ABC):
     """Whether the space is a group and :meth:`exp` the exponential of it, as with a bi-invariant metric."""
     smooth: bool = True
     """Whether its maps have derivatives of every order, not of the first alone."""
+    searched: bool = False
+    """Whether ``log`` looks for the geodesic, up to the injectivity radius."""
     dtype: np.dtype = np.dtype(np.float64)
 
     @property
@@ -281,6 +283,11 @@ class Maps(ABC):
         """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
         if not self.geodesics:
             return "the chart around x does not reach y; go by a point between them"
+        if self.searched:
+            return (
+                f"no geodesic shorter than {self.injectivity_radius():.6g} from x to y was found, and a longer one "
+                "might not be the shortest; go by a point between them"
+            )
         return (
             "y is at the cut locus of x or beyond it (injectivity radius "
             f"{self.injectivity_radius():.6g}), where no one geodesic is the shortest; go by a point between them"

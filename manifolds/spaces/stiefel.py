@@ -37,6 +37,7 @@ class Stiefel(Space):
     n: int
     p: int
     metric = "canonical"
+    searched = True
 
     def __post_init__(self):
         checked_size(self.n, 2, "Stiefel(n, p)")
@@ -171,12 +172,6 @@ class Stiefel(Space):
             lambda linear, b: solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b[:, None])[:, 0],
         )
         return self._from_coordinates(x, c)
-
-    def _why_no_log(self, x, y):
-        return (
-            f"no geodesic shorter than {self.injectivity_radius():.6g} from x to y was found, and a longer one might "
-            "not be the shortest; go by a point between them"
-        )
 
 
 def _transposed(a):
