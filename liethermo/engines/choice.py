@@ -25,12 +25,12 @@ from .stepping import State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
 
-SMALL_DIM, SMALL_PROGRAM = 16, 30_000
-"""Components of a state and operations of a step up to which it is compiled in no more time than XLA takes, so that
-"auto" always takes it. On a step of 8,000 operations XLA spends three times as long, on one of 28,000 as long."""
-
 COMPILED_DIM = 40
 """Components up to which unrolled scalar code is a good idea."""
+
+SMALL_PROGRAM = 30_000
+"""Operations of a step up to which it is compiled in no more time than XLA takes, so that "auto" always takes it. On a
+step of 8,000 operations XLA spends three times as long, on one of 28,000 as long."""
 
 COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
@@ -161,7 +161,7 @@ class Chosen:
                     "ComposedSystem of lt.Copies joined by lt.Each does"
                 )
         long = self.steps >= COMPILED_STEPS or system.spectral
-        if self.asked == "compiled" or (auto and is_small(system, COMPILED_DIM if long else SMALL_DIM)):
+        if self.asked == "compiled" or (auto and is_small(system)):
             compiled = CompiledEngine(system, method, planned=self.steps)
             try:
                 if operations(compiled) <= SMALL_PROGRAM or not auto or long:
@@ -222,9 +222,9 @@ class _Compiled:
         self._paces.write(name, chosen, values)
 
 
-def is_small(system: System, most: int) -> bool:
-    """Whether a system is worth trying to compile: unrolled code, on the CPU, for ``most`` components at most."""
-    return system.unrollable and system.dim <= most and jax.default_backend() == "cpu"
+def is_small(system: System) -> bool:
+    """Whether a system is worth trying to compile: unrolled code, on the CPU, for few components."""
+    return system.unrollable and system.dim <= COMPILED_DIM and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from manifolds._precision import by_own_settings
 
-from ..engines.choice import COMPILED_DIM, is_small, warn_of_fallback
+from ..engines.choice import is_small, warn_of_fallback
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
@@ -155,7 +155,7 @@ def ensemble(
         else:
             (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)
 
-    small = engine == "auto" and is_small(member, COMPILED_DIM)
+    small = engine == "auto" and is_small(member)
     chosen = "compiled" if engine == "compiled" or small else "array"
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
         if chosen == "compiled":

@@ -77,8 +77,8 @@ def integrate(
         Keep all states, so that ``solution(t)`` is known at any time, by a step from the last state before t.
     engine : {"auto", "array", "compiled", "sparse"}
         "array" runs JAX programs, for systems of any size. "compiled" runs machine code, which takes less time a step;
-        it is compiled the first time and kept on disk. "auto" compiles for up to 16 components if a step has few
-        operations, and for up to 40 in runs of 20,000 steps and more. It falls back to "array", with a warning, if a
+        it is compiled the first time and kept on disk. "auto" compiles for up to 40 components if a step has few
+        operations or the run 20,000 steps and more. It falls back to "array", with a warning, if a
         part of the system cannot be compiled. "sparse" solves stiff steps of large systems with sparse matrices.
         "auto" takes it from 200 components on, if the system knows which of its components act on which (networks do).
     on_failure : {"raise", "return"}

@@ -19,7 +19,7 @@ import numpy as np
 
 from manifolds.testing import Report, Suite
 
-from ..engines.choice import COMPILED_DIM, is_small
+from ..engines.choice import is_small
 from ..errors import InputError
 from ..functions.energy import Pullback
 from ..functions.gradients import EPS
@@ -326,7 +326,7 @@ def split(case: Case) -> Outcome:
 def engines(case: Case) -> Outcome:
     """Every engine takes the same steps."""
     case.same("array engine", case.run(engine="array"))
-    if not is_small(case.system, COMPILED_DIM):
+    if not is_small(case.system):
         return None
     try:
         case.same("compiled engine", case.run(engine="compiled"))

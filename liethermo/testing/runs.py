@@ -10,7 +10,7 @@ import numpy as np
 
 from manifolds.testing import Suite
 
-from ..engines.choice import COMPILED_DIM, is_small
+from ..engines.choice import is_small
 from ..integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod
 from ..results.audit import ACCURACY, INEXACT, TAKEN
 from ..runs.integrate import integrate
@@ -54,7 +54,7 @@ def follow_laws(suite: Suite, system: System, method: OneStepMethod, x0, h: floa
     again = integrate(rebuilt(system), x0, (0.0, STEPS * h), h, rebuilt(method), on_failure="return", engine="array")
     same = np.array_equal(solution.x, again.x) and solution.laws == again.laws
     suite.true(f"{label}the same to the bit when taken apart and put together", same)
-    if is_small(system, COMPILED_DIM):
+    if is_small(system):
         try:
             compiled = integrate(system, x0, (0.0, STEPS * h), h, method, on_failure="return", engine="compiled")
         except UnsupportedPrimitive as error:

@@ -231,7 +231,7 @@ def test_newtons_method_that_cannot_be_compiled(adaptive):
 def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     chosen = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen() == "compiled"
-    monkeypatch.setattr("liethermo.engines.choice.SMALL_DIM", 2)
+    monkeypatch.setattr("liethermo.engines.choice.SMALL_PROGRAM", 2)
     assert chosen() == "array"
     monkeypatch.setattr("liethermo.engines.choice.COMPILED_STEPS", 5)
     assert chosen() == "compiled"
