@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import real_array
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
+from ..functions.checks import check_shape
 from ..functions.conditions import numbers, require
 from ..functions.indices import Indices
 from .geometry import Geometry
@@ -36,9 +36,7 @@ def zero_state(dim: int):
 
 def checked_rate(rate) -> jax.Array:
     """A rate as one non-negative number (or a traced one)."""
-    array = real_array(rate)
-    if array.shape != ():
-        raise InputError(f"a rate is one number, not an array of shape {array.shape}")
+    array = numbers(rate, "a rate", ())
     require(
         array,
         lambda rate: rate >= 0.0,
@@ -49,7 +47,7 @@ def checked_rate(rate) -> jax.Array:
 
 def checked_rates(rates) -> jax.Array:
     """A rate, or one for each site, as an array of non-negative numbers (or traced ones)."""
-    array = real_array(rates)
+    array = numbers(rates, "a rate")
     if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
         least = float(np.asarray(array).min())
         raise InputError(f"a dissipation rate must be >= 0, not {least}: a negative one would lower the entropy")
@@ -68,7 +66,7 @@ def checked_bath(bath) -> Indices | None:
 
 def not_a_rate(form, dissipation: object, what: str) -> None:
     """Raise where a number stands for a form: that of a multiple of the identity is another thing than a rate."""
-    if form is not None and not callable(form) and np.ndim(form) == 0:
+    if isinstance(form, int | float):
         raise InputError(
             f"{type(dissipation).__name__} takes {what} first, a matrix, and {form} is a number: for a rate say "
             f"rate={form}"
@@ -110,9 +108,12 @@ def check_matrix(form, dim: int, what: str) -> None:
         if form.entries.shape != (dim,):
             raise InputError(f"{what} has {form.entries.size} entries, and a state has {dim} components")
         return
-    shape = jax.eval_shape(lambda x: jnp.asarray(form_at(form, x)), zero_state(dim)).shape
-    if shape != (dim, dim):
-        raise InputError(f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {shape}")
+    if callable(form):
+        check_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
+    elif form.shape != (dim, dim):
+        raise InputError(
+            f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {form.shape}"
+        )
 
 
 def needed_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:

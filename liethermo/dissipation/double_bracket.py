@@ -8,10 +8,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from manifolds._arrays import real_array
 from manifolds.matrices.blocks import Diagonal
 
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 from ..functions.indices import Indices
 from .base import Dissipation
 from .checks import check_matrix, checked_bath, checked_rate, over_sites, semidefinite
@@ -94,6 +93,6 @@ class DoubleBracket(Dissipation):
 def _form(metric) -> Any:
     if np.ndim(metric) != 1:
         return semidefinite(metric, "the metric")
-    entries = real_array(metric)
+    entries = numbers(metric, "the metric")
     require(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, not {value}")
     return Diagonal(entries)

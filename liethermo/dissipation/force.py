@@ -6,12 +6,11 @@ import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from manifolds._module import Module
 
-from ..errors import InputError
+from ..functions.checks import check_shape
 from .base import Dissipation
 from .checks import needed_algebra
 
@@ -34,10 +33,7 @@ class EulerPoincareForce(Dissipation):
 
     def prepared(self, system):
         needed_algebra(system, "EulerPoincareForce")
-        xi = jax.ShapeDtypeStruct(system.shape, jnp.float64)
-        shape = jax.eval_shape(lambda xi: jnp.asarray(self.F(xi)), xi).shape
-        if shape != system.shape:
-            raise InputError(f"the force F must map shape {system.shape} to the same, but it returns shape {shape}")
+        check_shape(self.F, [system.shape], [system.shape], "the force F", f"a velocity of shape {system.shape}")
         return dataclasses.replace(self, F=_OnSites(self.F, system.shape)) if system.sites else self
 
     def momentum(self, dH, turned):

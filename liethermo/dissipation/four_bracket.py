@@ -12,8 +12,10 @@ from manifolds.matrices.linear import skew
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import IndefiniteError, InputError
+from ..functions.checks import check_shape
+from ..functions.conditions import numbers
 from .base import Dissipation
-from .checks import check_matrix, form_at, semidefinite, zero_state
+from .checks import check_matrix, form_at, semidefinite
 from .factor import Factor
 from .inner_product import InnerProductDissipation, KillingDissipation
 
@@ -41,7 +43,7 @@ class FourBracket(Dissipation):
 
     def __init__(self, tensor):
         if not callable(tensor):
-            tensor = jnp.asarray(tensor, dtype=jnp.float64)
+            tensor = numbers(tensor, "a 4-bracket")
             if tensor.ndim != 4 or len(set(tensor.shape)) != 1:
                 raise InputError(f"a 4-bracket has shape (n, n, n, n), not {tensor.shape}")
             _check_curvature_symmetries(tensor)
@@ -62,9 +64,11 @@ class FourBracket(Dissipation):
         return KillingDissipation() if form is None else InnerProductDissipation(form)
 
     def prepared(self, system):
-        shape = jax.eval_shape(lambda x: jnp.asarray(form_at(self.tensor, x)), zero_state(system.dim)).shape
-        if shape != (system.dim,) * 4:
-            raise InputError(f"the 4-bracket has shape {shape}, but the state has {system.dim} components")
+        n = system.dim
+        if callable(self.tensor):
+            check_shape(self.tensor, [(n,)], [(n,) * 4], "the 4-bracket", f"a state of shape ({n},)")
+        elif self.tensor.shape != (n,) * 4:
+            raise InputError(f"the 4-bracket has shape {self.tensor.shape}, but the state has {n} components")
         return self
 
     def force(self, system, x, dH, dS, dL):

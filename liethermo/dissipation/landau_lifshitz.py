@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds._arrays import real_array
 from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled, summed
 
 from ..errors import InputError
+from ..functions.conditions import numbers
 from ..functions.frames import root
 from ..functions.indices import Indices
 from .base import Dissipation
@@ -44,14 +44,14 @@ class LandauLifshitz(Dissipation):
     bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, rate=1.0, bath=None):
-        array = real_array(rate)
+        array = numbers(rate, "a rate")
         self.rate = checked_rate(array) if array.shape == () else checked_rates(array)
         self.bath = checked_bath(bath)
 
     @staticmethod
     def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
         """Gyromagnetic ratio and rate of Landau and Lifshitz for the damping alpha and the ratio of Gilbert's form."""
-        alpha, ratio = real_array(alpha), real_array(ratio)
+        alpha, ratio = numbers(alpha, "alpha"), numbers(ratio, "ratio")
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
     energy_law = "nonincreasing"

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arrays import real_array
 from manifolds._module import Module, forwarded
 from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
+from ..functions.conditions import numbers
 from .base import Dissipation
 from .checks import zero_state
 from .factor import Factor
@@ -218,9 +218,7 @@ class ActivatedFriction(NamedPotential):
 
 
 def _number(value, what: str, zero: bool) -> jax.Array:
-    number = real_array(value)
-    if number.shape != ():
-        raise InputError(f"{what} is one number, not an array of shape {number.shape}")
+    number = numbers(value, what, ())
     if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if zero else float(number) > 0.0):
         raise InputError(f"{what} must be {'>=' if zero else '>'} 0, not {float(number):g}")
     return number

@@ -94,13 +94,22 @@ def traced_energies(tree, dim: int, role: str | None = None):
 
 
 def check_shape(
-    function: Callable, arguments: Sequence[tuple[int, ...]], shape: tuple[int, ...], what: str, at: str
-) -> Callable:
-    """A function of arrays of these shapes, traced; FunctionError unless it gives ``shape``; ``at`` names them."""
+    function: Callable, arguments: Sequence[tuple[int, ...]], shapes: Sequence[tuple[int, ...]], what: str, at: str
+) -> tuple[Callable, tuple[int, ...]]:
+    """A function of arrays of these shapes, traced, and the shape of its values; ``at`` names its arguments.
+
+    Raises
+    ------
+    FunctionError
+        Unless it gives real numbers of one of ``shapes``.
+    """
     try:
         function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
         raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
-    if found.shape != shape:
-        raise FunctionError(f"{what} has shape {shape}, not {found.shape}")
-    return function
+    if found.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise FunctionError(f"{what} has shape {wanted}, not {found.shape}")
+    if jnp.iscomplexobj(found):
+        raise FunctionError(f"{what} is real, not {found.dtype}; take the real part if that is meant")
+    return function, found.shape

@@ -67,8 +67,8 @@ def require(value, test: Callable, message: str) -> None:
         raise InputError(refusal(message, value))
 
 
-def numbers(value, what: str) -> jax.Array:
-    """What a user gives as numbers, as an array of doubles.
+def numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
+    """What a user gives as numbers, as an array of doubles; of one of these shapes, where any are given.
 
     Raises
     ------
@@ -76,10 +76,18 @@ def numbers(value, what: str) -> jax.Array:
         If it is none.
     """
     try:
-        return real_array(value)
+        kind = "f" if is_traced(value) else (value if isinstance(value, jax.Array) else np.asarray(value)).dtype.kind
+        if kind not in "biufO" or value is None:  # NumPy would make numbers of texts, and NaN of None
+            raise TypeError(f"not {kind}")
+        array = real_array(value)
     except (TypeError, ValueError) as error:
-        shown = repr(value) if isinstance(value, str | complex) else type(value).__name__
+        shown = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
         raise InputError(f"{what} is made of real numbers, not {shown}") from error
+    if shapes == ((),) and array.shape:
+        raise InputError(f"{what} is one number, not an array of shape {array.shape}")
+    if shapes and array.shape not in shapes:
+        raise InputError(f"{what} has shape {' or '.join(map(str, shapes))}, not {array.shape}")
+    return array
 
 
 def refusal(message: str, value) -> str:

@@ -14,6 +14,7 @@ from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import settled
 from .checks import check_scalar, recognised
+from .conditions import numbers
 from .energy import Energy, Function, real
 from .indices import Indices, cliques
 from .path import Path
@@ -49,7 +50,7 @@ class Each(Energy):
 
     def __init__(self, phi, places, *parameters):
         self.places = places if isinstance(places, Indices) else _checked_places(places)
-        self.parameters = tuple(jnp.asarray(a, dtype=jnp.float64) for a in parameters)
+        self.parameters = tuple(numbers(a, "a parameter") for a in parameters)
         m, r = self.places.shape
         for a in self.parameters:
             if a.shape[:1] != (m,):

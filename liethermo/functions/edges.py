@@ -81,8 +81,10 @@ def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.nd
     found: dict[tuple[int, int], Any] = {}
     for edge in graph:
         try:
-            i, j, k = edge
-            i, j, k = int(i), int(j), k if isinstance(k, jax.core.Tracer) else float(k)
+            first, second, k = edge
+            i, j, k = int(first), int(second), k if isinstance(k, jax.core.Tracer) else float(k)
+            if (i, j) != (first, second):
+                raise TypeError("not whole numbers")
         except (TypeError, ValueError):
             raise InputError(f"{what}: an edge is (i, j, weight), not {edge!r}") from None
         if not (0 <= i < nodes and 0 <= j < nodes):

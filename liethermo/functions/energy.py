@@ -24,6 +24,7 @@ from manifolds._precision import by_own_settings
 from ..errors import FunctionError, InputError
 from ..tracing.programs import part
 from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
+from .conditions import numbers
 from .coordinates import Choice, Components, check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
@@ -195,9 +196,9 @@ class Quadratic(Energy):
     c: jax.Array
 
     def __init__(self, A, b=None, c=0.0):
-        self.A = real_array(A)
-        self.b = None if b is None else real_array(b)
-        self.c = real_array(c)
+        self.A = numbers(A, "A of a quadratic function")
+        self.b = None if b is None else numbers(b, "b of a quadratic function")
+        self.c = numbers(c, "c of a quadratic function", ())
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
             raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:

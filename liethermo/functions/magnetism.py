@@ -33,6 +33,7 @@ from manifolds.structures.spins import (
 )
 
 from ..errors import InputError
+from .conditions import numbers
 from .each import Each
 from .edges import edges
 from .energy import Energy, Sum
@@ -322,7 +323,7 @@ def _inside(shape, offset, closed) -> np.ndarray:
 
 def _of_sites(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
     """A value of all sites, or one for each."""
-    array = real_array(value)
+    array = numbers(value, what)
     if array.shape not in (tail, (*shape, *tail)):
         wanted = f"{tail} or {(*shape, *tail)}" if tail else f"of one number, or {shape}"
         raise InputError(f"{what} has the shape {wanted}, not {array.shape}")

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._module import Module, forwarded
 
 from ..errors import InputError
+from ..functions.conditions import numbers, require
 from ..functions.energy import Energy
 from ..functions.gradients import EPS, DiscreteGradient, compensated
 from ..functions.rounding import with_rounding
@@ -52,6 +54,11 @@ class OneStepMethod(Module):
 
     systems: ClassVar[str] = EVERY_SYSTEM
     fixed: ClassVar[str] = "it does not estimate the error of its steps"
+
+    def __check_init__(self):
+        given = getattr(self, "retraction", None)
+        if not isinstance(given, str | mf.Retraction | None):
+            raise InputError(f"retraction is the name of one, such as 'exp', or a manifolds.Retraction, not {given!r}")
 
     # -- every method gives -------------------------------------------------------------------------------------------
 
@@ -266,6 +273,26 @@ def checked_stages(stages) -> int:
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
         raise InputError(f"stages is an integer from 1 to {MOST_STAGES}, not {stages!r}")
     return stages
+
+
+def kind_of(system) -> str:
+    """What a system is, or what is given in the place of one."""
+    return system.kind if isinstance(system, System) else type(system).__name__
+
+
+def checked_step(h) -> jax.Array:
+    """The size of the steps of a run."""
+    h = numbers(h, "the step h", ())
+    require(h, lambda h: (abs(h) > 0.0) & (abs(h) < np.inf), "the step h is finite and not zero, not {value}")
+    return h
+
+
+def states_of_run(system: System, x) -> jax.Array:
+    """Every state of a run, shape (times, n), at least two."""
+    x = system.state(x, batch=True)
+    if x.ndim != 2 or len(x) < 2:
+        raise InputError(f"x has the states of a run, at least two, shape (times, {system.dim}), not {x.shape}")
+    return x
 
 
 ROUNDINGS = 30.0

@@ -167,9 +167,12 @@ def in_charts(
         return method
     if retraction is None:
         retraction = default if system.space.geodesics else "projection"
-    if isinstance(retraction, str):
-        retraction = mf.retraction(system.space, retraction)
-    if retraction.space != system.space:
-        other = retraction.space.name
-        raise InputError(f"the retraction is one of {other}, but the system is on {system.space.name}")
-    return InCharts(method, retraction)
+    return InCharts(method, retraction_of(system.space, retraction))
+
+
+def retraction_of(space: mf.Space, given: str | mf.Retraction) -> mf.Retraction:
+    """A retraction of a space, by name or as it is."""
+    found = mf.retraction(space, given) if isinstance(given, str) else given
+    if found.space != space:
+        raise InputError(f"the retraction is one of {found.space.name}, not of {space.name}")
+    return found

@@ -15,10 +15,13 @@ from manifolds._module import Module
 from manifolds.matrices.linear import solve
 
 from ..errors import InputError
+from ..functions.arguments import needed_arguments
+from ..functions.checks import check_shape
+from ..functions.conditions import numbers
 from ..functions.energy import Energy, as_energy
 from ..functions.surface import OnLevels
 from ..systems import EmbeddedSystem, EvolutionSystem, System
-from .base import ONE_SIZE, OneStepMethod, moved
+from .base import ONE_SIZE, OneStepMethod, checked_step, moved
 
 _OUTER = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _PROPORTIONS = {2: (1.0,), 4: (_OUTER, _OUTER, 1.0 - 4.0 * _OUTER, _OUTER, _OUTER)}
@@ -69,7 +72,7 @@ class DiscreteHerglotz(OneStepMethod):
     composed: int = eqx.field(static=True)
 
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
-        if order not in PARTS:
+        if order not in tuple(PARTS):
             raise InputError(f"the order is 1, 2 or 4, not {order!r}")
         if not callable(discrete_lagrangian):
             raise InputError(f"a discrete Lagrangian is a function of (q_0, q_1, S_0, h), not {discrete_lagrangian!r}")
@@ -81,10 +84,11 @@ class DiscreteHerglotz(OneStepMethod):
 
         Parameters
         ----------
-        lagrangian : function from (q, v, S) in one array, shape (2n + 1,), to a scalar, or an Energy
+        lagrangian : function of (q, v, S), or of all in one array, shape (2n + 1,), to a scalar; or an Energy
         order : {1, 2, 4}
         """
-        return cls(_Midpoint(as_energy(lagrangian, "the Lagrangian")), order)
+        apart = callable(lagrangian) and not isinstance(lagrangian, Energy) and needed_arguments(lagrangian) == 3
+        return cls(_Midpoint(lagrangian if apart else _OfParts(as_energy(lagrangian, "the Lagrangian"))), order)
 
     @property
     def stages(self) -> int:
@@ -101,14 +105,24 @@ class DiscreteHerglotz(OneStepMethod):
 
     def state(self, q0, q1, S0, h) -> jax.Array:
         """The state (q_1, p_1, S_1) after a first step that is known, shape (2n + 1,), to start a run from."""
-        q0, q1 = (jnp.atleast_1d(jnp.asarray(q, dtype=jnp.float64)) for q in (q0, q1))
-        p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q0, q1, jnp.asarray(S0, dtype=jnp.float64), h)
+        q0 = jnp.atleast_1d(numbers(q0, "q0"))
+        q1, S0, h = jnp.atleast_1d(numbers(q1, "q1", q0.shape, ())), numbers(S0, "S0", ()), checked_step(h)
+        self._check_action(q0.shape)
+        p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q0, q1, S0, h)
         return jnp.concatenate([q1, p1, (S0 + jnp.dot(q1 - q0, p1))[None]])
 
     def check(self, system: System) -> None:
         """Raise InputError unless the state is a (q, p, S)."""
-        if not isinstance(_on_manifold(system), EvolutionSystem):
+        system = _on_manifold(system)
+        if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
+        space = system.configurations
+        self._check_action((system.dim // 2,) if space is None else space.shape)
+
+    def _check_action(self, at: tuple[int, ...]) -> None:
+        """Raise FunctionError unless the action of a step is a number, of positions of this shape."""
+        where = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {at}"
+        check_shape(self.discrete_lagrangian, [at, at, (), ()], [()], "the discrete Lagrangian", where)
 
     def weights(self, theta) -> np.ndarray:
         return np.asarray(theta)[..., None] * self._shares
@@ -194,8 +208,16 @@ class _OfPoints(Module):
 
 
 class _Midpoint(Module):
-    lagrangian: Energy
+    lagrangian: Callable
 
     def __call__(self, q0, q1, S0, h):
-        middle, velocity = 0.5 * (q0 + q1), (q1 - q0) / h
-        return h * self.lagrangian.value(jnp.concatenate([middle.ravel(), velocity.ravel(), jnp.reshape(S0, 1)]))
+        return h * self.lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)
+
+
+class _OfParts(Module):
+    """An energy of (q, v, S) in one array as a function of the three."""
+
+    energy: Energy
+
+    def __call__(self, q, v, S):
+        return self.energy.value(jnp.concatenate([q.ravel(), v.ravel(), jnp.reshape(S, 1)]))

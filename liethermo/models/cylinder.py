@@ -10,6 +10,7 @@ import numpy as np
 
 from manifolds._module import Module
 
+from ..functions.conditions import numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
@@ -59,7 +60,7 @@ def cylinder(
     gas = IdealGas(n, A * positive(height, "height"))
     push = pressure
     if pressure is not None:
-        push = _Push(timed(pressure), A) if callable(pressure) else -A * jnp.reshape(jnp.asarray(pressure), 1)
+        push = _Push(timed(pressure), A) if callable(pressure) else -A * numbers(pressure, "pressure", ())[None]
     return SimpleClosedSystem(
         Kinetic(m[None]) - Function(_UnderPiston(gas, A)).on([0, 2]),
         3,

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 
 from ..errors import InputError
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 
 
 class Periods(NamedTuple):
@@ -125,10 +125,10 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     ------
     InputError
     """
-    moments = jnp.asarray(inertia, dtype=jnp.float64)
+    moments = numbers(inertia, "inertia")
     if moments.shape[-1:] != (3,):
         raise InputError(f"inertia has shape (..., 3), not {moments.shape}")
-    tau, L = (jnp.asarray(value, dtype=jnp.float64) for value in (relaxation_time, momentum))
+    tau, L = numbers(relaxation_time, "a relaxation time"), numbers(momentum, "the size of a momentum")
     for value, what in ((moments, "moments of inertia"), (tau, "a relaxation time"), (L, "the size of a momentum")):
         require(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
     above = jnp.sum(1.0 / moments, axis=-1) - 3.0 / jnp.max(moments, axis=-1)

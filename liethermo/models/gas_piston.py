@@ -11,6 +11,7 @@ import numpy as np
 
 from manifolds._module import Module
 
+from ..functions.conditions import numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Subsystem
@@ -95,6 +96,7 @@ def gas_piston(
     n = positive(moles, "moles", 2)
     A, L, m = positive(area, "area"), positive(length, "length"), positive(mass, "mass")
     gases = [_InCylinder(IdealGas(n_i, 0.5 * A * L), A, L, right) for n_i, right in zip(n, (False, True), strict=True)]
+    numbers(conductance, "conductance", (2,))
     piston = Kinetic((1.0 / m)[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2])
     return ComposedSystem(
         {"left gas": Subsystem(None, 1), "piston": Subsystem(piston, 3, friction), "right gas": Subsystem(None, 1)},

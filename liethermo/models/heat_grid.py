@@ -67,6 +67,6 @@ def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
 
 
 def _sizes(shape: Sequence[int]) -> tuple[int, ...]:
-    if isinstance(shape, int) or len(shape) == 0:
+    if not isinstance(shape, Sequence) or isinstance(shape, str) or len(shape) == 0:
         raise InputError(f"shape is the number of nodes along each axis, such as (32, 32), not {shape!r}")
     return tuple(whole(n, "each entry of shape") for n in shape)

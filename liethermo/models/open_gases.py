@@ -11,11 +11,12 @@ import numpy as np
 
 from manifolds._module import Module
 
-from ..functions.conditions import require
+from ..errors import InputError
+from ..functions.conditions import numbers, require
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Membrane, Reaction, Subsystem
-from .parameters import positive
+from .parameters import finite, positive
 from .thermo_particles import Warmth
 
 
@@ -54,6 +55,11 @@ class IdealMixture(Module):
         """``prod (N_k / V)^nu_k`` where ``nu . mu = 0``: the law of mass action."""
         standard = self.energy + (self.capacity + 1.0) * T - T * (self.capacity * jnp.log(T) + self.entropy)
         return jnp.exp(-jnp.dot(jnp.asarray(stoichiometry), standard) / T)
+
+
+def _monatomic(heat_capacity) -> IdealMixture:
+    """One kind of particles, its energy and entropy counted from zero."""
+    return IdealMixture(positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
 
 
 class _BothSides(Module):
@@ -98,11 +104,12 @@ def porous_piston(
     heat_capacity : float, > 0
         Of a particle, at constant volume.
     """
-    gas = IdealMixture(positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
+    gas = _monatomic(heat_capacity)
+    numbers(conductance, "conductance", (2,))
     bodies = {
         "left": Subsystem(None, 2, species=1),
         "piston": Subsystem(
-            Kinetic(positive(1.0 / mass, "1 / mass")[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2]),
+            Kinetic(1.0 / positive(mass, "mass")[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2]),
             3,
             friction=friction,
         ),
@@ -131,18 +138,17 @@ def porous_piston_state(
     **parameters
         Those of :func:`porous_piston` that are not its defaults.
     """
-    given = inspect.signature(porous_piston).bind(**parameters)
-    given.apply_defaults()
-    area, length, capacity, heat_capacity = (
-        given.arguments[name] for name in ("area", "length", "capacity", "heat_capacity")
-    )
-    require(q, lambda q: 0.0 < q < length, f"the piston is between 0 and {length:g}, not at {{value:g}}")
-    gas = IdealMixture(positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
-    S = [
-        float(gas.entropy_at(positive(t, "a temperature"), positive([n], "a number of particles", 1), area * width))
-        for (n, t), width in ((left, q), (right, length - q))
-    ]
-    return np.array([S[0], left[0], q, 0.0, capacity * np.log(positive(T, "T")), S[1], right[0]])
+    known = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
+    if unknown := [name for name in parameters if name not in known]:
+        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(known)}")
+    area, length, capacity = (positive((known | parameters)[name], name) for name in ("area", "length", "capacity"))
+    place = numbers(q, "q", ())
+    require(place, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}")
+    gas, state = _monatomic((known | parameters)["heat_capacity"]), []
+    for name, side, width in (("left", left, place), ("right", right, length - place)):
+        n, t = positive(side, f"{name}, (particles, temperature),", 2)
+        state += [gas.entropy_at(t, n[None], area * width), n]
+    return np.array([*state[:2], place, 0.0, capacity * jnp.log(positive(T, "T")), *state[2:]])
 
 
 class _Vessel(Module):
@@ -183,11 +189,11 @@ def reaction_vessel(
         Heat capacity of the jacket.
     conductance : float, >= 0
     """
-    count = len(stoichiometry)
+    reaction = Reaction("vessel", stoichiometry, rate)
+    count = len(reaction.stoichiometry)
     gas = IdealMixture(
         positive(capacity, "capacity", count),
-        jnp.asarray(energy, dtype=jnp.float64),
-        jnp.asarray(entropy, dtype=jnp.float64),
+        *(finite(value, name, count) for value, name in ((energy, "energy"), (entropy, "entropy"))),
     )
     bodies = {
         "vessel": Subsystem(_Vessel(gas, positive(volume, "volume")), 1 + count, species=count),
@@ -196,6 +202,6 @@ def reaction_vessel(
     return ComposedSystem(
         bodies,
         conductance=conductance,
-        reactions=[Reaction("vessel", stoichiometry, rate)],
+        reactions=[reaction],
         validate=False,
     )

@@ -6,17 +6,27 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 
 
 def positive(value, name: str, count: int | None = None) -> jax.Array:
     """A positive number as an array, or ``count`` of them; traced ones as they are."""
-    array = jnp.asarray(value, dtype=jnp.float64)
-    if array.shape != (() if count is None else (count,)):
-        wanted = "one number" if count is None else f"{count} numbers"
-        raise InputError(f"{name} is {wanted}, not an array of shape {array.shape}")
+    array = numbers(value, name, () if count is None else (count,))
     require(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, not {value}")
     return array
+
+
+def finite(value, name: str, count: int | None = None) -> jax.Array:
+    """Finite numbers as an array, ``count`` of them in a row if that is said; traced ones as they are."""
+    array = numbers(value, name, *(() if count is None else ((count,),)))
+    require(array, lambda a: abs(a) < jnp.inf, name + " must be finite, not {value}")
+    return array
+
+
+def several(value, name: str) -> jax.Array:
+    """Positive numbers in a row, at least one."""
+    count = numbers(value, name).size
+    return positive(value, name, max(count, 1))
 
 
 def whole(value, name: str, least: int = 1) -> int:

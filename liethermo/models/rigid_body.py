@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
@@ -14,8 +13,7 @@ from manifolds.errors import warn
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
-from ..errors import InputError
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
 
@@ -76,9 +74,8 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
 
 def checked_inertia(inertia) -> np.ndarray | jax.Array:
-    moments = jnp.asarray(inertia, dtype=jnp.float64) if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
-    if moments.shape != (3,):
-        raise InputError(f"inertia is three numbers, not an array of shape {moments.shape}")
+    checked = numbers(inertia, "inertia", (3,))
+    moments = checked if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
     require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia are positive and finite, not {value}")
     if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())

@@ -15,7 +15,7 @@ from ..dissipation.base import Dissipation
 from ..dissipation.checks import checked_rate
 from ..dissipation.factor import Factor
 from ..errors import InputError
-from ..functions.conditions import require
+from ..functions.conditions import numbers, require
 from ..functions.energy import Quadratic
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
@@ -241,6 +241,7 @@ def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -
 def _with_rotor(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
     """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
     I, J = jnp.asarray(checked_inertia(inertia)), positive(rotor, "the moment of the rotor")
+    numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")

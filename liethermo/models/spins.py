@@ -7,6 +7,7 @@ import numpy as np
 
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
+from ..functions.conditions import numbers
 from ..functions.energy import Energy, Sum
 from ..functions.magnetism import anisotropy, checked_sites, dzyaloshinskii_moriya, exchange, zeeman
 from ..systems import HeatBaths, SpinSystem
@@ -105,4 +106,4 @@ def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_
 
 
 def _along_third(field):
-    return jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(field, dtype=jnp.float64)])
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), numbers(field, "the field", ())])

@@ -14,7 +14,7 @@ from ..functions.edges import edges
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Copies, Subsystem
-from .parameters import positive, whole
+from .parameters import positive, several, whole
 
 
 def warmth(x, capacity):
@@ -45,7 +45,7 @@ def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) 
     conductance : float for two bodies, or a graph as in :class:`liethermo.ComposedSystem`
         k_ab (power / temperature).
     """
-    c = positive(capacities, "capacities", len(capacities))
+    c = several(capacities, "capacities")
     return ComposedSystem(Copies(len(c), warmth, 1, c), conductance=conductance)
 
 
@@ -122,8 +122,8 @@ def thermo_springs(
 
 
 def _bodies(masses, capacities, dimension, friction) -> list[Subsystem]:
-    c = positive(capacities, "capacities", len(capacities))
-    m, n = positive(masses, "masses", len(capacities)), whole(dimension, "dimension")
+    c = several(capacities, "capacities")
+    m, n = positive(masses, "masses", len(c)), whole(dimension, "dimension")
     return [
         Subsystem(Kinetic(jnp.full(n, 1.0 / m_a)) + Function(Warmth(c_a)).on([2 * n]), 2 * n + 1, friction)
         for m_a, c_a in zip(m, c, strict=True)

@@ -9,6 +9,7 @@ import numpy as np
 from manifolds._module import Module
 
 from ..errors import InputError
+from ..functions.conditions import numbers
 from ..functions.each import Each
 from ..functions.energy import Energy, Function, Quadratic
 from ..functions.mechanics import Kinetic
@@ -91,16 +92,16 @@ def thermoelastic_chain(
         raise InputError(f"dimension is 1, 2 or 3, not {n}")
     spring = Thermospring(
         positive(stiffness, "stiffness"),
-        jnp.asarray(expansion, dtype=jnp.float64),
+        numbers(expansion, "expansion", ()),
         positive(capacity, "capacity"),
         positive(length, "length"),
         positive(temperature, "temperature"),
     )
     m = positive(mass, "mass")
     body: Energy = Kinetic(jnp.full(n, 1.0 / m))
-    heavy = not (isinstance(gravity, float | int) and gravity == 0.0)
+    g, heavy = numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
     if heavy:
-        body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * gravity))
+        body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * g))
     size = 2 * n + 1
     q = size * np.arange(N)[:, None] + np.arange(n)
     S = size * np.arange(1, N + 1)[:, None] - 1

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arrays import is_traced, real_array
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 
 from ..errors import InputError
-from ..functions.conditions import require
-from .parameters import positive
+from ..functions.conditions import numbers, require
+from .parameters import finite, positive
 
 __all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
 
@@ -38,7 +38,7 @@ class ConstantInBody(Module):
     moment: jax.Array
 
     def __init__(self, moment):
-        self.moment = _finite(moment, "moment")
+        self.moment = finite(moment, "moment")
 
     def __call__(self, t, mu):
         return self.moment
@@ -56,7 +56,7 @@ class ConstantInSpace(Module):
     moment: jax.Array
 
     def __init__(self, moment):
-        self.moment = _finite(moment, "moment", 3)
+        self.moment = finite(moment, "moment", 3)
 
     def __call__(self, t, mu, attitude):
         return attitude.T @ self.moment
@@ -85,9 +85,7 @@ class GravityGradient(Module):
     normal: jax.Array
 
     def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
-        self.inertia = real_array(inertia)
-        if self.inertia.shape not in ((3,), (3, 3)):
-            raise InputError(f"inertia has shape (3,) or (3, 3), not {self.inertia.shape}")
+        self.inertia = numbers(inertia, "inertia", (3,), (3, 3))
         self.mean_motion = positive(mean_motion, "mean_motion")
         self.towards, self.normal = _direction(towards, "towards"), _direction(normal, "normal")
         if not is_traced((self.towards, self.normal)):
@@ -121,8 +119,8 @@ class Magnetic(Module):
     field: jax.Array | Callable
 
     def __init__(self, dipole, field):
-        self.dipole = _finite(dipole, "dipole", 3)
-        self.field = field if callable(field) else _finite(field, "field", 3)
+        self.dipole = finite(dipole, "dipole", 3)
+        self.field = field if callable(field) else finite(field, "field", 3)
 
     def __call__(self, t, mu, attitude):
         field = self.field(t) if callable(self.field) else self.field
@@ -145,7 +143,7 @@ class Motor(Module):
     moment: jax.Array | Callable
 
     def __init__(self, moment):
-        self.moment = moment if callable(moment) else _finite(np.atleast_1d(moment), "moment")
+        self.moment = moment if callable(moment) else finite(np.atleast_1d(moment), "moment")
 
     def __call__(self, t, mu):
         moment = jnp.atleast_1d(self.moment(t) if callable(self.moment) else self.moment)
@@ -170,7 +168,7 @@ class Tabulated(Module):
     moments: jax.Array
 
     def __init__(self, times, moments):
-        self.times, self.moments = _finite(times, "times"), _finite(moments, "moments")
+        self.times, self.moments = finite(times, "times"), finite(moments, "moments")
         if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
             raise InputError(
                 f"times has shape (m,), m at least 2, and moments m rows: not {self.times.shape} and "
@@ -185,15 +183,7 @@ class Tabulated(Module):
         return jnp.tensordot(now * (1.0 - gone), self.moments[:-1], 1) + jnp.tensordot(now * gone, self.moments[1:], 1)
 
 
-def _finite(value, name: str, size: int | None = None) -> jax.Array:
-    array = real_array(value)
-    if size is not None and array.shape != (size,):
-        raise InputError(f"{name} has shape ({size},), not {array.shape}")
-    require(array, np.isfinite if not is_traced(array) else jnp.isfinite, name + " must be finite, not {value}")
-    return array
-
-
 def _direction(value, name: str) -> jax.Array:
-    array = _finite(value, name, 3)
+    array = finite(value, name, 3)
     require(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
     return array / jnp.sqrt(jnp.sum(array**2))

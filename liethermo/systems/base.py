@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from manifolds.structures.poisson import Beside
 
 from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
-from ..errors import AxiomError, CasimirError, FunctionError, InputError
+from ..errors import AxiomError, CasimirError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
 from ..functions.energy import Energy, as_energy
 from ..functions.frames import frame
@@ -97,8 +97,7 @@ class System(Kind):
         self.entropy = None
         if entropy is not None:
             self.entropy = check_scalar(self.on_states(as_energy(entropy, "the entropy")), dim, "the entropy")
-        if not isinstance(momentum_maps, Mapping):
-            momentum_maps = {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
+        momentum_maps = named_maps(momentum_maps)
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
             name: check_scalar(self.on_states(as_energy(J, roles[name])), dim, roles[name])
@@ -636,14 +635,13 @@ def _seen(system: System, x, alpha):
     return alpha if system.space is None else system.lowered(x, system.raised(x, alpha))
 
 
-def square_field(function: Callable, dim: int, what: str) -> None:
-    """Raise unless ``function`` maps a state to a (dim, dim) matrix."""
-    try:
-        shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(f"{what} could not be evaluated on a state of shape ({dim},): {error}") from error
-    if shape != (dim, dim):
-        raise FunctionError(f"{what} must return a ({dim}, {dim}) matrix, but it returns shape {shape}")
+def named_maps(given) -> dict[str, Any]:
+    """Momentum maps by name."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise InputError(f"momentum_maps are a dict of functions, or a sequence of them, not {type(given).__name__}")
+    return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
 
 
-__all__ = ["AXIOM_TOLERANCE", "System", "square_field"]
+__all__ = ["AXIOM_TOLERANCE", "System", "named_maps"]

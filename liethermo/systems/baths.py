@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import is_traced, real_array
+from manifolds._arrays import is_traced
 from manifolds._module import Module
 from manifolds.structures.poisson import Beside
 
 from ..errors import InputError
+from ..functions.conditions import numbers
 from ..functions.each import Each
 from ..functions.energy import Energy
 from ..functions.warmth import Reservoir, Warmth, warmth
@@ -90,7 +91,8 @@ class HeatBaths(Module):
 def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     known = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with known:  # numbers, while a family of systems is traced
-        array = jnp.broadcast_to(real_array(value), (number,)) if np.ndim(value) == 0 else real_array(value)
+        array = numbers(value, f"the {what} of baths")
+        array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
         raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
     if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):

@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from manifolds._module import Module
 
 from ..dissipation.base import Law
-from ..errors import FunctionError, InputError
+from ..errors import InputError
 from ..functions.arguments import Steady, needed_arguments
 from ..functions.checks import check_shape
 from ..tracing.interpret import at_points
@@ -116,15 +116,8 @@ class Form(Module):
         implicit, n, what = needed_arguments(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
         given = eta if implicit else Steady(eta)
         given = given if len(at) == 1 else InOneRow(given, at)
-        shapes = (n,), (n,), (), ()
-        try:
-            arguments = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-            size = jax.eval_shape(lambda *a: jnp.asarray(given(*a)), *arguments).shape
-        except (TypeError, ValueError, IndexError) as error:
-            raise FunctionError(f"eta could not be evaluated at {what}: {type(error).__name__}: {error}") from error
-        if size not in ((n,), (n + 1,)):
-            raise FunctionError(f"eta has shape ({n + 1},), or {at} where eta_S = 1, not {size}")
-        return cls(check_shape(given if size == (n + 1,) else _Unit(given), shapes, (n + 1,), "eta", what), implicit)
+        function, found = check_shape(given, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", what)
+        return cls(function if found == (n + 1,) else _Unit(function), implicit)
 
     def rate(self, q, v, S) -> jax.Array:
         """S' with ``eta_q . v + eta_S S' = 0``; NaN where none is found."""

@@ -141,4 +141,4 @@ def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], 
         For messages: what it is, and of what.
     """
     found = timed(function, len(parts)) if callable(function) else Constant(numbers(function, what))
-    return check_shape(found, (*parts, ()), shape, what, at)
+    return check_shape(found, (*parts, ()), [shape], what, at)[0]

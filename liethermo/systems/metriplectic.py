@@ -11,7 +11,8 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from .base import System, square_field
+from ..functions.checks import check_shape
+from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
 from .embedded import EmbeddedSystem
@@ -100,7 +101,8 @@ class MetriplecticSystem(System):
             )
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
-        square_field(poisson.tensor, poisson.dim, "the Poisson tensor")
+        dim = poisson.dim
+        check_shape(poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)")
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:

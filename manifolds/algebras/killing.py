@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from ..errors import LieAlgebraError, ShapeError
+from .._arrays import real_components
+from ..errors import ComponentError, LieAlgebraError, ShapeError
 from ._balance import STRUCTURE_TOLERANCE
 
 
@@ -27,9 +28,13 @@ def trilinear_form(algebra, form=None) -> np.ndarray:
     ndarray, shape (dim, dim, dim)
         ``c[a, b, d] = form(e_a, [e_b, e_d])``.
     """
-    form = np.asarray(algebra.killing_form() if form is None else form, dtype=np.float64)
+    if not hasattr(algebra, "killing_form"):
+        raise LieAlgebraError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {algebra!r}")
+    form = np.asarray(real_components(algebra.killing_form() if form is None else form, algebra.dim, "the form"))
     if form.shape != (algebra.dim, algebra.dim):
         raise ShapeError(f"the form on {algebra.name} has shape ({algebra.dim}, {algebra.dim}), not {form.shape}")
+    if not np.isfinite(form).all():
+        raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))
 
 

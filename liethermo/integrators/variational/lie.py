@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import square_matrices
 from manifolds.groups.maps import cayley, dexp, exp
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import program
-from ..base import ONE_SIZE, OneStepMethod, register
+from ..base import ONE_SIZE, OneStepMethod, checked_step, kind_of, register, states_of_run
 
 NEWTON_STEPS = 20
 """For the velocities between the states of a finished run."""
@@ -69,7 +70,7 @@ class LieVariational(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError where the Cayley map is to take an algebra to a group, and does not."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {system.kind}")
+            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {kind_of(system)}")
         algebra = system.algebra
         if self.tau == "exp":
             return
@@ -128,9 +129,10 @@ class LieVariational(OneStepMethod):
         start : array, shape (m, m), optional
             g_0; the identity by default.
         """
-        steps = np.asarray(_turns(self, system, system.state(x, batch=True), jnp.asarray(h)))
-        first = np.eye(steps.shape[-1]) if start is None else np.asarray(start)
-        path = [first]
+        self.check(system)
+        steps = np.asarray(_turns(self, system, states_of_run(system, x), checked_step(h)))
+        size = steps.shape[-1]
+        path = [np.eye(size) if start is None else np.asarray(square_matrices(start, size, "start"))]
         for turn in steps:
             path.append(path[-1] @ turn)
         return np.array(path)

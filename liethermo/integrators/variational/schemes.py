@@ -14,9 +14,11 @@ import numpy as np
 import manifolds as mf
 
 from ...errors import InputError
+from ...functions.conditions import numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
 from ...tracing.programs import program
-from ..base import ONE_SIZE, OneStepMethod, moved, register
+from ..base import ONE_SIZE, OneStepMethod, checked_step, kind_of, moved, register, states_of_run
+from ..charts import retraction_of
 from .composed import OnBodies
 from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
 from .equations import solved, velocity_of, velocity_slope
@@ -179,10 +181,7 @@ class VariationalIntegrator(OneStepMethod):
         space, kind = system.configurations, self.retraction
         if space is None or kind is None:
             return None if space is None else Curve(space)
-        found = mf.retraction(space, kind) if isinstance(kind, str) else kind
-        if found.space != space:
-            raise InputError(f"the retraction is one of {found.space.name}, and the positions are in {space.name}")
-        return Curve(space, found.chart)
+        return Curve(space, retraction_of(space, kind).chart)
 
     # -- the step ---------------------------------------------------------------------------------------------------
 
@@ -234,11 +233,11 @@ class VariationalIntegrator(OneStepMethod):
         space = system.configurations
         if space is not None:
             q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
-        q0, q1 = (jnp.atleast_1d(jnp.asarray(q, dtype=jnp.float64)) for q in (q0, q1))
+        q0, q1 = jnp.atleast_1d(numbers(q0, "q0")), jnp.atleast_1d(numbers(q1, "q1"))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
             raise InputError(f"q0 and q1 have shape ({system.degrees_of_freedom},), not {q0.shape} and {q1.shape}")
-        discrete, S0 = self.discrete(system, h, t), jnp.asarray(S0, dtype=jnp.float64)
-        found = discrete.onto_constraint(q0, q1, S0) if S1 is None else jnp.asarray(S1, dtype=jnp.float64)
+        discrete, S0 = self.discrete(system, checked_step(h), numbers(t, "t", ())), numbers(S0, "S0", ())
+        found = discrete.onto_constraint(q0, q1, S0) if S1 is None else numbers(S1, "S1", ())
         misfit, size = (float(a) for a in _misfit(discrete, q0, q1, S0, found))
         if not misfit <= CONSTRAINT_TOLERANCE * size:
             raise InputError(
@@ -270,8 +269,9 @@ class VariationalIntegrator(OneStepMethod):
         -------
         ndarray, shape (times - 1,)
         """
-        x = system.state(x, batch=True)
-        return np.asarray(_energies(self, system, jnp.asarray(h), x[:-1], x[1:]))
+        need_simple_closed(system, "VariationalIntegrator")
+        x = states_of_run(system, x)
+        return np.asarray(_energies(self, system, checked_step(h), x[:-1], x[1:]))
 
     def explain(self, system: System, x, k, h) -> str:
         if not isinstance(system, SimpleClosedSystem) or system.configurations is not None:
@@ -304,7 +304,7 @@ def need_simple_closed(system: System, name: str) -> None:
     if isinstance(system, EmbeddedSystem):
         raise InputError(f"{name} runs on R^n: on a manifold take lt.VariationalIntegrator or a metriplectic method")
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {system.kind}")
+        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {kind_of(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {

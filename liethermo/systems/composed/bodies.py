@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import equinox as eqx
 import jax
@@ -13,11 +13,10 @@ from manifolds._module import Module
 
 from ...dissipation.checks import semidefinite
 from ...errors import InputError
-from ...functions.checks import check_scalar, recognised
-from ...functions.conditions import require
+from ...functions.checks import check_scalar, check_shape, recognised
+from ...functions.conditions import numbers, require
 from ...functions.each import Each
 from ...functions.energy import Energy, Quadratic, as_energy
-from ...tracing.traced import converted
 
 
 class Subsystem(Module):
@@ -110,7 +109,7 @@ class Copies(Module):
         self.count, self.dim, self.name = count, dim, name
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
         given = parameters if isinstance(parameters, tuple) else (parameters,)
-        self.parameters = tuple(jnp.asarray(a, dtype=jnp.float64) for a in given)
+        self.parameters = tuple(numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
         self.energy_from(0)  # checked there
         self.friction = _friction_of_many(friction, count, dim, name or "the bodies")
 
@@ -137,8 +136,8 @@ def named(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
     if isinstance(subsystems, Mapping):
         names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
     else:
-        bodies = (subsystems,) if isinstance(subsystems, Subsystem | Copies) else tuple(subsystems)
-        starts = np.cumsum([0, *(getattr(body, "count", 1) for body in bodies)])
+        bodies = tuple(subsystems) if isinstance(subsystems, Iterable) else (subsystems,)
+        starts = np.cumsum([0, *(body.count if isinstance(body, Subsystem | Copies) else 1 for body in bodies)])
         names = tuple(
             getattr(body, "name", None) or ("body" if isinstance(body, Copies) else f"body {i}")
             for body, i in zip(bodies, starts[:-1], strict=True)
@@ -167,15 +166,10 @@ def _checked_friction(friction, dim: int, name: str):
             raise InputError(f"friction of {name} is a coefficient or 'contact', not {friction!r}")
         return friction
     if callable(friction):
-        friction, found = converted(friction, lambda friction, x: jnp.asarray(friction(x)), (dim,))
-        if found.shape not in ((), (n,), (n, n)):
-            raise InputError(f"friction of {name} must return shape (), ({n},) or ({n}, {n}), not {found.shape}")
-        return friction
-    R = jnp.asarray(friction, dtype=jnp.float64)
-    if R.ndim == 0:
-        R = jnp.full(n, R)
-    if R.shape not in ((n,), (n, n)):
-        raise InputError(f"friction of {name} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
+        shapes, at = ((), (n,), (n, n)), f"a state of shape ({dim},)"
+        return check_shape(friction, [(dim,)], shapes, f"friction of {name}", at)[0]
+    R = numbers(friction, f"friction of {name}", (), (n,), (n, n))
+    R = jnp.full(n, R) if R.ndim == 0 else R
     if R.ndim == 2:
         return semidefinite(R, f"the friction of {name}")
     return _not_negative(R, name)
@@ -184,7 +178,7 @@ def _checked_friction(friction, dim: int, name: str):
 def _friction_of_many(friction, count: int, dim: int, name: str):
     if friction is None or isinstance(friction, str):
         return _checked_friction(friction, dim, name)
-    n, R = dim // 2, jnp.asarray(friction, dtype=jnp.float64)
+    n, R = dim // 2, numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
             f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"

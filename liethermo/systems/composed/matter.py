@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._module import Module
 from manifolds.structures.extended import Matter
 
 from ...dissipation.matter import Process
 from ...errors import InputError
+from ...functions.checks import check_shape
 from ...functions.conditions import numbers, require
 
 
@@ -46,23 +48,24 @@ class Membrane(Module):
         self.first, self.second = first, second
         self.permeability = _coefficient(permeability, "the permeability of a membrane")
         pair = (species, species) if isinstance(species, int) else species
-        if not (isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(kind, int) for kind in pair)):
+        if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
             raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
         self.species = pair
-        self.carries = numbers(carries, "the entropy that a particle carries")
+        self.carries = numbers(carries, "the entropy that a particle carries", ())
         require(self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}")
 
-    def process(self, names: Sequence[str], matter: Matter) -> Process:
-        """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
+    def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
+        """Which numbers change together, among the bodies of these ``names``."""
         a, b = (_body(given, names) for given in (self.first, self.second))
         if a == b:
             raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
-        stoichiometry, sides = np.zeros(len(matter.N)), np.zeros((2, len(names)))
+        stoichiometry, sides = np.zeros(len(structure.matter.N)), np.zeros((2, len(names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
-            stoichiometry[_number(body, kind, names, matter)] = sign
+            stoichiometry[_number(body, kind, names, structure.matter)] = sign
             sides[:, body] = 0.5, sign
         numbers, heated, carried = (tuple(row.tolist()) for row in (stoichiometry, *sides))
-        return Process(numbers, heated, carried, self.carries, self.permeability)
+        L = _on_states(self.permeability, structure.dim, "the permeability of a membrane")
+        return Process(numbers, heated, carried, self.carries, L)
 
 
 class Reaction(Module):
@@ -91,9 +94,10 @@ class Reaction(Module):
             raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {found.tolist()}")
         self.stoichiometry = tuple(found.tolist())
 
-    def process(self, names: Sequence[str], matter: Matter) -> Process:
-        """Which numbers change together, among the bodies of these ``names`` and their ``matter``."""
+    def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
+        """Which numbers change together, among the bodies of these ``names``."""
         body = _body(self.body, names)
+        matter = structure.matter
         own = np.flatnonzero(matter.owner == body)
         if len(own) != len(self.stoichiometry):
             raise InputError(
@@ -101,22 +105,29 @@ class Reaction(Module):
             )
         stoichiometry, heated = np.zeros(len(matter.N)), np.zeros(len(names))
         stoichiometry[own], heated[body] = self.stoichiometry, 1.0
-        none = (0.0,) * len(names)
-        return Process(tuple(stoichiometry.tolist()), tuple(heated.tolist()), none, jnp.zeros(()), self.rate)
+        none, L = (0.0,) * len(names), _on_states(self.rate, structure.dim, "the rate of a reaction")
+        return Process(tuple(stoichiometry.tolist()), tuple(heated.tolist()), none, jnp.zeros(()), L)
 
 
 def _coefficient(given, what: str) -> jax.Array | Callable:
     if callable(given):
         return given
-    value = numbers(given, what)
-    if value.shape != ():
-        raise InputError(f"{what} is one number, or a function of the state, not an array of shape {value.shape}")
-    require(value, lambda L: L >= 0.0, what + " must be >= 0, not {value}: entropy would fall")
+    value = numbers(given, what, ())
+    require(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
     return value
+
+
+def _on_states(coefficient, dim: int, what: str) -> jax.Array | Callable:
+    """A coefficient, as a function checked on states of so many components."""
+    if not callable(coefficient):
+        return coefficient
+    return check_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
 def _body(given, names: Sequence[str]) -> int:
     if isinstance(given, str) and given in names:
+        if list(names).count(given) > 1:
+            raise InputError(f"{given!r} is the name of several bodies: give the number of the one that is meant")
         return list(names).index(given)
     if isinstance(given, int) and not isinstance(given, bool) and 0 <= given < len(names):
         return given

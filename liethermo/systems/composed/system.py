@@ -21,12 +21,12 @@ from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearF
 from ...dissipation.matter import MatterExchange, Process, conserved_numbers
 from ...errors import InputError
 from ...functions.arguments import Constant, Steady, needed_arguments
-from ...functions.checks import check_scalar
+from ...functions.checks import check_scalar, check_shape
 from ...functions.edges import Edges, edges, parts
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import as_pattern, pattern, union
 from ...functions.mechanics import is_free_of, is_mechanical
-from ..base import System
+from ..base import System, named_maps
 from ..evolution import entropy_component
 from .bodies import Copies, Subsystem, named
 from .matter import Membrane, Reaction
@@ -124,11 +124,11 @@ class ComposedSystem(System):
         for one in given:
             if not isinstance(one, Membrane | Reaction):
                 raise InputError(f"membranes and reactions are lt.Membrane and lt.Reaction, not {type(one).__name__}")
-        processes = [one.process(self.names, structure.matter) for one in given]
+        processes = [one.process(self.names, structure) for one in given]
         if processes:
             exchange = MatterExchange(processes)
             dissipation = exchange if dissipation is None else dissipation + exchange
-        momentum_maps = {**_conserved_numbers(structure, processes), **_named_maps(momentum_maps)}
+        momentum_maps = {**_conserved_numbers(structure, processes), **named_maps(momentum_maps)}
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
@@ -251,8 +251,9 @@ class ComposedSystem(System):
             if R is None and not (body.friction is None or isinstance(body.friction, str)):
                 found.append(LinearFriction(body.friction, body=a))
         if conductance is not None:
-            given, laws = _by_law(conductance, len(dofs))
+            given, functions = _by_law(conductance, len(dofs))
             graph = edges(given, len(dofs), "the conductance", self.names)
+            laws = _laws(graph, functions, structure.dim, self.names) if functions else ()
             if connected:
                 _need_connected(graph, self.names)
             found.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
@@ -320,12 +321,6 @@ class _Apart(Module):
         return self.V(*jnp.split(y, self.ends), *t)
 
 
-def _named_maps(given) -> dict:
-    if isinstance(given, Mapping):
-        return dict(given)
-    return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
-
-
 def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
     """The sums of particle numbers that no process changes."""
     N = structure.matter.N
@@ -337,8 +332,8 @@ def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Pro
     return found
 
 
-def _by_law(conductance, bodies: int) -> tuple[Any, tuple[Callable, ...]]:
-    """A graph of conductances and, where an edge of it has a function, one for each edge."""
+def _by_law(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
+    """A graph of conductances, with 1 in the place of functions, and the edges that have one."""
     if callable(conductance):
         conductance = [(0, 1, conductance)]
         if bodies != 2:
@@ -346,17 +341,22 @@ def _by_law(conductance, bodies: int) -> tuple[Any, tuple[Callable, ...]]:
                 f"the conductance as one function is meant for two bodies, not {bodies}: give edges (i, j, function)"
             )
     listed = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
-    if not listed or not any(callable(edge[-1]) for edge in conductance):
-        return conductance, ()
-    laws = [(i, j, _as_law(k)) if i < j else (j, i, _Exchanged(_as_law(k))) for i, j, k in conductance]
-    return [(i, j, 1.0) for i, j, _ in laws], tuple(law for _, _, law in laws)
+    functions = [edge for edge in conductance if any(map(callable, edge))] if listed else []
+    if not functions:
+        return conductance, []
+    return [tuple(1.0 if callable(part) else part for part in edge) for edge in conductance], functions
 
 
-def _as_law(k) -> Callable:
-    """A law of (T_i, T_j), or a number, as one of (T_i, T_j, x)."""
-    if not callable(k):
-        return Constant(jnp.asarray(k, dtype=jnp.float64))
-    return k if needed_arguments(k) == 3 else Steady(k)
+def _laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Callable, ...]:
+    """A function of (T_i, T_j, x) for each edge of a graph, checked: where none is given, its weight."""
+    found = {}
+    for i, j, k in functions:
+        law = k if needed_arguments(k) == 3 else Steady(k)
+        what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
+        law, _ = check_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
+        found[min(i, j), max(i, j)] = law if i < j else _Exchanged(law)
+    pairs = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
+    return tuple(found.get((i, j), Constant(weight)) for i, j, weight in pairs)
 
 
 class _Exchanged(Module):

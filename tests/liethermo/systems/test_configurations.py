@@ -400,7 +400,7 @@ def test_units():
         (lambda: run(V(Lazy(0.5))), "no subclass of it"),
         (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "not a SimpleClosedSystem"),
         (lambda: by_herglotz().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
-        (lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))), r"one of S\^3.*positions are in S\^2"),
+        (lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))), r"one of S\^3, not of S\^2"),
         (lambda: run(V.midpoint(), np.array([1.0, 0, 0, 0.5, 1.0, 0, 0])), r"T S\^2.*off the space"),
     ],
 )

@@ -184,8 +184,9 @@ def test_42():
     assert not solution.audit().passed
 
 
-def test_the_action_of_the_midpoint_rule():
-    made = lt.DiscreteHerglotz.midpoint(OSCILLATOR).discrete_lagrangian
+@pytest.mark.parametrize("given", [OSCILLATOR, lambda q, v, S: OSCILLATOR(jnp.array([q[0], v[0], S]))], ids=["1", "3"])
+def test_the_action_of_the_midpoint_rule(given):
+    made = lt.DiscreteHerglotz.midpoint(given).discrete_lagrangian
     for q0, q1, S0, h in np.random.default_rng(0).standard_normal((4, 4)):
         q0, q1 = jnp.array([q0]), jnp.array([q1])
         assert float(made(q0, q1, S0, h)) == pytest.approx(float(L_d(q0, q1, S0, h)), rel=1e-13)

@@ -237,7 +237,7 @@ def test_unusable_energies(energy, error, words):
         (lambda: lt.Quadratic([[0.0, 1.0], [0.0, 0.0]]), "not symmetric"),
         (lambda: lt.Quadratic(np.ones((2, 3))), r"\(n, n\)"),
         (lambda: lt.Quadratic(np.ones(2), np.ones(3)), "b has shape"),
-        (lambda: lt.models.rigid_body(inertia=(1.0, 2.0)), "three numbers"),
+        (lambda: lt.models.rigid_body(inertia=(1.0, 2.0)), r"inertia has shape \(3,\)"),
         (lambda: lt.models.rigid_body(inertia=(1.0, -2.0, 1.0)), "positive"),
         (lambda: lt.models.rigid_body(rate=-1.0), "not -1.0"),
     ],

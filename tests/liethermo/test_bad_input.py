@@ -1,0 +1,175 @@
+"""Input of the wrong kind to systems, schemes and models: one line each, before anything runs."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.models.open_gases import porous_piston_state
+
+V, D, M = lt.VariationalIntegrator, lt.DiscreteHerglotz, lt.models
+SO3 = mf.so(3)
+
+
+def L(q, v, S):
+    return 0.5 * (v @ v - q @ q) - jnp.exp(S)
+
+
+@functools.cache
+def bodies():
+    return [lt.Subsystem(lambda x: jnp.exp(x[0]), 1)] * 2
+
+
+@functools.cache
+def gases():
+    return [lt.Subsystem(lambda x: x[1] * jnp.exp(x[0] / x[1]), 2, species=1)] * 2
+
+
+def twins():
+    return [lt.Subsystem(gases()[0].energy, 2, name="a", species=1)] * 2
+
+
+@functools.cache
+def oscillator():
+    return lt.SimpleClosedSystem(L, 3, friction=0.1)
+
+
+@functools.cache
+def body():
+    return lt.EulerPoincareClosedSystem(SO3, lambda xi, S: 0.5 * xi @ xi - jnp.exp(S), lambda xi, S: -xi)
+
+
+@functools.cache
+def field():
+    return lt.EvolutionSystem(lambda q, p, S: 0.5 * (p @ p + q @ q) + jnp.exp(S), 3)
+
+
+def composed(**arguments):
+    return lt.ComposedSystem(bodies(), **arguments)
+
+
+def exchanging(**arguments):
+    return lt.ComposedSystem(gases(), validate=False, **arguments)
+
+
+def with_form(K):
+    return lt.MetriplecticSystem(lambda x: jnp.zeros((2, 2)), lambda x: x[0], lambda x: x[1], K, dim=2, validate=False)
+
+
+def run(system, method):
+    return lt.integrate(system, [1.0, 0.0, 0.0], (0.0, 0.2), 0.1, method)
+
+
+X, RUN = np.ones((2, 4)), np.ones((2, 3))
+
+CASES = {
+    # conductances, membranes, reactions
+    "four": (lambda: composed(conductance=lambda a, b, c, d: 1.0), "between body 0 and body 1 could not be evaluated"),
+    "text": (
+        lambda: composed(conductance=lambda a, b: "x"),
+        "between body 0 and body 1 could not be evaluated at .T_i",
+    ),
+    "array": (lambda: composed(conductance=lambda a, b: jnp.ones(2)), r"has shape \(\), not \(2,\)"),
+    "complex": (lambda: composed(conductance=lambda a, b: 1j * a), "is real, not complex128"),
+    "empty edge": (lambda: composed(conductance=[()]), r"an edge is \(i, j, weight\), not \(\)"),
+    "long edge": (lambda: composed(conductance=[(0, 1, 2, lambda a, b: a)]), r"an edge is \(i, j, weight\)"),
+    "named edge": (lambda: composed(conductance=[("a", 1, lambda a, b: a)]), r"an edge is \(i, j, weight\)"),
+    "half an edge": (lambda: composed(conductance=[(0.5, 1, 1.0)]), r"an edge is \(i, j, weight\)"),
+    "no bodies": (lambda: lt.ComposedSystem(3), "body 0 must be an lt.Subsystem or lt.Copies, not int"),
+    "texts": (lambda: lt.ComposedSystem(["a"]), "body 0 must be an lt.Subsystem or lt.Copies, not str"),
+    "maps": (
+        lambda: composed(momentum_maps=3),
+        "momentum_maps are a dict of functions, or a sequence of them, not int",
+    ),
+    "parameters": (lambda: lt.Copies(2, lambda x, c: c * x[0], 1, "a"), "made of real numbers, not 'a'"),
+    "membrane": (
+        lambda: exchanging(membranes=[lt.Membrane(0, 1, lambda x: x)]),
+        r"permeability of a membrane has shape \(\), not \(4,\)",
+    ),
+    "reaction": (
+        lambda: exchanging(reactions=[lt.Reaction(0, [1.0], lambda x, y: 1.0)]),
+        r"rate of a reaction could not be evaluated at a state of shape \(4,\)",
+    ),
+    "carried": (lambda: lt.Membrane(0, 1, 1.0, carries=[1.0, 2.0]), "is one number, not an array of shape"),
+    "two of a name": (
+        lambda: lt.ComposedSystem(twins(), membranes=[lt.Membrane("a", 1, 1.0)]),
+        "'a' is the name of several bodies",
+    ),
+    # models
+    "one conductance": (
+        lambda: M.porous_piston(conductance=1.0),
+        r"conductance has shape \(2,\), not",
+    ),
+    "three": (
+        lambda: M.gas_piston(conductance=(1.0, 1.0, 1.0)),
+        r"conductance has shape \(2,\), not",
+    ),
+    "no mass": (lambda: M.porous_piston(mass=0), "mass must be positive and finite, not 0.0"),
+    "mass": (lambda: M.porous_piston(mass="a"), "mass is made of real numbers, not 'a'"),
+    "None": (lambda: M.cylinder(mass=None), "mass is made of real numbers, not None"),
+    "inertia": (lambda: M.rigid_body("a"), "inertia is made of real numbers, not 'a'"),
+    "rate": (lambda: M.rigid_body(rate="a"), "a rate is made of real numbers, not 'a'"),
+    "capacities": (lambda: M.thermo_particles(0), r"capacities has shape \(1,\), not \(\)"),
+    "stoichiometry": (lambda: M.reaction_vessel(1.0), "a row of finite numbers, not 1.0"),
+    "energies": (lambda: M.reaction_vessel(energy=(1.0, 2.0)), r"energy has shape \(3,\), not \(2,\)"),
+    "unknown": (
+        lambda: porous_piston_state((1, 1), (1, 1), foo=3),
+        "porous_piston has no parameter 'foo': it has perm",
+    ),
+    "side": (lambda: porous_piston_state(1.0, (1, 1)), r"left, \(particles, temperature\), has shape \(2,\), not \(\)"),
+    "place": (lambda: porous_piston_state((1, 1), (1, 1), q="a"), "q is made of real numbers, not 'a'"),
+    # systems with a Lagrangian, on Lie algebras, with matrices
+    "friction": (lambda: lt.SimpleClosedSystem(L, 3, lambda q, v, S: v.foo), "friction could not be evaluated"),
+    "heat": (lambda: lt.SimpleClosedSystem(L, 3, heat_power=lambda q, v, S: 1j), "the heat power is real"),
+    "eta": (lambda: lt.ChetaevSystem(L, lambda q, v, S: 1j * v, 3), "eta is real, not complex128"),
+    "external": (
+        lambda: lt.EulerPoincareClosedSystem(SO3, body().lagrangian, external=lambda xi, S: 1j * xi),
+        "the external force is real",
+    ),
+    "K": (lambda: lt.FrictionOperator("a"), "the friction operator K is made of real numbers, not 'a'"),
+    "complex K": (lambda: lt.FrictionOperator(1j * np.eye(2)), "is made of real numbers, not ndarray"),
+    "K(x, y)": (lambda: with_form(lt.FrictionOperator(lambda x, y: x)), "friction operator K could not be evaluated"),
+    "quadratic": (lambda: lt.Quadratic([1.0], b=["a"]), "b of a quadratic function is made of real numbers, not list"),
+    # schemes
+    "retraction": (lambda: V("verlet", retraction=3), "retraction is the name of one, such as 'exp', or a .*, not 3"),
+    "of Gauss": (lambda: lt.MetriplecticGauss(2, retraction=3), "retraction is the name of one"),
+    "weight": (lambda: lt.FiniteDifference(0.5, weight="a"), "must be > 0 and finite, not 'a'"),
+    "S0": (lambda: V("verlet").state(oscillator(), [1.0], [1.0], [0.0, 1.0], 0.1), "S0 is one number, not an array"),
+    "h": (lambda: V("verlet").state(oscillator(), [1.0], [1.0], 0.0, "a"), "the step h is made of real numbers"),
+    "no step": (lambda: V("verlet").energies(oscillator(), RUN, 0.0), "the step h is finite and not zero, not 0.0"),
+    "one state": (lambda: V("verlet").energies(oscillator(), RUN[0], 0.1), r"at least two, shape \(times, 3\), not"),
+    "two states": (lambda: V("verlet").energies(composed(), RUN, 0.1), "runs an lt.SimpleClosedSystem, not a Composed"),
+    "no system": (lambda: V("verlet").energies(3, RUN, 0.1), "runs an lt.SimpleClosedSystem, not a int"),
+    "start": (
+        lambda: lt.LieVariational().attitudes(body(), X, 0.1, start=np.eye(2)),
+        r"start must have last axes \(3, 3",
+    ),
+    "one attitude": (lambda: lt.LieVariational().attitudes(body(), X[0], 0.1), r"at least two, shape \(times, 4\)"),
+    "wrong system": (lambda: lt.LieVariational().attitudes(oscillator(), RUN, 0.1), "not a SimpleClosedSystem"),
+    "order": (lambda: D(lambda q0, q1, S, h: S, [2]), r"the order is 1, 2 or 4, not \[2\]"),
+    "action": (lambda: run(field(), D(lambda q0, q1, S, h: q0)), r"discrete Lagrangian has shape \(\), not \(1,\)"),
+    "of three": (lambda: run(field(), D(lambda q0, q1, S: S)), "discrete Lagrangian could not be evaluated at .q_0"),
+    "midpoint": (lambda: run(field(), D.midpoint(lambda x: x)), "discrete Lagrangian has shape"),
+    "of two": (lambda: run(field(), D.midpoint(lambda q, v: 1.0)), "discrete Lagrangian could not be evaluated"),
+    "q1": (
+        lambda: D.midpoint(L).state([1.0], [1.0, 2.0], 0.0, 0.1),
+        r"q1 has shape \(1,\) or \(\), not \(2,\)",
+    ),
+    # algebras
+    "no algebra": (lambda: mf.trilinear_form("a"), r"a manifolds.LieAlgebra, such as mf.so\(3\), not 'a'"),
+    "number": (lambda: mf.trilinear_form(3), r"a manifolds.LieAlgebra, such as mf.so\(3\), not 3"),
+    "NaN": (lambda: mf.trilinear_form(SO3, np.full((3, 3), np.nan)), "must be finite, not .*nan"),
+    "complex form": (lambda: mf.trilinear_form(SO3, 1j * np.eye(3)), "must be real, not complex128"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_line(case):
+    call, words = CASES[case]
+    with pytest.raises((lt.LiethermoError, mf.ManifoldsError), match=words) as caught:
+        call()
+    assert isinstance(caught.value, ValueError | TypeError)
+    assert "\n" not in str(caught.value)
