@@ -276,7 +276,7 @@ def checked_stages(stages) -> int:
 
 
 def kind_of(system) -> str:
-    """What a system is, or what is given in the place of one."""
+    """What a system is; of anything else its class."""
     return system.kind if isinstance(system, System) else type(system).__name__
 
 

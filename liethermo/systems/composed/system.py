@@ -333,7 +333,7 @@ def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Pro
 
 
 def _by_law(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
-    """A graph of conductances, with 1 in the place of functions, and the edges that have one."""
+    """A graph of conductances, with 1 for functions, and the edges that have one."""
     if callable(conductance):
         conductance = [(0, 1, conductance)]
         if bodies != 2:
