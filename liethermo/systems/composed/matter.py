@@ -55,7 +55,7 @@ class Membrane(Module):
         require(self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}")
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Which numbers change together, among the bodies of these ``names``."""
+        """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
         a, b = (_body(given, names) for given in (self.first, self.second))
         if a == b:
             raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
@@ -95,7 +95,7 @@ class Reaction(Module):
         self.stoichiometry = tuple(found.tolist())
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Which numbers change together, among the bodies of these ``names``."""
+        """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
         body = _body(self.body, names)
         matter = structure.matter
         own = np.flatnonzero(matter.owner == body)
