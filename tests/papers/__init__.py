@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 import re
@@ -61,11 +62,12 @@ class Row(NamedTuple):
 ROWS: dict[str, Row] = {}
 
 
-def row(paper: str, where: str, what: str, beside: str) -> Callable:
-    """Decorator: the figure of a line."""
+def row(paper: str, where: str, what: str, beside: str, *arguments) -> Callable:
+    """Decorator: the figure of a line, a function of these arguments."""
 
-    def enter(figure: Callable[[], Figure]) -> Callable[[], Figure]:
-        ROWS[f"{paper} {where}: {figure.__name__}"] = Row(paper, where, what, beside, figure)
+    def enter(figure: Callable[..., Figure]) -> Callable[..., Figure]:
+        name = " ".join([figure.__name__, *map(str, arguments)])
+        ROWS[f"{paper} {where}: {name}"] = Row(paper, where, what, beside, functools.partial(figure, *arguments))
         return figure
 
     return enter
