@@ -11,13 +11,15 @@ import numpy as np
 from .._sizes import checked_size
 from ..matrices.linear import largest
 from ..matrices.symmetric import cholesky, symmetrized
-from .base import Space, register
+from .base import register
+from .maps import by_coordinates, by_projection
+from .spd import Definite
 
 
 @register((3,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
-class Correlation(Space):
+class Correlation(Definite):
     """Symmetric positive definite n x n matrices with ones on the diagonal, and the Euclidean-Cholesky metric.
 
     The Cholesky factor L of x, with each row divided by its entry on the diagonal, is a triangular matrix with ones on
@@ -38,10 +40,6 @@ class Correlation(Space):
     @property
     def dim(self):
         return self.n * (self.n - 1) // 2
-
-    @property
-    def shape(self):
-        return (self.n, self.n)
 
     def _residual(self, x):
         return jnp.where(self._inside(x), largest(self._rest(x)), jnp.inf)
@@ -65,14 +63,10 @@ class Correlation(Space):
     def _normal(self, x, c):
         return self.from_vector(c)
 
-    def _along(self, x, w):
-        return self._project_tangent(x, w)
+    _along = by_projection
 
     def _rounded(self, x):
         return self.to_vector(jnp.abs(x))
-
-    def _inside(self, x):
-        return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
 
     @property
     def _normals(self):
@@ -109,8 +103,7 @@ class Correlation(Space):
     def _frame(self, x):
         return jax.vmap(lambda e: self._from_coordinates(x, e), out_axes=-3)(jnp.eye(self.dim))
 
-    def _inner(self, x, u, v):
-        return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+    _inner = by_coordinates
 
     def _flat(self, x, v):
         c = self._coordinates(x, v)
@@ -129,8 +122,3 @@ class Correlation(Space):
 
     def _transport(self, x, v, u):
         return self._from_coordinates(self._exp(x, v), self._coordinates(x, u))
-
-    def _why_off(self, x, residual):
-        if np.isfinite(x).all() and not np.isfinite(residual):
-            return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
-        return super()._why_off(x, residual)

@@ -20,6 +20,7 @@ from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
 from ..matrices.linear import determinant, polar, skew, solve, spectral_radius, symmetric
 from ..matrices.symmetric import orthonormal_columns
 from .base import Space, register
+from .maps import by_coordinates, by_flat, by_projection
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
@@ -200,8 +201,7 @@ class GroupSpace(Space):
     def _from_coordinates(self, x, c):
         return self._from_velocity(x, c @ np.linalg.inv(self._root))
 
-    def _inner(self, x, u, v):
-        return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+    _inner = by_coordinates
 
     @cached_property
     def _traces(self) -> np.ndarray:
@@ -251,8 +251,7 @@ class BiInvariantSpace(GroupSpace):
     def _project_tangent(self, x, w):
         return self._from_velocity(x, self._velocity(x, w))  # vee is the orthogonal projection
 
-    def _along(self, x, w):
-        return self._project_tangent(x, w)
+    _along = by_projection
 
     def _frame(self, x):
         return x[..., None, :, :] @ self.group.algebra._known_basis()
@@ -263,8 +262,7 @@ class BiInvariantSpace(GroupSpace):
     def _from_coordinates(self, x, c):
         return self._from_velocity(x, c)
 
-    def _inner(self, x, u, v):
-        return self._pair(self._flat(x, u), v)
+    _inner = by_flat
 
     def _flat(self, x, v):
         basis = self.group.algebra._known_basis()
@@ -419,8 +417,7 @@ class SpecialEuclidean(GroupSpace):
     def _project_tangent(self, x, w):
         return self._map(self.rotations._project_tangent, lambda x, w: w, x, w)
 
-    def _along(self, x, w):
-        return self._project_tangent(x, w)
+    _along = by_projection
 
     def _correction(self, x, c):
         of_rotation, of_last = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
@@ -440,8 +437,7 @@ class SpecialEuclidean(GroupSpace):
     def _from_coordinates(self, x, c):
         return Space._from_coordinates(self, x, c)
 
-    def _inner(self, x, u, v):
-        return self._pair(self._flat(x, u), v)
+    _inner = by_flat
 
     def _flat(self, x, v):
         return self._map(self.rotations._flat, lambda x, v: v / self.length**2, x, v)

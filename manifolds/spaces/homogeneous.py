@@ -17,6 +17,7 @@ from ..groups.subgroups import factored, subalgebra
 from ..matrices.exponential import expm
 from .base import CUT_MARGIN, Space
 from .groups import BiInvariantSpace, SpecialOrthogonal, SpecialUnitary
+from .maps import by_coordinates
 
 
 @jax.tree_util.register_static
@@ -113,8 +114,7 @@ class Homogeneous(Space):
     def _frame(self, x):
         return x[..., None, :, :] @ np.einsum("da,aij->dij", self._m, self.upstairs.group.algebra._known_basis())
 
-    def _inner(self, x, u, v):
-        return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+    _inner = by_coordinates
 
     def _flat(self, x, v):
         return self.upstairs._flat(x, self._project_tangent(x, v))

@@ -11,7 +11,7 @@ import numpy as np
 from .._sizes import checked_size
 from ..matrices.stumpff import hyperbolic_arc, hyperbolic_stumpff
 from .base import Space, register
-from .maps import safe_sqrt
+from .maps import by_projection, safe_sqrt
 
 
 @register((2,))
@@ -61,8 +61,7 @@ class Hyperbolic(Space):
     def _normal(self, x, c):
         return c * _lowered(x) / (x**2).sum(axis=-1, keepdims=True)
 
-    def _along(self, x, w):
-        return self._project_tangent(x, w)
+    _along = by_projection
 
     def _rounded(self, x):
         return (x**2).sum(axis=-1, keepdims=True)

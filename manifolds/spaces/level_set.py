@@ -14,6 +14,7 @@ from .._sizes import checked_size
 from ..errors import DomainError, ParameterError, SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import MEMBERSHIP_TOLERANCE, Space, register
+from .maps import by_flat
 
 DEPENDENT = 1e-9
 """Least singular value of the gradients of the constraints, made unit vectors, that counts as independent."""
@@ -175,8 +176,7 @@ class LevelSet(Space):
         found = jax.vmap(lambda y: jnp.asarray(form(y)))(x.reshape(-1, *self.shape))
         return found.reshape(*batch, *found.shape[1:])
 
-    def _inner(self, x, u, v):
-        return self._pair(self._flat(x, u), v)
+    _inner = by_flat
 
     def _flat(self, x, v):
         if self.form is None:

@@ -341,3 +341,21 @@ def safe_sqrt(z):
     """``sqrt(max(z, 0))``, with the derivative 0 where z <= 0."""
     positive = z > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
+
+
+# -- what several spaces have: ``_inner = by_flat`` in the body of a class ---------------------------------------------
+
+
+def by_flat(self: Maps, x, u, v):
+    """The inner product, by :meth:`Maps._flat`."""
+    return self._pair(self._flat(x, u), v)
+
+
+def by_coordinates(self: Maps, x, u, v):
+    """The inner product, in the orthonormal frame."""
+    return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
+
+
+def by_projection(self: Maps, x, w):
+    """What is along a space whose :meth:`Maps._project_tangent` is right near it too."""
+    return self._project_tangent(x, w)

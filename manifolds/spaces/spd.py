@@ -15,10 +15,28 @@ from ..matrices.symmetric import cholesky, solve_lower, spd_log, symmetrized
 from .base import Space, register
 
 
+class Definite(Space):
+    """Symmetric positive definite n x n matrices of some kind."""
+
+    n: int
+
+    @property
+    def shape(self):
+        return (self.n, self.n)
+
+    def _inside(self, x):
+        return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
+
+    def _why_off(self, x, residual):
+        if np.isfinite(x).all() and not np.isfinite(residual):
+            return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
+        return super()._why_off(x, residual)
+
+
 @register((3,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
-class SPD(Space):
+class SPD(Definite):
     """Symmetric positive definite n x n matrices with ``inner(x, u, v) = tr(x^-1 u x^-1 v)``.
 
     The metric is invariant under every ``x -> g x g^T``; it makes the space complete and of nonpositive curvature, so
@@ -41,24 +59,16 @@ class SPD(Space):
     def dim(self):
         return self.n * (self.n + 1) // 2
 
-    @property
-    def shape(self):
-        return (self.n, self.n)
-
     def _residual(self, x):
-        positive = jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
         asymmetry = largest(x - x.swapaxes(-1, -2)) / largest(x)
-        return jnp.where(positive, asymmetry, jnp.inf)
+        return jnp.where(self._inside(x), asymmetry, jnp.inf)
 
     def _project(self, x):
         x = symmetrized(x)
-        return jnp.where(jnp.isfinite(cholesky(x)).all(axis=(-2, -1), keepdims=True), x, jnp.nan)
+        return jnp.where(self._inside(x)[..., None, None], x, jnp.nan)
 
     def _returned(self, x):
         return symmetrized(x)
-
-    def _inside(self, x):
-        return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
 
     @property
     def _normals(self):
@@ -99,11 +109,6 @@ class SPD(Space):
 
     def _straight_reach(self, x, v):
         return self._norm(x, v)  # x + v = L (I + a) L^T, with a of this norm
-
-    def _why_off(self, x, residual):
-        if np.isfinite(x).all() and not np.isfinite(residual):
-            return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
-        return super()._why_off(x, residual)
 
     def _inverse_factor(self, x):
         return solve_lower(cholesky(x), jnp.broadcast_to(np.eye(self.n), x.shape))

@@ -15,6 +15,7 @@ from ..matrices.exponential import expm
 from ..matrices.linear import complement, largest, lyapunov, orthonormalized, polar, skew, solve, symmetric
 from ..matrices.symmetric import orthonormal_columns
 from .base import CUT_MARGIN, Space, register
+from .maps import by_flat
 
 _MOST_STEPS = 30
 """Iterations of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
@@ -113,8 +114,7 @@ class Stiefel(Space):
         """By the rotations of every plane."""
         return skew(w, self.n) @ x
 
-    def _inner(self, x, u, v):
-        return self._pair(self._flat(x, u), v)
+    _inner = by_flat
 
     def _flat(self, x, v):
         return v - 0.5 * x @ (_transposed(x) @ v)
