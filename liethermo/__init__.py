@@ -9,6 +9,7 @@ import importlib
 import importlib.metadata
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
+from manifolds._names import listing
 
 from . import bodies, models, testing
 from .dissipation.base import Dissipation
@@ -220,9 +221,7 @@ __all__ = [
 _INTEROP = ("diffrax", "scipy", "sympy")
 
 
-def __dir__() -> list[str]:
-    """What is public: not the modules that are imported here."""
-    return sorted([*__all__, "__doc__", "__name__", "__version__"])
+__dir__ = listing(__all__, "__version__")
 
 
 def __getattr__(name: str):

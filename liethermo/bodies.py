@@ -5,7 +5,10 @@ Units are SI or any others that are consistent; angles are in radians.
 
 from __future__ import annotations
 
+from manifolds._names import listing
+
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .results.orientation import nutation, precession, quaternions, spin
 
 __all__ = ["Periods", "damping_time", "nutation", "periods", "precession", "quaternions", "rate_of", "spin"]
+__dir__ = listing(__all__)

@@ -7,6 +7,7 @@ round them away.
 import importlib
 
 from . import _fork, _precision, testing  # noqa: F401
+from ._names import listing
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
@@ -195,11 +196,7 @@ __all__ = [
     "trilinear_form",
     "u",
 ]
-
-
-def __dir__() -> list[str]:
-    """What is public: not the modules that are imported here."""
-    return sorted([*__all__, "__doc__", "__name__"])
+__dir__ = listing(__all__)
 
 
 def __getattr__(name: str):

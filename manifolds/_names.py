@@ -1,6 +1,8 @@
-"""Names of basis elements and components."""
+"""Names of basis elements and components, and those that a module shows."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 from .errors import ParameterError
 
@@ -17,3 +19,8 @@ def checked_names(names, dim: int) -> tuple[str, ...]:
 def component_names(names: tuple[str, ...] | None, dim: int) -> tuple[str, ...]:
     """The names, or ``mu1``, ``mu2``, …"""
     return tuple(f"mu{i + 1}" for i in range(dim)) if names is None else names
+
+
+def listing(names, *more: str) -> Callable[[], list[str]]:
+    """``__dir__`` of a module: what is public, not the modules that are imported there."""
+    return lambda: sorted({*names, *more, "__doc__", "__name__"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,23 @@ def test_everything_public_is_described(package):
         if described and not doc and member not in attributes and not by_class:
             silent.append(name)
     assert silent == []
+
+
+MODULES = ("bodies", "diffrax", "learn", "magnetism", "models", "plot", "scipy", "sympy", "testing", "torques")
+GEOMETRY = ("manifolds", "manifolds.sympy", "manifolds.testing")
+
+
+@pytest.mark.parametrize("name", ["liethermo", *(f"liethermo.{name}" for name in MODULES), *GEOMETRY])
+def test_modules_show_what_is_public_and_nothing_else(name):
+    """Other modules too only where the package has them for its users."""
+    package, _, inner = name.partition(".")
+    if inner in ("diffrax", "sympy"):
+        pytest.importorskip(inner)
+    module = sys.modules[package] if not inner else getattr(sys.modules[package], inner)
+    version = {"__version__"} if name == "liethermo" else set()
+    assert set(dir(module)) == {*module.__all__, "__doc__", "__name__"} | version
+    found = {shown for shown in module.__all__ if inspect.ismodule(getattr(module, shown))}
+    assert found <= (set() if inner else {*MODULES})
 
 
 def test_an_argument_that_nobody_tells_is_found():

@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced, real_array
+from manifolds._names import listing
 from manifolds.structures.spins import (
     Lattice,
     Planes,
@@ -38,6 +39,9 @@ from .each import Each
 from .edges import edges
 from .energy import Energy, Sum
 from .indices import cliques
+
+__all__ = ["anisotropy", "dzyaloshinskii_moriya", "exchange", "zeeman"]
+__dir__ = listing(__all__)
 
 
 def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:

@@ -11,12 +11,17 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from manifolds._names import listing
+
 from ..errors import InputError
 from ..functions.checks import traced_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.base import estimates_error
 from ..runs.flow import first_carry, one_step
 from ..systems import System
+
+__all__ = ["Solver", "Term"]
+__dir__ = listing(__all__)
 
 
 class Term(diffrax.ODETerm):

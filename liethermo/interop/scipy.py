@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from manifolds._names import listing
+
 from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
@@ -16,6 +18,9 @@ from ..runs.adaptive import Adaptive
 from ..runs.integrate import integrate
 from ..runs.watch import Watch
 from ..systems import System
+
+__all__ = ["OdeResult", "solve_ivp"]
+__dir__ = listing(__all__)
 
 STATUSES = {"completed": 0, "event": 1}
 """SciPy's numbers for how a run ended; -1 for every failure."""

@@ -20,6 +20,7 @@ import numpy as np
 import sympy
 
 import manifolds as mf
+from manifolds._names import listing
 
 from .. import disk
 from ..errors import FileError, InputError
@@ -28,6 +29,9 @@ from ..runs.integrate import integrate
 from ..systems import LiePoissonSystem, System
 from ..tracing.program import Program
 from ..tracing.scalarize import scalarize
+
+__all__ = ["Expressions", "describe", "expressions", "function", "write"]
+__dir__ = listing(__all__)
 
 FORMAT = "liethermo-problem-1"
 

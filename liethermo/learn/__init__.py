@@ -1,5 +1,7 @@
 """Systems with networks in them, fitted to data: both laws hold by construction, before, during and after training."""
 
+from manifolds._names import listing
+
 from .files import load, save
 from .fitting import fit
 from .known import Determined, Fits, determined, several
@@ -24,3 +26,4 @@ __all__ = [
     "save",
     "several",
 ]
+__dir__ = listing(__all__)

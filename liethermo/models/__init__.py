@@ -5,6 +5,8 @@ A function ``model_solution`` beside a model, in its module, is the exact soluti
 
 from __future__ import annotations
 
+from manifolds._names import listing
+
 from .body_with_wheels import body_with_wheels
 from .cylinder import cylinder
 from .gas_piston import gas_piston
@@ -48,3 +50,4 @@ __all__ = [
     "tumbling_body",
     "zeitlin",
 ]
+__dir__ = listing(__all__)

@@ -15,12 +15,14 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 from manifolds._module import Module
+from manifolds._names import listing
 
 from ..errors import InputError
 from ..functions.conditions import numbers, require
 from .parameters import finite, positive
 
 __all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
+__dir__ = listing(__all__)
 
 PERPENDICULAR = 1e-8
 """Largest cosine of two directions that count as perpendicular."""

@@ -5,6 +5,7 @@ Each ``check_*`` puts an object through what every registered one goes through. 
 :mod:`manifolds.testing`.
 """
 
+from manifolds._names import listing
 from manifolds.testing import PropertyError, Report
 
 from .dissipations import check_dissipation
@@ -23,3 +24,4 @@ __all__ = [
     "check_relations",
     "check_system",
 ]
+__dir__ = listing(__all__)
