@@ -13,6 +13,7 @@ from manifolds.testing import Suite
 from ..engines.choice import is_small
 from ..integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod
 from ..results.audit import ACCURACY, INEXACT, TAKEN
+from ..results.solution import Solution
 from ..runs.integrate import integrate
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
@@ -43,10 +44,15 @@ def step_of(system: System, x0) -> float:
     return 0.01 * max(size, 1e-3) / speed if speed > 0.0 else 0.01
 
 
+def completes(suite: Suite, what: str, run: Solution) -> None:
+    """A row that says whether a run came to its end."""
+    suite.true(f"{what} completes", run.status.ok, "" if run.status.ok else run.status.message)
+
+
 def follow_laws(suite: Suite, system: System, method: OneStepMethod, x0, h: float, label: str = "") -> None:
     """Rows of the audit of a run, of the engines' agreement and of a system that was put together again."""
     solution = integrate(system, x0, (0.0, STEPS * h), h, method, on_failure="return", engine="array")
-    suite.true(f"{label}run completes", solution.status.ok, solution.status.message if not solution.status.ok else "")
+    completes(suite, f"{label}run", solution)
     for row in solution.audit().rows:
         if row.passed is not None and row.law not in (TAKEN, ACCURACY):
             passed = None if row.note == INEXACT else row.passed  # what it does not claim to keep is not judged

@@ -184,3 +184,10 @@ def test_a_fault_is_found(relation):
 def test_a_name_that_is_none():
     with pytest.raises(lt.InputError, match="no relation 'unit'; there are constant, "):
         testing.check_relations(oscillator(), relations=["unit"])
+
+
+def test_a_run_that_fails_is_told():
+    """A fall into ``ln q``: the loaded run is the failed one to the bit, which is no evidence."""
+    falling = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.log(x[0]), validate=False)
+    with pytest.raises(testing.PropertyError, match=r"the run completes .*FAILS"):
+        testing.check_relations(falling, METHODS["explicit 4"], [0.1, -1.0], 0.02, relations=["file"])
