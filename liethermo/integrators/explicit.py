@@ -118,11 +118,12 @@ class ExplicitMethod(TransportingMethod):
         """On orbits of two dimensions: their levels are orbits everywhere, but for momenta that nothing moves.
 
         Among larger ones some have fewer dimensions than the levels around them, as that of a body on se(3) that spins
-        but does not move. Near these the turn that makes up for an error is much larger than the error.
+        but does not move. Near these the turn that makes up for an error is much larger than the error. Momenta of
+        parts that turn inside, such as a wheel that rubs, are no matter of the attitude's.
         """
-        casimirs = system.casimirs()
-        held = bool(system.pushed_by) or casimirs.keys() <= set(self.held)  # of a torque, the impulse is made to fit
-        return system.has_all_casimirs and held and system.body_dim - len(casimirs) <= 2
+        size, casimirs = system.orbit
+        held = bool(system.pushed_by) or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
+        return system.has_all_casimirs and held and size - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         seen = self._with(lambda C: seen_on(system, C), tuple(sorted(system.first_integrals())))

@@ -176,6 +176,7 @@ class DrivenSystem(System):
         return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
 
     has_all_casimirs = forwarded("body")
+    orbit = forwarded("body")
 
     def conserves(self, functions, near=None):
         """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""

@@ -150,6 +150,11 @@ class Kind(Geometry):
         return False
 
     @property
+    def orbit(self) -> tuple[int, frozenset[str]]:
+        """How many momenta a group turns, and the names of the Casimirs on them: an orbit is a level of these."""
+        return self.body_dim, frozenset(self.casimirs())
+
+    @property
     def surface(self) -> Surface | None:
         """Where a step has to end, of constraints that are no functions of the system; None where there are none."""
         return None

@@ -218,6 +218,12 @@ class LiePoissonSystem(System):
     def has_all_casimirs(self) -> bool:
         return _spans_all_casimirs(self.algebra)
 
+    @property
+    def orbit(self) -> tuple[int, frozenset[str]]:
+        if self.group is None:
+            return super().orbit
+        return self.group.dim, _on_the_first(self.algebra, self.algebra.basis_names, self.group.dim)
+
 
 def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
     """The way to reconstruct attitudes in a group of the algebra; None without a group."""
@@ -294,6 +300,15 @@ def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) ->
             function = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
             found[name] = recognised(function, algebra.dim)
     return found
+
+
+@functools.lru_cache(maxsize=64)
+def _on_the_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int) -> frozenset[str]:
+    """Which of the recorded Casimirs depend on the first n components."""
+    x = np.random.default_rng(0).standard_normal(algebra.dim)
+    with jax.ensure_compile_time_eval():
+        found = _recorded_casimirs(algebra, names).items()
+        return frozenset(name for name, C in found if bool(C.gradient(jnp.asarray(x))[:n].any()))
 
 
 @functools.lru_cache(maxsize=64)
