@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -52,7 +53,7 @@ class Jump(NamedTuple):
     Attributes
     ----------
     operator : Operator
-        V; together with its adjoint, which puts that energy in.
+        V in the frame of the jumps; together with its adjoint, which puts that energy in.
     source : int
         The number of the coupling.
     weight : float
@@ -107,6 +108,7 @@ class ThermalJumps(Dissipation):
     rates: tuple[Any, ...]
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True)
+    frame: Operator | None = eqx.field(static=True)
     isolated: bool = eqx.field(static=True)
     keeps_energy: bool = eqx.field(static=True)
 
@@ -118,7 +120,7 @@ class ThermalJumps(Dissipation):
             raise InputError(f"bath is the number of a bath, from 0, not {bath!r}")
         self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(given))
         self.rates = tuple(rate if callable(rate) else checked_rate(rate) for _, rate in given)
-        self.bath, self.jumps, self.isolated, self.keeps_energy = bath, (), False, True
+        self.bath, self.jumps, self.frame, self.isolated, self.keeps_energy = bath, (), None, False, True
 
     @property
     def energy_law(self):
@@ -138,16 +140,17 @@ class ThermalJumps(Dissipation):
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if _hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             kept = all(_small(_commutator(H, V), H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
-        else:
-            jumps = tuple(
-                itertools.chain.from_iterable(_split(V, i, hamiltonians) for i, V in enumerate(self.operators))
-            )
-            kept = True
-        return self._replaced(jumps=jumps, isolated=baths is None, keeps_energy=kept)
+            return self._replaced(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
+        vectors = _eigenvectors(hamiltonians[0])
+        inside = [vectors.conj().T @ H @ vectors for H in hamiltonians]
+        found = [_split(V, i, inside, vectors) for i, V in enumerate(self.operators)]
+        frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
+        jumps = tuple(itertools.chain.from_iterable(found))
+        return self._replaced(jumps=jumps, frame=frame, isolated=False, keeps_energy=True)
 
     def _replaced(self, **fields) -> ThermalJumps:
         found = object.__new__(ThermalJumps)
-        for name in ("operators", "rates", "bath", "jumps", "isolated", "keeps_energy"):
+        for name in ("operators", "rates", "bath", "jumps", "frame", "isolated", "keeps_energy"):
             object.__setattr__(found, name, fields.get(name, getattr(self, name)))
         return found
 
@@ -157,50 +160,52 @@ class ThermalJumps(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         structure, n = system.structure, system.body_dim
-        logs = mf.spectral(jnp.log, structure.matrix(x[:n]))
-        H, A = structure.matrix(dH[:n]), structure.matrix(dS[:n])
-        fixed = np.stack([np.asarray(jump.operator) for jump in self.jumps])
-        V, adjoint = jnp.asarray(fixed), jnp.asarray(fixed.conj().swapaxes(-1, -2))
-        squares, conjugate = np.sum(np.abs(fixed) ** 2, axis=(-2, -1)), jnp.asarray(fixed.conj())
-        turned = _commutator(V, H)
-        omega = jnp.sum(turned * conjugate, axis=(-2, -1)).real / squares
+        rho, H, A = (self._inside(structure.matrix(a[:n])) for a in (x, dH, dS))
+        fixed = _stacked(self.jumps)
+        V, adjoint, omega = jnp.asarray(fixed), jnp.asarray(_adjoint(fixed)), self._frequencies(structure, dH[:n])
         if self.isolated:
             T, shift = jnp.asarray(jnp.inf), jnp.zeros(len(self.jumps))
-            B = _commutator(V, A)
         else:
             T = dH[n + self.bath]
-            ratio, shift = dS[n + self.bath] / T, omega / (2.0 * T)
-            B = _commutator(V, A) - ratio * turned
-        image = log_mean(logs, shift, B) * self._strengths(omega, T)[:, None, None]
-        force = structure.vector(jnp.sum(_commutator(adjoint, image), axis=0))  # the adjoints add the adjoint
-        if self.isolated:
-            return force
-        lost = jnp.sum(turned.conj() * image).real
-        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-lost / T)])
+            shift, A = omega / (2.0 * T), A - (dS[n + self.bath] / T) * H
+        image = log_mean(mf.spectral(jnp.log, rho), shift, _commutator(V, A)) * self._strengths(omega, T)[:, None, None]
+        moved = jnp.sum(_commutator(adjoint, image), axis=0)  # the adjoints add the adjoint
+        return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
 
     has_generator = True
 
     def generated(self, system, x, dH):
         """Lindblad's equation, and the heat that the bath takes."""
         structure, n = system.structure, system.body_dim
-        rho, fixed = structure.matrix(x[:n]), np.stack([np.asarray(jump.operator) for jump in self.jumps])
-        adjoint = fixed.conj().swapaxes(-1, -2)
-        taken, given = adjoint @ fixed, fixed @ adjoint
-        # the frequency is linear in H, by a table that is known when programs are written
-        along = (taken - given) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
-        with jax.ensure_compile_time_eval():
-            along = np.asarray(structure.vector(along))
-        omega = along @ dH[:n]
+        rho, omega = self._inside(structure.matrix(x[:n])), self._frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.isolated else dH[n + self.bath]
         strengths, grown = self._strengths(omega, T), jnp.exp(omega / (2.0 * T))
         rates = jnp.concatenate([strengths * grown, strengths / grown])
-        jumps = np.concatenate([fixed, adjoint])
-        moved = (rates[:, None, None] * jumps) @ rho @ np.concatenate([adjoint, fixed])
-        lost = jnp.tensordot(rates, np.concatenate([taken, given]), 1) @ rho
-        force = structure.vector(jnp.sum(moved, axis=0) - lost)  # the Hermitian part has both terms of what is lost
+        # the Hermitian part has both terms of what is lost
+        moved = _jumped(self.jumps, rates, rho) - jnp.tensordot(rates, _left(self.jumps), 1) @ rho
+        return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
+
+    def _inside(self, matrix):
+        """A matrix in the frame, in which most entries of the jumps are zero."""
+        return matrix if self.frame is None else _adjoint(np.asarray(self.frame)) @ matrix @ np.asarray(self.frame)
+
+    def _outside(self, matrix):
+        return matrix if self.frame is None else np.asarray(self.frame) @ matrix @ _adjoint(np.asarray(self.frame))
+
+    def _frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
+        """The energies that the jumps take: linear in H, by a table that is known when programs are written."""
+        fixed = _stacked(self.jumps)
+        adjoint = _adjoint(fixed)
+        along = (adjoint @ fixed - fixed @ adjoint) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
+        with jax.ensure_compile_time_eval():
+            return np.asarray(structure.vector(self._outside(along))) @ dH
+
+    def _with_heat(self, system, dH, T, force) -> jax.Array:
+        """The force with the entropy that the bath takes."""
         if self.isolated:
             return force
-        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * (-jnp.dot(dH[:n], force) / T)])
+        taken = -jnp.dot(dH[: system.body_dim], force) / T
+        return jnp.concatenate([force, np.eye(system.dim - system.body_dim)[self.bath] * taken])
 
     def _strengths(self, omega, T) -> jax.Array:
         rates = [self.rates[jump.source] for jump in self.jumps]
@@ -319,6 +324,64 @@ def _commutator(a, b):
     return a @ b - b @ a
 
 
+def _adjoint(a: np.ndarray) -> np.ndarray:
+    return a.conj().swapaxes(-1, -2)
+
+
+def _eigenvectors(H: np.ndarray) -> np.ndarray:
+    """Those of a matrix that is diagonal are the axes."""
+    return np.eye(len(H)) if not (H - np.diag(np.diag(H))).any() else np.linalg.eigh(H)[1]
+
+
+def _stacked(jumps: tuple[Jump, ...]) -> np.ndarray:
+    """The matrices of jumps, real ones where they are."""
+    found = np.stack([np.asarray(jump.operator) for jump in jumps])
+    return found if found.imag.any() else found.real
+
+
+@functools.lru_cache(maxsize=64)
+def _left(jumps: tuple[Jump, ...]) -> np.ndarray:
+    """``V^H V`` of each jump, and then of each adjoint."""
+    fixed = _stacked(jumps)
+    return np.concatenate([_adjoint(fixed) @ fixed, fixed @ _adjoint(fixed)])
+
+
+def _jumped(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
+    """``sum rate V rho V^H`` over the jumps and then their adjoints."""
+    fixed = _stacked(jumps)
+    both = np.concatenate([fixed, _adjoint(fixed)])
+    found = _table(jumps)
+    if found is None:
+        return jnp.sum((rates[:, None, None] * both) @ rho @ _adjoint(both), axis=0)
+    which, source, factors = found
+    return jnp.sum(rho.ravel()[source] * (rates[which] * factors), axis=-1).reshape(rho.shape)
+
+
+@functools.lru_cache(maxsize=64)
+def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The numbers of the jumps, the entries of rho and the factors that make up each entry of ``sum V rho V^H``.
+
+    None where products of matrices are shorter, as with a few full matrices.
+    """
+    fixed = _stacked(jumps)
+    both = np.concatenate([fixed, _adjoint(fixed)])
+    size = both.shape[-1]
+    jump, i, j = np.nonzero(both)
+    if np.sum(np.bincount(jump) ** 2) > 2 * both.size * size:
+        return None
+    one, other = np.nonzero(jump[:, None] == jump)
+    target = i[one] * size + i[other]
+    order = np.argsort(target, kind="stable")
+    one, other, target = one[order], other[order], target[order]
+    counts = np.bincount(target, minlength=size**2)
+    place = target, np.arange(len(target)) - np.repeat(np.cumsum(counts) - counts, counts)
+    which, source = np.zeros((2, size**2, counts.max()), np.uint32)  # no sign: JAX then looks for no negative ones
+    factors = np.zeros(which.shape, both.dtype)
+    which[place], source[place] = jump[one], j[one] * size + j[other]
+    factors[place] = both[jump[one], i[one], j[one]] * both[jump[other], i[other], j[other]].conj()
+    return which, source, factors
+
+
 def _hermitian(V) -> bool:
     V = np.asarray(V)
     return bool(np.abs(V - V.conj().T).max() <= 1e-12 * np.abs(V).max())
@@ -328,11 +391,13 @@ def _small(residual, H, V) -> bool:
     return bool(np.abs(residual).max() <= EIGEN * np.abs(H).max() * np.abs(V).max())
 
 
-def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray]) -> list[Jump]:
-    """The eigenoperators of ``[H, .]`` that a coupling is the sum of; those of a Hermitian one up to adjoints."""
-    V, H = np.asarray(operator), hamiltonians[0]
-    energies, vectors = np.linalg.eigh(H)
-    inside = vectors.conj().T @ V @ vectors
+def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray) -> list[Jump]:
+    """The eigenoperators of ``[H, .]`` that a coupling is the sum of; those of a Hermitian one up to adjoints.
+
+    The Hamiltonians are those in the frame, in which the first one is diagonal.
+    """
+    V = np.asarray(operator)
+    energies, inside = np.diag(hamiltonians[0]).real, _adjoint(frame) @ V @ frame
     gaps = energies[None, :] - energies[:, None]
     present = np.abs(inside) > 1e-14 * np.abs(V).max()
     spread = EIGEN * max(float(np.abs(energies).max()), 1e-300)
@@ -345,12 +410,7 @@ def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray]) 
         if own_adjoint and omega < -spread:
             continue
         still = own_adjoint and abs(omega) <= spread
-        whole = len(frequencies) == 1
-        part = (
-            V
-            if whole
-            else vectors @ np.where(present & (np.abs(gaps - omega) <= spread), inside, 0.0) @ vectors.conj().T
-        )
+        part = np.where(present & (np.abs(gaps - omega) <= spread), inside, 0.0)
         for other in hamiltonians[1:]:
             turned = _commutator(other, part)
             along = np.vdot(part, turned) / np.vdot(part, part)

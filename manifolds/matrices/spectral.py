@@ -133,7 +133,7 @@ class Spectral:
 
 def _eigenvectors(a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
     a = (a + a.conj().swapaxes(-1, -2)) / 2
-    if unrolled and a.shape[-1] > SMALL:
+    if a.shape[-1] > SMALL:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
         return values, vectors
     return eigh(a)

@@ -34,16 +34,17 @@ class DensityMatrices(PoissonBySharp):
 
     def matrix(self, x) -> jax.Array:
         """The Hermitian matrices with coordinates x, shape (..., N^2) to (..., N, N)."""
-        parts = (x @ table for table in _tables(self.size))
-        real, imaginary = (part.reshape(*part.shape[:-1], self.size, self.size) for part in parts)
+        (re, im), (size, sign), _ = _places(self.size)
+        real, imaginary = (part.reshape(*part.shape[:-1], self.size, self.size) for part in (x[..., re], x[..., im]))
+        real, imaginary = real * size, imaginary * sign
         return real + 1j * imaginary if isinstance(x, np.ndarray) else jax.lax.complex(real, imaginary)
 
     def vector(self, a) -> jax.Array:
         """The coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of :meth:`matrix`."""
         a = jnp.asarray(a)
-        real, imaginary = (part.reshape(*part.shape[:-2], -1) for part in (a.real, a.imag))
-        first, second = _tables(self.size)
-        return real @ first.T + imaginary @ second.T
+        turned, (_, (size, _), chosen) = a.swapaxes(-1, -2), _places(self.size)
+        parts = jnp.stack([(a.real + turned.real) * (0.5 / size), (a.imag - turned.imag) * (0.5 / size)], axis=-3)
+        return parts.reshape(*a.shape[:-2], -1)[..., chosen]
 
     def sharp(self, x, alpha) -> jax.Array:
         product = self.matrix(alpha) @ self.matrix(x)
@@ -51,13 +52,16 @@ class DensityMatrices(PoissonBySharp):
 
 
 @functools.lru_cache(maxsize=64)
-def _tables(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Real and imaginary parts of the basis, shape (N^2, N^2) each: mostly zeros, which a program leaves out."""
+def _places(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where in the coordinates the parts of each entry stand, and their factors; where in the parts the coordinates."""
     (j, k), on, root = np.triu_indices(n, 1), np.arange(n), np.sqrt(0.5)
-    real, imaginary = np.zeros((2, n * n, n, n))
-    real[on, on, on] = 1.0
-    re = n + np.arange(len(j))
-    im = re + len(j)
-    real[re, j, k] = real[re, k, j] = imaginary[im, j, k] = root
-    imaginary[im, k, j] = -root
-    return real.reshape(n * n, -1), imaginary.reshape(n * n, -1)
+    pairs = n + np.arange(len(j))
+    re, im = np.empty((2, n, n), np.uint32)  # without a sign: JAX then looks for no negative ones
+    factors = np.full((2, n, n), root)
+    re[on, on] = im[on, on] = on
+    factors[0, on, on], factors[1, on, on] = 1.0, 0.0
+    re[j, k] = re[k, j] = pairs
+    im[j, k] = im[k, j] = pairs + len(j)
+    factors[1, k, j] = -root
+    chosen = np.concatenate([on * (n + 1), j * n + k, n * n + j * n + k])
+    return np.stack([re.ravel(), im.ravel()]), factors, chosen.astype(np.uint32)
