@@ -19,6 +19,9 @@ EPS = float(np.finfo(np.float64).eps)
 REACHED = 1e-9
 """Largest change of a constraint, relative to the size at which it is rounded, that one more step takes off."""
 
+NEWTON = 5
+"""Steps of Newton's method at most: a short step needs two, noise moves a state farther."""
+
 NOTICED, TAKEN = 4.0 * EPS, 8.0 * EPS
 """What a constraint has to be off, relative to that size, for a step to take it back, and the most that one takes."""
 
@@ -82,16 +85,18 @@ class OnLevels:
         """By Newton's method, from what the constraints change by along d: as exact as d is small."""
         if _count(self.space) == 0:
             return d, jnp.zeros(())
-        end = x + (compensation + d)
 
-        def nearer(d, _):
-            change = self._change(x, compensation, d)
-            return d - self._moved(end, change), change
+        def nearer(d) -> tuple[jax.Array, jax.Array]:
+            change, end = self._change(x, compensation, d), x + (compensation + d)
+            left = jnp.max(jnp.abs(change) / (self.space._rounded(self._point(end)) + TINY))
+            return d - self._moved(end, change), left
+
+        def again(carry, _):
+            return jax.lax.cond(carry[1] <= REACHED, lambda: carry, lambda: nearer(carry[0])), None
 
         if _degree(self.space) <= 1:
-            return nearer(d, None)[0], jnp.zeros(())
-        d, changes = jax.lax.scan(nearer, d, length=2)
-        left = jnp.max(jnp.abs(changes[-1]) / (self.space._rounded(self._point(end)) + TINY))
+            return nearer(d)[0], jnp.zeros(())
+        (d, left), _ = jax.lax.scan(again, (d, jnp.asarray(jnp.inf)), length=NEWTON)
         return d, jnp.where(left <= REACHED, 0.0, left) * jnp.linalg.norm(x)
 
     def settled(self, x, compensation) -> tuple[jax.Array, jax.Array]:
@@ -112,11 +117,19 @@ class OnLevels:
         return x if _count(self.space) == 0 else x - self._moved(x, self.space._constraints(self._point(x)))
 
     def _change(self, x, compensation, d) -> jax.Array:
-        """What the constraints change by along d, by a quadrature that is exact for polynomials of degree ten."""
+        """What the constraints change by along d, by a quadrature that is exact for polynomials of degree ten.
+
+        Where it misses more than rounding, in long steps on other constraints, it is the difference of their values.
+        """
         nodes, weights = _rule(int(min(np.ceil(0.5 * max(_degree(self.space), 2)), NODES)))
         way = self._point(d)
         rates = [jax.jvp(self.space._constraints, (self._point(x + (compensation + c * d)),), (way,))[1] for c in nodes]
-        return sum(w * rate for w, rate in zip(weights[1:], rates[1:], strict=True)) + weights[0] * rates[0]
+        change = sum(w * rate for w, rate in zip(weights[1:], rates[1:], strict=True)) + weights[0] * rates[0]
+        if _degree(self.space) <= 2 * NODES:
+            return change
+        end = self._point(x + (compensation + d))
+        difference = self.space._constraints(end) - self.space._constraints(self._point(x + compensation))
+        return jnp.where(jnp.abs(difference - change) > MISSED * self.space._rounded(end), difference, change)
 
     def _moved(self, x, c) -> jax.Array:
         """The displacement, shape (n,), that changes the constraints by c."""
@@ -131,6 +144,9 @@ TINY = float(np.finfo(np.float64).tiny)
 
 NODES = 5
 """Nodes of the quadrature for constraints of higher degree: it misses the eleventh power of the step."""
+
+MISSED = 64.0 * EPS
+"""What it misses, relative to the size at which a constraint is rounded, beyond the rounding of differences."""
 
 
 def _rule(number: int) -> tuple[np.ndarray, np.ndarray]:

@@ -227,17 +227,25 @@ ONE_SIZE = (
 
 
 def moved(
-    method: OneStepMethod, system: System, x, compensation, d, held: tuple[Energy, ...] = (), settles: bool = False
+    method: OneStepMethod,
+    system: System,
+    x,
+    compensation,
+    d,
+    held: tuple[Energy, ...] = (),
+    settles: bool = False,
+    driven: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """x + compensation + d, on the surface that the system has; of an implicit step, on which also ``held`` are kept.
 
-    These are functions besides energy and entropy. ``settles`` says that d ends on the surface by itself.
+    These are functions besides energy and entropy. ``settles`` says that d ends on the surface by itself, ``driven``
+    that noise moves it.
     """
     surface = system.surface
     if surface is None:
         return compensated(x, compensation + d)
     if not (method.explicit or settles or surface.collocated):
-        d = ended(system, surface, held, x, compensation, d)
+        d = ended(system, surface, held, x, compensation, d, driven)
     return surface.settled(*compensated(x, compensation + d))
 
 

@@ -16,7 +16,7 @@ from ..functions.energy import Energy
 from ..systems import SpinSystem, System
 from ..tracing.interpret import at_points
 from ..tracing.remembered import remembered
-from .base import OneStepMethod, TransportingMethod, Wrapping
+from .base import OneStepMethod, TransportingMethod, Wrapping, moved
 from .charts import in_charts
 from .midpoint import MetriplecticMidpoint
 
@@ -101,6 +101,9 @@ class Fluctuating(Wrapping, TransportingMethod):
             quantum = self.boltzmann * (1.0 if part.energy_law == "conserved" else self.temperature)
             found.append((B, quantum * d + _amplitude(B, quantum, h) * (dW / h)))
         return found
+
+    def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
+        return moved(self, system, x, compensation, self.increment(h, k), driven=True)
 
     def predict(self, k, before) -> jax.Array:
         """The noise of a step has nothing to do with that of those before."""
@@ -192,9 +195,9 @@ def _noisy(part) -> bool:
 def undisturbed(system: System) -> dict[str, bool]:
     """Whether no noise changes a function, for each of a system's: ``B^T grad f = 0`` at random points."""
     found = {}
-    for name, (moved, size) in _tested(system)[1].items():
-        inside = np.isfinite(moved)
-        found[name] = bool(inside.any() and (moved[inside] <= MISFIT * size[inside]).all())
+    for name, (change, size) in _tested(system)[1].items():
+        inside = np.isfinite(change)
+        found[name] = bool(inside.any() and (change[inside] <= MISFIT * size[inside]).all())
     return found
 
 
@@ -209,8 +212,8 @@ def _tests(system: System, x):
     B = beside([B for _, B in factors_at(system.dissipation, system, x)])
     # they see columns as large as any
     size = jnp.max(jnp.stack([jnp.max(jnp.abs(B.transposed(away))) for away in elsewhere(x.shape[0], 2)]))
-    moved = {}
+    changes = {}
     for name, function in system.functions().items():
         gradient = function.gradient(x)
-        moved[name] = jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size * jnp.linalg.norm(gradient)
-    return residuals(system.dissipation, system, x)[SQUARE], moved
+        changes[name] = jnp.max(jnp.abs(B.transposed(gradient)), initial=0.0), size * jnp.linalg.norm(gradient)
+    return residuals(system.dissipation, system, x)[SQUARE], changes

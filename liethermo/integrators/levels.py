@@ -119,23 +119,25 @@ def corrected(
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
 
 
-def ended(system: System, surface: Surface, held: Sequence[Energy], x, compensation, d) -> jax.Array:
+def ended(
+    system: System, surface: Surface, held: Sequence[Energy], x, compensation, d, driven: bool = False
+) -> jax.Array:
     """The displacement of an implicit step, which has changed all functions as it has to, brought to the surface.
 
     The functions ``held`` stay as they were, and so does an energy that is conserved; what else has a law changes by
-    what it has changed by. NaN where that is not found.
+    what it has changed by, if the step is not driven by noise, under which it has none. NaN where that is not found.
     """
     laws = [Law(C, 0.0) for C in held]
     for function, law in ((system.energy, system.energy_law), (system.entropy, system.entropy_law)):
-        if law in LAWS and function is not None:
+        if law in LAWS and function is not None and not (driven and LAWS[law]):
             laws.append(Law(function, LAWS[law]))
-    if not laws:
-        return surface.reached(x, compensation, d)[0]
-    change = ALONG
-    changes = [
-        jnp.zeros(()) if law.sign == 0.0 else jnp.dot(change(law.function, x, d, compensation), d) for law in laws
-    ]
-    d, defect = corrected(system, laws, x, compensation, d, jnp.stack(changes))
+    if laws:
+        changes = [
+            jnp.zeros(()) if law.sign == 0.0 else jnp.dot(ALONG(law.function, x, d, compensation), d) for law in laws
+        ]
+        d, defect = corrected(system, laws, x, compensation, d, jnp.stack(changes))
+    else:
+        d, defect = surface.reached(x, compensation, d)
     return jnp.where(defect <= UNREACHED * jnp.linalg.norm(x), d, jnp.nan)
 
 

@@ -393,7 +393,7 @@ def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
     return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
 
 
-LONG, SHORT, HEAVY = 500, 32, 20_000
+LONG, SHORT, HEAVY = 500, 32, 50_000
 """Instructions of an unrolled loop from which it stays a loop; passes up to which it is short, and instructions from
 which a short one stays a loop if its passes differ: what is known of single ones, such as zeros, makes unrolled code
 the faster one. Passes that count nothing and read no table are alike, and unrolling them gains nothing."""
@@ -431,28 +431,32 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     given = inside.entered(constants, avals[:consts])
     rows = [aval.update(shape=aval.shape[1:]) for aval in avals[end:]]
     columns = list(zip(*(flat([x[i, ...] for x in slices]) for i in range(length)), strict=True))
-    row = arranged((f"x2_{j}" for j in range(len(columns))), rows)
+    names = [f"x2_{j}" for j in range(len(columns))]
+    row = arranged(iter(names), rows)
     alike = not columns
     while True:
         own, results = inside.unrolled(closed, [*given, *carried.arrays, *row])
         if not (changed := carried.released(results[: len(start)])):
             break
         alike = alike and "i" not in changed
-    if len(own.instructions) * length <= (LONG if alike or length > SHORT else HEAVY):
-        return None
-    moving, new, rows = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
-    inputs = [
-        tuple(inside.outer.values()),
-        [carried.entries[i] for i in moving],
-        [f"x2_{j}" for j in range(len(columns))],
-    ]
-    body = _program(own, inputs, [[new[i] for i in moving], rows], [(len(moving),), (len(rows),)])
+    if alike or length > SHORT:
+        if len(own.instructions) * length <= LONG:
+            return None
+    else:  # what is known of the pass in the middle, such as its number, says how long unrolled ones are
+        middle = (column[length // 2] for column in columns)
+        known = (name if type(a) is str else a for name, a in zip(names, middle, strict=True))
+        typical, _ = inside.unrolled(closed, [*given, *carried.arrays, *arranged(known, rows)])
+        if len(typical.instructions) * length <= HEAVY:
+            return None
+    moving, new, made = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
+    inputs = [tuple(inside.outer.values()), [carried.entries[i] for i in moving], names]
+    body = _program(own, inputs, [[new[i] for i in moving], made], [(len(moving),), (len(made),)])
     out = [var.aval for var in closed.jaxpr.outvars[len(start) :]]
     loop = Scan(length, eqn.params["reverse"], body, carried.kinds, kinds(out))
     tables = [b.table(column) for column in columns]
     found = b.block(loop, *inside.outer, *(carried.start[i] for i in moving), *tables)
     rest = found[len(moving) :]
-    each = [arranged((rest[j * length + i] for j in range(len(rows))), out) for i in range(length)]
+    each = [arranged((rest[j * length + i] for j in range(len(made))), out) for i in range(length)]
     stacked = [
         array([a for row in each for a in row[k].ravel().tolist()], var.aval.shape)
         for k, var in enumerate(eqn.outvars[len(start) :])

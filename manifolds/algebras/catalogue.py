@@ -77,7 +77,8 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
 
     Examples
     --------
-
+    >>> g = mf.so(3)
+    >>> print(g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]).tolist())
     [0.0, 0.0, 1.0]
     >>> print(*g.casimirs(degree=2))
     mu1**2 + mu2**2 + mu3**2

@@ -223,6 +223,14 @@ def test_equilibria_with_the_volume_of_the_space(name):
     check_equilibrium(system, noise, start, 12.0, 0.02, paths=1000, samples=(points, weights))
 
 
+def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
+    """Where the energy is least its gradient is no way to change it: noise has no law of the energy to hold."""
+    system, noise, samples, _ = CASES["ring"]
+    many = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
+    assert many.ok.all()
+    assert system.space.residual(many.x).max() < 1e-13  # differences of values of size 4, 64 roundings of which count
+
+
 @pytest.mark.slow
 def test_the_energy_is_exact_on_a_thousand_paths_of_ten_thousand_steps():
     many = lt.ensemble(held(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
