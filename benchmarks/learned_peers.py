@@ -1,7 +1,7 @@
 """A GFINN and an NMS of our own, written from their papers: both laws hold in continuous time, and they run by RK4.
 
-Inputs, outputs and time are scaled as those of ``lt.learn`` are, and the loss, the optimiser and the number of steps
-are the same: what differs is how energy, entropy and brackets are made, and what runs them.
+Inputs, outputs and time are scaled as those of ``lt.learn`` are. Points, loss, descent and batches are those of
+``lt.learn.fit``: what differs is how energy, entropy and brackets are made, and what runs them.
 """
 
 from __future__ import annotations
@@ -13,8 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
-from liethermo.learn.data import Scales, Trajectory, smoothed
+from liethermo.learn import losses
+from liethermo.learn.data import Scales, Trajectory
+from liethermo.learn.fitting import BATCH
+from liethermo.learn.training import Course, Phase
 
 
 class Perceptron(eqx.Module):
@@ -105,27 +109,26 @@ class NMS(Peer):
         return off_S @ (A - A.T) @ off_S, C @ C.T
 
 
-def trained(peer: Peer, data: list[Trajectory], scales: Scales, steps: int, rate: float, batch: int, seed: int) -> Peer:
-    """The peer after so many steps of Adam on the rates of change of splines through the data."""
-    import optax
+class InUnits(eqx.Module):
+    """A peer in the units of the data."""
 
-    smooth = [smoothed(trajectory, None) for trajectory in data]
-    x = jnp.asarray(np.concatenate([(x[1:-1] - scales.centre) / scales.size for x, _ in smooth]))
-    rates = jnp.asarray(np.concatenate([v[1:-1] / scales.size * scales.time for _, v in smooth]))
-    adam = optax.adam(optax.cosine_decay_schedule(rate, steps, alpha=0.01))
+    peer: Peer
+    scales: Scales
 
-    def loss(peer, chosen):
-        return jnp.mean((jax.vmap(peer.rates)(x[chosen]) - rates[chosen]) ** 2)
+    def _vector_field(self, x):
+        centre, size, time = self.scales
+        return size / time * self.peer.rates((x - centre) / size)
 
-    def step(carry, key):
-        peer, state = carry
-        slope = jax.grad(loss)(peer, jax.random.randint(key, (batch,), 0, len(x)))
-        updates, state = adam.update(slope, state, peer)
-        return (eqx.apply_updates(peer, updates), state), None
 
-    keys = jax.random.split(jax.random.key(seed), steps)
-    run = jax.jit(lambda peer, state, keys: jax.lax.scan(step, (peer, state), keys)[0][0])
-    return run(peer, adam.init(peer), keys)
+def trained(peer: Peer, data: list[Trajectory], scales: Scales, steps: int, rate: float, seed: int) -> Peer:
+    """The peer after the matching of ``lt.learn.fit``."""
+    start, back = ravel_pytree(peer)
+    shapes = tuple(leaf.shape for leaf in jax.tree_util.tree_leaves(peer))
+    own = losses.Weights(np.asarray(start), shapes, lambda vector: InUnits(back(vector), scales))
+    task = losses.matching_of(own, data, None, scales)
+    course = Course([Phase("matching", task, None, steps, rate, BATCH["matching"], shapes)], own.start, "")
+    course.run(seed, None, None, False)
+    return back(jnp.asarray(course.weights))
 
 
 def forecast(peer: Peer, x0: np.ndarray, scales: Scales, step: float, steps: int) -> tuple[np.ndarray, Callable]:

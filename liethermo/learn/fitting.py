@@ -144,11 +144,7 @@ def fit(
         unit[places] = sigma
 
     def matched(part: list[Trajectory]) -> Task:
-        smooth = [smoothed(trajectory, sigma) for trajectory in part]
-        inner = [slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smooth]  # a spline is worst at its ends
-        x = np.concatenate([x[i] for (x, _), i in zip(smooth, inner, strict=True)])
-        rates = np.concatenate([v[i] for (_, v), i in zip(smooth, inner, strict=True)])
-        return losses.matching(own, x, rates, found.size / found.time)
+        return losses.matching_of(own, part, sigma, found)
 
     def shot(part: list[Trajectory], free: bool) -> Task:
         starts = [_whole(smoothed(trajectory, sigma)[0], places, system.dim) for trajectory in part]

@@ -15,7 +15,7 @@ from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..runs.flow import first_carry, one_step
 from ..runs.preparation import of_steps
 from ..systems import System
-from .data import Windows
+from .data import Scales, Trajectory, Windows, smoothed
 from .model import tied
 from .networks import learned
 
@@ -95,6 +95,16 @@ def matching(own: Weights, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -
         return jnp.mean(((found - wanted) / size) ** 2 / (SLOW + speed))
 
     return Task(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
+
+
+def matching_of(own: Weights, data: list[Trajectory], noise: np.ndarray | None, found: Scales) -> Task:
+    """:func:`matching` at the points of trajectories, by splines through them or as near as the noise allows."""
+    smooth = [smoothed(trajectory, noise) for trajectory in data]
+    inner = [slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smooth]  # a spline is worst at its ends
+    x, rates = (
+        np.concatenate([values[i] for values, i in zip(each, inner, strict=True)]) for each in zip(*smooth, strict=True)
+    )
+    return matching(own, x, rates, found.size / found.time)
 
 
 def shooting(

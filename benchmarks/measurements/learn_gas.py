@@ -1,0 +1,10 @@
+"""Learned systems: two gas containers."""
+
+from __future__ import annotations
+
+from .. import learned
+from ..report import Report
+
+
+def run(quick: bool) -> Report:
+    return learned.report("gas", quick)

@@ -1,0 +1,10 @@
+"""Learned systems: a thermoelastic double pendulum."""
+
+from __future__ import annotations
+
+from .. import learned
+from ..report import Report
+
+
+def run(quick: bool) -> Report:
+    return learned.report("pendulum", quick)
