@@ -106,12 +106,14 @@ THEMES: dict[str, list[Pair]] = {
     ],
     "Manifolds": [Pair("spin", 2, "a spin with a bath to an error of 1e-8", COMPILED, "heyoka")],
     "Quantum systems": [],
-    "Learning": [],
 }
 """Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
 
 COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body", "large", "magnet")
 """Measurements without another program: their targets that are no ratios are a table of their own."""
+
+WHOLE = {"Learning": ("learn_gas", "learn_pendulum", "learn_body")}
+"""Themes whose measurements are about errors: their tables are shown as they are."""
 
 NOTES = {"The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."}
 """What a reader has to know before a table."""
@@ -165,6 +167,10 @@ def sections(reports: Mapping[str, Report]) -> Iterator[str]:
     for theme, found in themes.items():
         note = f"\n\n{NOTES[theme]}" if theme in NOTES else ""
         yield f"## {theme}{note}" + _table(found).markdown()
+    for theme, names in WHOLE.items():
+        shown = [reports[name] for name in names if name in reports]
+        if shown:
+            yield "\n\n".join([f"## {theme}", *(r.markdown().replace("## ", "### ", 1) for r in shown)])
     targets = [t for name in COSTS if name in reports for t in reports[name].targets if t.kind != "ratio"]
     if targets:
         table = Table("", {"Work": "text", "Measured": "text"}, [target.row()[::2] for target in targets])

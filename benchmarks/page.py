@@ -62,8 +62,9 @@ def write(results: Path, page: Path) -> None:
 
     machines, differing = _machines(found)
     parts = [SECOND, machines, _targets(targets)]
+    whole = [name for names in front.WHOLE.values() for name in names]
     for name, report in reports.items():
-        parts.append(report.markdown())
+        parts.append(f"## {report.title}\n\nOn the page {{doc}}`benchmarks`." if name in whole else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:

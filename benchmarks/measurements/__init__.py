@@ -12,6 +12,7 @@ NAMES = (
     "quantum",
     "learn_gas",
     "learn_pendulum",
+    "learn_body",
     "ensemble",
     "others",
     "tumbling",

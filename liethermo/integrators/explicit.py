@@ -15,6 +15,7 @@ import manifolds as mf
 from ..dissipation.base import portions
 from ..errors import InputError
 from ..functions.energy import Energy
+from ..functions.frames import towards
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod, TransportingMethod
@@ -30,6 +31,11 @@ for the states between. Error and what is missed are over h."""
 NOTICED, STEERED = 4.0 * EPS, 0.25 * EPS
 """What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
 back, and the most that one takes back: far below what its rounding is."""
+
+STEERABLE = 1e-10
+"""What a step may move by to be taken back, relative to the state: more where the gradients of the laws are nearly
+parallel. There the levels have next to no points in common, as at an equilibrium, and those of the start may have
+none."""
 
 
 class Unlawful(NamedTuple):
@@ -167,18 +173,24 @@ class ExplicitMethod(TransportingMethod):
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
         """
+        gradients = [law.function.gradient(x) for law in laws]
 
-        def back(law: Law, level) -> jax.Array:
-            gradient = law.function.gradient(x)
+        def back(law: Law, gradient, level) -> jax.Array:
             size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
             off = (level - law.function.value(x)) - jnp.dot(gradient, compensation)
             return jnp.where(jnp.abs(off) > NOTICED * size, jnp.clip(off, -STEERED * size, STEERED * size), 0.0)
 
-        found = [
-            back(law, levels[i]) if law.sign == 0.0 and i < _room(system) else jnp.zeros(())
-            for i, law in enumerate(laws)
-        ]
-        return jax.lax.stop_gradient(jnp.stack(found))
+        found = jnp.stack(
+            [
+                back(law, gradient, levels[i]) if law.sign == 0.0 and i < _room(system) else jnp.zeros(())
+                for i, (law, gradient) in enumerate(zip(laws, gradients, strict=True))
+            ]
+        )
+        raised = [system.raised(x, gradient) for gradient in gradients]
+        along = raised if system.surface is None else [system.surface.along(x, v) for v in raised]
+        move = towards(along, found, passes=min(len(system.blocks), 2))
+        near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
+        return jax.lax.stop_gradient(jnp.where(jnp.stack(near).all(), found, 0.0))
 
     def _own_changes(self, laws: list[Law], x, compensation, d) -> jax.Array:
         """What an uncorrected step changes the functions by that have to rise or fall, where that has the right sign.

@@ -152,6 +152,13 @@ class WithAttitude(Wrapping):
             new_compensation, jnp.zeros_like(g), p_compensation
         )
 
+    def plain(self, system: AttitudeSystem, x, h) -> jax.Array:
+        """A step without care for rounding, of a method that has such: see :meth:`.MetriplecticRungeKutta.plain`."""
+        g, group = system.split(x)[1], system.group
+        local = TurningSystem(system, self.order, g)
+        end = pulled(self.method, local).plain(local, local.around(x), h)
+        return system.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
+
     def _turn(self, group, xi) -> jax.Array:
         """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
         if self.kind == "coadjoint":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +84,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
     def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
         t = self.tableau
-        slopes, rates = self._stages(system, laws, x, compensation, h)
+        slopes, rates = self._stages(lambda y: self.rates(system, laws, y), x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
         return Unlawful(h * (t.b @ slopes), h * (t.b @ rates), jnp.asarray(t.d) @ slopes, ends)
 
@@ -95,23 +95,35 @@ class MetriplecticRungeKutta(ExplicitMethod):
         fit notices. Its program is short, and so are those of its derivatives.
         """
         laws, t = self._laws(system), self.tableau
-        slopes, rates = self._stages(system, laws, x, 0.0, h)
+
+        @jax.checkpoint  # what is computed again is not carried from step to step: a shorter program, and faster
+        def rates(x) -> tuple[jax.Array, jax.Array]:
+            """Of the laws by the whole field: along the motion they change by rounding alone."""
+            dH = system.energy.gradient(x)
+            dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
+            field = system.here(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))
+            given = [dS if law.function is system.entropy else law.function.gradient(x) for law in laws if law.sign]
+            changes = [jnp.zeros(())] * (len(laws) - len(given)) + [jnp.dot(g, field) for g in given]  # they come last
+            return field, jnp.asarray(changes)
+
+        slopes, changes = self._stages(rates, x, 0.0, h)
         end = x + h * (t.b @ slopes)
         if not laws:
             return end
-        functions = [law.function for law in laws]
-        missed = h * (t.b @ rates) - jnp.stack([f.value(end) - f.value(x) for f in functions])
-        return end + towards([system.raised(end, f.gradient(end)) for f in functions], missed)
+        both, functions = jnp.stack([x, end]), [law.function for law in laws]
+        values, gradients = zip(*(jax.vmap(jax.value_and_grad(f.value))(both) for f in functions), strict=True)
+        missed = h * (t.b @ changes) - jnp.stack([after - before for before, after in values])
+        return end + towards([system.raised(end, gradient) for _, gradient in gradients], missed)
 
-    def _stages(self, system: System, laws: list[Law], x, compensation, h) -> tuple[jax.Array, jax.Array]:
+    def _stages(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
         """The field at the stages, shape (s, n), and the rates of the functions of the laws there, shape (s, laws)."""
         t = self.tableau
         s = len(t.b)
 
         def stage(slopes, row):
             i, weights = row
-            found, rates = self.rates(system, laws, x + (compensation + h * (weights @ slopes)))
-            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), rates
+            found, changes = rates(x + (compensation + h * (weights @ slopes)))
+            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), changes
 
         return jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
 

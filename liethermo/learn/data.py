@@ -10,45 +10,50 @@ import scipy.interpolate
 
 from ..errors import InputError
 from ..systems import System
+from .observation import Observation
 
 SMOOTHNESS = 5
 """Degree of the splines through the data: their derivatives are of order 5."""
 
 
 class Trajectory(NamedTuple):
-    """Times, shape (m,), and what is observed of the states then, shape (m, k)."""
+    """Times, shape (m,), and what is observed of the states then, shape (m, ...)."""
 
     t: np.ndarray
     x: np.ndarray
 
+    @property
+    def flat(self) -> Trajectory:
+        """The same with rows of numbers, shape (m, k)."""
+        return Trajectory(self.t, self.x.reshape(len(self.t), -1))
 
-def trajectories(data: Any, system: System, observed: Sequence[int] | None) -> list[Trajectory]:
-    """What a user gives as data: a pair of times and states, several of them, or solutions.
+
+def trajectories(data: Any, system: System, own: Observation) -> list[Trajectory]:
+    """What a user gives as data: a pair of times and observations, several of them, or solutions.
 
     Raises
     ------
     InputError
         If something is missing, is not finite, or does not fit.
     """
-    count = system.dim if observed is None else len(observed)
-    found = [_checked(i, t, x, system, count, observed is None) for i, (t, x) in enumerate(_pairs(data))]
+    found = [_checked(i, t, x, system, own) for i, (t, x) in enumerate(_pairs(data, own))]
     if not found:
         raise InputError("there are no trajectories in the data")
     return found
 
 
-def _pairs(data: Any) -> list[tuple[Any, Any]]:
-    if hasattr(data, "t") and hasattr(data, "x"):
-        return [(data.t, data.x)]
+def _pairs(data: Any, own: Observation) -> list[tuple[Any, Any]]:
+    if hasattr(data, "stats") and hasattr(data, "t"):
+        return [(data.t, own.of_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim(data[0]) == 1:
         t, x = data
-        return [(t, x) for x in np.asarray(x)] if _ndim(x) == 3 else [(t, x)]
+        return [(t, x) for x in np.asarray(x)] if _ndim(x) == 2 + len(own.shape) else [(t, x)]
     if not isinstance(data, Sequence):
         raise InputError(
             f"data is a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such pairs, "
             f"or solutions, not {type(data).__name__}"
         )
-    return [pair for part in data for pair in _pairs(part)]
+    return [pair for part in data for pair in _pairs(part, own)]
 
 
 def _ndim(values: Any) -> int | None:
@@ -67,7 +72,7 @@ def _real(values: Any) -> np.ndarray:
     return found.astype(np.float64)
 
 
-def _checked(number: int, t, x, system: System, count: int, whole: bool) -> Trajectory:
+def _checked(number: int, t, x, system: System, own: Observation) -> Trajectory:
     what = f"trajectory {number}"
     try:
         t, x = _real(t), _real(x)
@@ -87,33 +92,41 @@ def _checked(number: int, t, x, system: System, count: int, whole: bool) -> Traj
     if len(falls):
         i = int(falls[0])
         raise InputError(f"{what}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
-    if whole:
+    if own.is_whole:
         try:
             x = np.asarray(system.numbers(x, batch=True))
         except InputError as error:
             raise type(error)(f"{what}: {error}") from None
-    elif x.shape != (len(t), count):
-        raise InputError(f"{what} has states of shape {x.shape}, but {count} components are observed at {len(t)} times")
+    elif x.shape != (len(t), *own.shape):
+        seen = f"{len(own.places)} components are observed" if len(own.places) else f"observe returns shape {own.shape}"
+        raise InputError(f"{what} has observations of shape {x.shape}, but {seen} at {len(t)} times")
     return Trajectory(t, x)
 
 
 class Scales(NamedTuple):
-    """What data are of the size of.
+    """What numbers are of the size of.
 
     Attributes
     ----------
     centre, size : array, shape (n,)
-        Mean and spread of each component; 0 and 1 of one that is not observed.
+        Mean and spread of each.
     time : float
-        In which components change by their spread.
+        In which they change by their spread.
     """
 
     centre: np.ndarray
     size: np.ndarray
     time: float
 
+    def of_states(self, places: np.ndarray, states: np.ndarray) -> Scales:
+        """Those of states, shape (m, n), of which some components are observed; 0 and 1 of one that does not vary."""
+        centre, size = states.mean(axis=0), states.std(axis=0)
+        centre, size = np.where(size > 0.0, centre, 0.0), np.where(size > 0.0, size, 1.0)
+        centre[places], size[places] = self.centre[: len(places)], self.size[: len(places)]
+        return Scales(centre, size, self.time)
 
-def scales(data: list[Trajectory], dim: int, observed: Sequence[int] | None) -> Scales:
+
+def scales(data: list[Trajectory]) -> Scales:
     """The mean and the spread of all trajectories together, and the time in which they change."""
     x = np.concatenate([trajectory.x for trajectory in data])
     rates = np.concatenate([np.diff(x, axis=0) / np.diff(t)[:, None] for t, x in data])
@@ -123,10 +136,7 @@ def scales(data: list[Trajectory], dim: int, observed: Sequence[int] | None) -> 
     moving = speed[speed > 0.0]
     if not len(moving):
         raise InputError("nothing moves in the data: all states of a trajectory are the same")
-    centre, size = np.zeros(dim), np.ones(dim)
-    places = np.arange(dim) if observed is None else np.asarray(observed)
-    centre[places], size[places] = middle, spread
-    return Scales(centre, size, 1.0 / float(np.median(moving)))
+    return Scales(middle, spread, 1.0 / float(np.median(moving)))
 
 
 def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -152,34 +162,36 @@ class Windows(NamedTuple):
 
     Attributes
     ----------
-    starts : array, shape (windows, k)
+    starts : array, shape (windows, N)
+        The states in which they begin.
     sizes : array, shape (windows, m)
         Of the intervals.
-    ends : array, shape (windows, m, k)
+    shown : array, shape (windows, m + 1, k)
+        What is observed at their ends, that of the start first.
     following : array of int, shape (windows,)
         The window that begins where one ends; -1 where none does.
     """
 
     starts: np.ndarray
     sizes: np.ndarray
-    ends: np.ndarray
+    shown: np.ndarray
     following: np.ndarray
 
 
 def windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart: bool) -> Windows:
     """The pieces of trajectories; with ``apart`` one begins where another ends, else at every point."""
     length = min(length, *(len(t) - 1 for t, _ in data))
-    starts, sizes, ends = [], [], []
+    starts, sizes, shown = [], [], []
     following: list[int] = []
-    for (t, x), smooth in zip(data, states, strict=True):
+    for (t, x), own in zip(data, states, strict=True):
         last = len(t) - 1 - length
         firsts = list(range(0, last + 1, length if apart else 1))
         if firsts[-1] != last:
             firsts.append(last)
         for i in firsts:
             follows = apart and i + length in firsts
-            starts.append(smooth[i])
+            starts.append(own[i])
             sizes.append(np.diff(t[i : i + length + 1]))
-            ends.append(x[i + 1 : i + length + 1])
+            shown.append(x[i : i + length + 1])
             following.append(len(following) + 1 if follows else -1)
-    return Windows(np.stack(starts), np.stack(sizes), np.stack(ends), np.array(following))
+    return Windows(np.stack(starts), np.stack(sizes), np.stack(shown), np.array(following))

@@ -18,7 +18,8 @@ from ..systems import System
 from . import losses
 from .data import Trajectory, scales, smoothed, trajectories, windows
 from .losses import Task
-from .model import in_units
+from .model import has_networks, in_units
+from .observation import coordinates, observation, plain_states, states_that_move
 from .training import Course, Phase, fingerprint
 
 T = TypeVar("T", bound=System)
@@ -44,6 +45,7 @@ def fit(
     method: OneStepMethod | None = None,
     noise: float | Sequence[float] | None = None,
     observed: Sequence[int] | None = None,
+    observe: Callable | None = None,
     validation: float | None = None,
     patience: int | None = None,
     seed: int = 0,
@@ -80,11 +82,17 @@ def fit(
     method : OneStepMethod
         The method of the runs; by default ``MetriplecticRungeKutta(4)``, with one correction a step.
     noise : float, or array, shape (n,), optional
-        Standard deviation of the errors of the data (in the units of the states). Splines then smooth the data, losses
-        are relative to it, and the fit also finds the initial states of the short runs.
+        Standard deviation of the errors of the data (in their units), one number or one for each number observed.
+        Splines then smooth the data, losses are relative to it, and the fit also finds the initial states of the short
+        runs.
     observed : sequence of int, optional
-        Indices of the components that were measured; the data then have shape (m, len(observed)). The other components
-        begin at zero, and the fit finds them with the initial states: only the laws determine them.
+        Indices of the components that were measured; the data then have shape (m, len(observed)).
+    observe : function of x, shape (n,), or of x and the attitude, shape (m, m); optional
+        What was measured, an array of any shape, in place of ``observed``: ``lambda x, R: R`` for attitudes. The data
+        then have shape (m, ...), in the units of what it returns; solutions are observed by it.
+
+        Of states that are not observed in full the fit finds the initial ones: only the laws determine them. A system
+        without networks begins with those that move as the data do. One with networks begins with zeros.
     validation : float, optional
         Fraction of the trajectories that is held out (of a single trajectory the end). The fit returns the weights that
         do best there. By default a fifth, and 0 if not all components are observed.
@@ -124,35 +132,46 @@ def fit(
         _check_count(name, value, 0 if name in BATCH or name == "seed" else 1, name in ("batch", "patience"))
     if system.is_driven:
         raise InputError("a fit is for systems without an energy that depends on time, and without torques")
-    places = _places(observed, system.dim)
-    whole = trajectories(data, system, observed)
-    found = scales(whole, system.dim, observed)
-    sigma = _noise(noise, len(places))
-    system = in_units(system, found, np.concatenate([_whole(x, places, system.dim) for _, x in whole]))
-    if observed is not None and validation:
+    seen = observation(system, observed, observe)
+    method = MetriplecticRungeKutta(4) if method is None else method
+    run = losses.stepper(system, method, substeps, seen.group is not None)[0]
+    whole = [trajectory.flat for trajectory in trajectories(data, system, seen)]
+    shown = scales(whole)
+    sigma = _noise(noise, shown.size.size)
+    smooth = [smoothed(trajectory, sigma) for trajectory in whole]
+    if seen.is_whole or has_networks(system):
+        starts = [plain_states(seen, run, x) for x, _ in smooth]
+    else:
+        starts = states_that_move(seen, run, smooth, shown.size, shown.time)
+    states = np.concatenate(starts)
+    found = shown.of_states(seen.places, states[:, : system.dim])
+    system = in_units(system, found, states[:, : system.dim])
+    if not seen.is_whole and validation:
         raise InputError("validation is for data of all components: what is not observed has no start that is known")
     own = losses.weights(system, also, positive)
     if not own.start.size:
         raise InputError(
             "nothing is learned of this system: give it parts of lt.learn, or name parameters with also= or positive="
         )
-    share = (0.2 if observed is None else 0.0) if validation is None else validation
-    train, held = _split(whole, share, seed)
-    method = MetriplecticRungeKutta(4) if method is None else method
-    unit = found.size.copy()
-    if sigma is not None:
-        unit[places] = sigma
+    share = (0.2 if seen.is_whole else 0.0) if validation is None else validation
+    train, held = _split(list(zip(whole, starts, strict=True)), share, seed)
+    noisy = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / shown.size) ** 2)))
+    behind = np.ones(run.dim - system.dim)  # the numbers of an attitude
+    searched = found.size.copy()
+    if sigma is not None and len(seen.places):
+        searched[seen.places] = sigma
+    searched = np.concatenate([searched, noisy * np.ones(coordinates(run) - system.dim)])
+    units = shown.size if sigma is None else sigma, searched, noisy * np.concatenate([found.size, behind])
 
-    def matched(part: list[Trajectory]) -> Task:
-        return losses.matching_of(own, part, sigma, found)
+    def matched(part: list) -> Task:
+        return losses.matching_of(own, [trajectory for trajectory, _ in part], sigma, found)
 
-    def shot(part: list[Trajectory], free: bool) -> Task:
-        starts = [_whole(smoothed(trajectory, sigma)[0], places, system.dim) for trajectory in part]
-        pieces = windows(part, starts, window, free)
-        return losses.shooting(own, method, pieces, unit, places, substeps, free)
+    def shot(part: list, free: bool) -> Task:
+        pieces = windows(*map(list, zip(*part, strict=True)), window, free)
+        return losses.shooting(own, method, pieces, seen, units, substeps, free)
 
     phases = []
-    if matching and observed is None:
+    if matching and seen.is_whole:
         task = matched(train)
         phases.append(
             Phase(
@@ -166,7 +185,7 @@ def fit(
             )
         )
     if shooting:
-        free, slower = sigma is not None or observed is not None, SLOWER if phases else 1.0
+        free, slower = sigma is not None or not seen.is_whole, SLOWER if phases else 1.0
         task = shot(train, free)
         phases.append(
             Phase(
@@ -181,7 +200,9 @@ def fit(
         )
     settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
     numbers = [values for trajectory in whole for values in trajectory]
-    course = Course(phases, own.start, fingerprint(*numbers, own.start, sigma, places, repr(settings)))
+    course = Course(
+        phases, own.start, fingerprint(*numbers, own.start, sigma, seen.places, *seen.content(run), repr(settings))
+    )
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists():
         course.resume(path)
@@ -202,21 +223,6 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def _places(observed: Sequence[int] | None, dim: int) -> np.ndarray:
-    if observed is None:
-        return np.arange(dim)
-    try:
-        places = np.asarray(observed)
-    except ValueError:  # rows of different lengths
-        places = np.zeros(0)
-    if places.dtype.kind not in "iu" or places.ndim != 1 or not len(places) or len(set(places.tolist())) < len(places):
-        raise InputError(f"observed is a sequence of different component numbers, not {observed!r}")
-    outside = places[(places < 0) | (places >= dim)]
-    if len(outside):
-        raise InputError(f"observed has component {outside[0]}, but a state has the components 0 to {dim - 1}")
-    return places
-
-
 def _noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
     if noise is None:
         return None
@@ -231,25 +237,19 @@ def _noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | No
     return np.broadcast_to(sigma, (count,)).copy()
 
 
-def _whole(x: np.ndarray, places: np.ndarray, dim: int) -> np.ndarray:
-    """States with zeros in place of what is not observed."""
-    states = np.zeros((len(x), dim))
-    states[:, places] = x
-    return states
-
-
-def _split(data: list[Trajectory], share: float, seed: int) -> tuple[list[Trajectory], list[Trajectory]]:
-    """What is learned from, and what is held out: whole trajectories, or the end of the only one."""
+def _split(data: list, share: float, seed: int) -> tuple[list, list]:
+    """What is learned from, and what is held out: whole trajectories with their states, or the end of the only one."""
     if not (_is_real(share) and 0.0 <= share < 1.0):
         raise InputError(f"validation is a share from 0 to below 1, not {share!r}")
     if share == 0.0:
         return data, []
     if len(data) == 1:
-        t, x = data[0]
+        (t, x), states = data[0]
         cut = round((1.0 - share) * (len(t) - 1))
         if min(cut, len(t) - 1 - cut) < 1:
             return data, []
-        return [Trajectory(t[: cut + 1], x[: cut + 1])], [Trajectory(t[cut:], x[cut:])]
+        first = Trajectory(t[: cut + 1], x[: cut + 1]), states[: cut + 1]
+        return [first], [(Trajectory(t[cut:], x[cut:]), states[cut:])]
     order = np.random.default_rng(seed).permutation(len(data))
     count = min(max(1, round(share * len(data))), len(data) - 1)
     return [data[i] for i in sorted(order[count:])], [data[i] for i in sorted(order[:count])]

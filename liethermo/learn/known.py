@@ -19,6 +19,7 @@ from ..systems import System
 from . import losses
 from .data import trajectories
 from .fitting import fit
+from .observation import observation
 
 T = TypeVar("T", bound=System)
 
@@ -176,7 +177,7 @@ def several(
     systems = []
     for own in range(seed, seed + number):
         system = build(own)
-        whole = trajectories(data, system, how.get("observed"))
+        whole = trajectories(data, system, observation(system, how.get("observed"), how.get("observe")))
         drawn = np.random.default_rng(own).integers(len(whole), size=len(whole)) if resample else range(len(whole))
         systems.append(fit(system, [whole[i] for i in drawn], seed=own, **how))
     return Fits(tuple(systems))

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..integrators import MetriplecticRungeKutta, OneStepMethod
+from ..integrators import MetriplecticRungeKutta, OneStepMethod, WithAttitude
 from ..runs.flow import first_carry, one_step
 from ..runs.preparation import of_steps
 from ..systems import System
 from .data import Scales, Trajectory, Windows, smoothed
 from .model import tied
 from .networks import learned
+from .observation import Observation
 
 SLOW = 0.1
 """Mean square of the rates of change, in units of their usual size, below which they count as slow."""
@@ -111,62 +112,69 @@ def shooting(
     own: Weights,
     method: OneStepMethod,
     pieces: Windows,
-    size: np.ndarray,
-    places: np.ndarray,
+    seen: Observation,
+    units: tuple[np.ndarray, np.ndarray, np.ndarray],
     substeps: int,
     free: bool,
 ) -> Task:
     """The mean square of what runs miss of the data at the ends of all intervals.
 
-    With ``free`` the states where the runs begin are found too, and what they miss of the data counts, and what a run
+    With ``free`` the states where the runs begin are found too, and what they show of the data counts, and what a run
     misses of where the next one begins.
 
     Parameters
     ----------
-    size : array, shape (n,)
-    places : array of int
-        The components that are observed.
+    units : three arrays, shapes (k,), (coordinates of a state,), (numbers of a state,)
+        Of what is observed, of the search for the states where runs begin, and of what a run misses of the next one.
     """
-    p, n, unit = len(own.start), len(size), jnp.asarray(size)
-    seen = unit[places]
-    count, length, _ = pieces.ends.shape
+    p = len(own.start)
+    of_data, of_search, of_gaps = map(jnp.asarray, units)
+    count, length = pieces.sizes.shape
 
-    def runs(system: System, starts, sizes):
-        begin, advance, shown = stepper(system, method, substeps)
+    def loss(vector, arrays, chosen):
+        starts, sizes, shown, following = arrays
+        system = own.system(vector[:p])
+        run, begin, advance, state_of = stepper(system, method, substeps, seen.group is not None)
 
-        def one(x, h):
+        def along(x, h):
             def interval(carry, h):
                 carry = advance(carry, h)
-                return carry, shown(carry)
+                return carry, state_of(carry)
 
             return jax.lax.scan(interval, begin(x), h)[1]
 
-        return jax.vmap(one)(starts, sizes)
+        def shows(states):
+            return jax.vmap(lambda x: seen.of(run, x))(states)
 
-    def loss(vector, arrays, chosen):
-        starts, sizes, ends, following = arrays
-        if free:
-            own_starts = vector[p:].reshape(count, n) * unit
-            at = own_starts[chosen]
-        else:
-            at = starts[chosen]
-        found = runs(own.system(vector[:p]), at, sizes[chosen])
-        missed = jnp.mean(((found[..., places] - ends[chosen]) / seen) ** 2)
-        if not free:
+        moves = vector[p:].reshape(count, -1) * of_search if free else None
+
+        def begins(i):
+            return starts[i] if moves is None else jax.vmap(lambda x, z: seen.moved(run, x, z))(starts[i], moves[i])
+
+        at = begins(chosen)
+        found = jax.vmap(along)(at, sizes[chosen])
+        missed = jnp.mean(((jax.vmap(shows)(found) - shown[chosen, 1:]) / of_data) ** 2)
+        if moves is None:
             return missed
-        begun = jnp.mean(((at[:, places] - starts[chosen][:, places]) / seen) ** 2) / length
+        begun = jnp.mean(((shows(at) - shown[chosen, 0]) / of_data) ** 2) / length
         next_ = following[chosen]
-        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - own_starts[next_]) / unit, 0.0)
+        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - begins(next_)) / of_gaps, 0.0)
         return missed + begun + jnp.mean(gaps**2)
 
-    arrays = tuple(map(jnp.asarray, (pieces.starts, pieces.sizes, pieces.ends, pieces.following)))
-    return Task(loss, arrays, count, (pieces.starts / size).ravel() if free else np.zeros(0))
+    arrays = tuple(map(jnp.asarray, (pieces.starts, pieces.sizes, pieces.shown, pieces.following)))
+    return Task(loss, arrays, count, np.zeros(count * of_search.size if free else 0))
 
 
-def stepper(system: System, method: OneStepMethod, substeps: int) -> tuple[Callable, Callable, Callable]:
-    """What begins a run at a state, takes it over an interval, and shows its state, for derivatives."""
-    run, method = of_steps(system, method)
-    plain = isinstance(method, MetriplecticRungeKutta) and run.surface is None
+def stepper(
+    system: System, method: OneStepMethod, substeps: int, attitude: bool = False
+) -> tuple[System, Callable, Callable, Callable]:
+    """The system as it is run, what begins a run at a state, takes it over an interval, and what its state is then.
+
+    For derivatives.
+    """
+    run, method = of_steps(system, method, None, attitude)
+    inner = method.method if isinstance(method, WithAttitude) else method
+    plain = isinstance(inner, MetriplecticRungeKutta) and run.surface is None
 
     def step(carry, h):
         return method.plain(run, carry, h) if plain else one_step(run, method, carry, h)  # type: ignore[attr-defined]
@@ -177,5 +185,5 @@ def stepper(system: System, method: OneStepMethod, substeps: int) -> tuple[Calla
         return jax.lax.scan(lambda carry, _: (step(carry, h / substeps), None), carry, length=substeps)[0]
 
     if plain:
-        return lambda x: x, advance, lambda x: x
-    return lambda x: first_carry(run, method, x), advance, lambda carry: carry[0][: system.dim]
+        return run, lambda x: x, advance, lambda x: x
+    return run, lambda x: first_carry(run, method, x), advance, lambda carry: carry[0][: run.dim]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ from ..errors import FileError, InputError
 from ..runs.progress import Progress
 from .descent import descent
 from .losses import Task
+from .quickly import quickly
 
 BLOCK = 50
 """Steps between two looks at the course."""
@@ -246,16 +246,6 @@ def _programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
     looking = jax.jit(held.loss, compiler_options=quickly())
     weights = phase.task.free.size
     return descend, lambda vector: float(looking(vector[: vector.size - weights], held.arrays, some))
-
-
-def quickly() -> dict[str, Any]:
-    """Options for programs that derivatives make long: they compile sooner, and run about as fast.
-
-    Where the user has chosen a level of optimisation, that is taken.
-    """
-    if "optimization_level" in os.environ.get("XLA_FLAGS", ""):
-        return {}
-    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 
 def write(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.explicit import DEFECT
+from liethermo.integrators.explicit import DEFECT, LEVELS, SLOPE
 from tests.liethermo import random_systems
 
 RK, Taylor = lt.MetriplecticRungeKutta, lt.MetriplecticTaylor
@@ -263,3 +263,17 @@ def test_a_step_that_misses_its_levels_fails():
     run = lt.integrate(BODY, X0, (0.0, 1.0), 0.5, Unchecked(4), on_failure="return")
     assert run.status.code == "not_converged"
     assert run.status.residual > 1e-10
+
+
+def test_an_energy_is_not_steered_where_the_levels_hardly_meet():
+    """At an equilibrium the entropy is the most that the energy allows: one ulp less of this, and there is none."""
+    heat = lambda x: jnp.exp(x[0]) + jnp.exp(x[1])  # noqa: E731
+    K = lambda x: 0.1 * jnp.outer(a := jnp.array([jnp.exp(x[1]), -jnp.exp(x[0])]), a)  # noqa: E731
+    system = lt.MetriplecticSystem(mf.NoPoisson(2), heat, lambda x: x[0] + x[1], lt.FrictionOperator(K), dim=2)
+    x, method, zero = jnp.array([1.0 + 1e-10, 1.0]), RK(4).on(system), jnp.zeros(2)
+    k = method.start(system, x)
+    for off in (0.0, 6.0 * EPS, -6.0 * EPS):  # levels of a start that roundings have taken the run away from
+        levels = k.at[LEVELS, 0].multiply(1.0 + off)
+        found = method.slopes(system, x, zero, 0.01, levels)
+        assert np.abs(found[DEFECT]).max() * 0.01 < 1e-14
+        assert np.abs(found[SLOPE]).max() < 1e-9

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+import manifolds as mf
 from liethermo.learn import training
+from liethermo.learn.data import Trajectory, smoothed
+from liethermo.learn.losses import stepper
+from liethermo.learn.observation import observation, states_that_move
 
 from . import cases
 
@@ -208,3 +212,72 @@ def test_a_loss_that_is_not_finite_is_an_error():
     t, x = cases.record()
     with pytest.raises(lt.InputError, match="the loss is nan after 50 steps, in the matching"):
         lt.learn.fit(system, (t, x), matching=50, shooting=0)
+
+
+def _attitudes(noise, seed=0):
+    """Records of the attitudes of a body with friction inside, each turned by a small random angle."""
+    body, random, found = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08), np.random.default_rng(seed), []
+    for start in random.standard_normal((4, 3)):
+        run = lt.integrate(body, start, (0.0, 8.0), 0.05, method=lt.MetriplecticRungeKutta(6), save_every=4)
+        turned = mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3)))
+        found.append((run.t, run.attitude[5] @ run.attitude @ np.asarray(turned)))  # in axes of its own
+    return found
+
+
+def test_the_first_states_show_the_attitudes_and_move_as_they_do():
+    """Of the body that made them, from any attitude: a spline is off by the noise over the distance of the times."""
+    body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
+    (t, R), *_ = _attitudes(0.0)
+    seen = observation(body, None, lambda x, R: R)
+    run = stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
+    shown = smoothed(Trajectory(t, R.reshape(-1, 9)), None)
+    states = states_that_move(seen, run, [shown], np.ones(9), 1.0)[0]
+    true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
+    np.testing.assert_allclose(states[:, 4:], R.reshape(-1, 9), atol=2e-3)  # splines are worst at their ends: 4e-4
+    np.testing.assert_allclose(states[5:-5, :3], true.x[5:-5, :3], atol=2e-2)
+
+
+@pytest.mark.slow
+def test_a_body_is_found_from_its_attitudes_alone():
+    """Up to the unit of momenta, which attitudes do not tell."""
+    found = lt.learn.fit(
+        lt.models.tumbling_body((2.5, 2.0, 1.2), rate=0.1),
+        _attitudes(1e-3),
+        observe=lambda x, R: R,
+        noise=1e-3,
+        shooting=1500,
+        rate=0.02,
+        window=10,
+        positive=lambda s: (s.energy.body.A, s.dissipation.part.rate),
+    )
+    inertia = 1.0 / np.asarray(found.energy.body.A)
+    np.testing.assert_allclose(inertia / inertia[2], [3.0, 2.0, 1.0], rtol=0.02)
+    assert float(found.dissipation.part.rate) * inertia[2] == pytest.approx(0.08, rel=0.1)
+
+
+def test_components_and_a_function_of_the_state_are_one_mechanism():
+    t, x = cases.record(2, 21)
+    system = cases.oscillator(energy=lt.learn.Energy(_Bath(jnp.zeros(()))))
+    how = {"shooting": 60, "rate": 0.1, "window": 5}
+    by_index = lt.learn.fit(system, (t, x[..., 1:2]), observed=[1], **how)
+    by_function = lt.learn.fit(system, (t, x[..., 1]), observe=lambda x: x[1], **how)
+    for found in (by_index, by_function):
+        assert found.training.loss[-1] < 0.5 * found.training.loss[0]
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"observe": lambda x: x, "observed": [0]}, "not both"),
+        ({"observe": 3}, "function of the state"),
+        ({"observe": lambda x, R: R}, "give the system a group"),
+        ({"observe": lambda x: x[:, 0]}, "could not be evaluated"),
+        ({"observe": lambda x: 1}, "real numbers"),
+        ({"observe": lambda x: x[:2]}, r"shape \(5, 3\), but observe returns shape \(2,\)"),
+        ({"observe": lambda x: x, "validation": 0.5}, "no start that is known"),
+    ],
+)
+def test_an_observation_that_cannot_be_used_has_an_error_of_one_line(how, words):
+    with pytest.raises((lt.InputError, lt.FunctionError), match=words) as raised:
+        lt.learn.fit(cases.oscillator(), (T, X), **how)
+    assert "\n" not in str(raised.value)
