@@ -73,9 +73,9 @@ def _pendulum(t, x):
 PROBLEMS = {
     "gas": Problem(
         "two gas containers",
-        f"{TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, which are rare in "
-        "the data, make up a large part of all means. Models of which more is known lose to NMS after T: their descents "
-        "end at losses about ten times larger, and more neurons do not help.",
+        f"{TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, which are rare "
+        "in the data, make up a large part of all means. Models of which more is known lose to NMS after T: their "
+        "descents end at losses about ten times larger, and more neurons do not help.",
         _gas,
         lambda r: np.array([1.0, 0.0, 2.0, 2.0]) + r.uniform(-1.0, 1.0, 4) * [0.8, 1.0, 1.0, 1.0],
         8.0,

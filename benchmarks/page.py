@@ -90,10 +90,17 @@ def _machines(found: list[dict]) -> tuple[str, dict[str, str]]:
     table = Table("", {"Part": "text", "Here": "text"}, [list(row) for row in rows])
     others = {result["name"]: result["machine"] for result in found if result["machine"] != usual}
     differing = {
-        name: "; ".join(f"{part} {text}" for part, text in machine.items() if usual.get(part) != text)
+        name: "; ".join(
+            f"{part} {_new(text, usual.get(part))}" for part, text in machine.items() if usual.get(part) != text
+        )
         for name, machine in others.items()
     }
     return "## Machine" + table.markdown(), differing
+
+
+def _new(text: str, usual: str | None) -> str:
+    """What of an enumeration is not in the usual one."""
+    return ", ".join(part for part in text.split(", ") if part not in (usual or "").split(", "))
 
 
 def _targets(targets: list[Target]) -> str:
