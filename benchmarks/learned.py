@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -138,16 +138,18 @@ def compared(problem: Problem, quick: bool) -> list[list]:
     long = round((2 if quick else LONG) * problem.end / problem.step)
     rows = []
 
-    def ours(build: Callable[[int], lt.System], name: str) -> None:
+    def ours(build: Callable[[int], Any], name: str) -> None:
         def one(seed: int) -> list[float]:
             start = time.process_time()
             pairs = [tuple(own) for own in train]
-            how = {"matching": steps, "shooting": 0, "rate": RATE, "validation": 0.0}
-            fitted = lt.learn.fit(build(seed), pairs, seed=seed, progress=False, **how)
+            fitted = lt.learn.fit(
+                build(seed), pairs, matching=steps, shooting=0, rate=RATE, validation=0.0, seed=seed, progress=False
+            )
             spent = time.process_time() - start
             method = lt.MetriplecticRungeKutta(4)
             end = (x.shape[1] - 1) * problem.step
             states = lt.ensemble(fitted, test[:, 0], (0.0, end), problem.step, method, outputs="trajectory").x
+            assert states is not None
             run = lt.integrate(fitted, test[0, 0], (0.0, long * problem.step), problem.step, method)
             assert run.entropy is not None
             laws = _laws(run.energy, run.entropy, float(np.std(fitted.energy(test))))
@@ -175,11 +177,12 @@ def compared(problem: Problem, quick: bool) -> list[list]:
         rows.append([name, int(number[0]), *means, float(drift.max()), float(increment.min()), float(spent.mean())])
         print(rows[-1], flush=True)
 
+    known: dict[str, Any]
     n, known = x.shape[2], {"poisson": problem.poisson, "entropy": problem.entropy}
     ours(lambda seed: lt.learn.Metriplectic(n, width=width, seed=seed), "`lt.learn`, nothing known")
     for construction in ("skew", "projected"):
 
-        def build(seed: int, construction=construction) -> lt.System:
+        def build(seed: int, construction=construction) -> Any:
             friction = lt.learn.Friction(n, 1, construction, width=width, seed=4 * seed + 3)
             return lt.learn.Metriplectic(n, **known, friction=friction, width=width, seed=seed)
 

@@ -11,7 +11,7 @@ import manifolds as mf
 
 from ..report import Report, Table
 
-INERTIA, RATE = np.array([3.0, 2.0, 1.0]), 0.08
+INERTIA, RATE = (3.0, 2.0, 1.0), 0.08
 GUESS = lt.models.tumbling_body((2.4, 2.0, 1.4), rate=0.2)
 END, STEP, NUMBER = 20.0, 0.1, 8
 METHOD = lt.MetriplecticRungeKutta(4)
@@ -23,7 +23,7 @@ def _records(noise: float) -> list[tuple[np.ndarray, np.ndarray]]:
     for start in _starts(random):
         run = lt.integrate(body, start, (0.0, END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
         turned = np.asarray(mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3))))
-        found.append((run.t, run.attitude @ turned))
+        found.append((run.t, np.asarray(run.attitude) @ turned))
     return found
 
 
@@ -52,10 +52,10 @@ def _row(noise: float, window: int, steps: int) -> list:
     start_, true = np.array([0.3, 0.9, 0.4]), lt.models.tumbling_body(INERTIA, rate=RATE)
     own = lt.integrate(fitted, unit * start_, (0.0, 100.0 * END), STEP, METHOD)
     other = lt.integrate(true, start_, (0.0, 2.0 * END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
-    missed = np.einsum("tij,tij->t", own.attitude[: len(other.t)], other.attitude)
+    missed = np.einsum("tij,tij->t", np.asarray(own.attitude)[: len(other.t)], np.asarray(other.attitude))
     angle = float(np.arccos(np.clip((missed.min() - 1.0) / 2.0, -1.0, 1.0)))
-    errors = [float(e) for e in np.abs(shape[:2] / INERTIA[:2] - 1.0)]
-    laws = [own.audit().energy_drift, float(np.diff(own.entropy).min())]
+    errors = [float(e) for e in np.abs(shape[:2] / np.array(INERTIA[:2]) - 1.0)]
+    laws = [own.audit().energy_drift, float(np.diff(np.asarray(own.entropy)).min())]
     kind = "whole records" if window * STEP >= END else f"pieces of {window} intervals"
     return [f"noise {noise:g} rad, {kind}", *errors, float(abs(friction / RATE - 1.0)), angle, *laws, spent]
 

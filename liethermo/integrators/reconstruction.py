@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -156,7 +158,8 @@ class WithAttitude(Wrapping):
         """A step without care for rounding, of a method that has such: see :meth:`.MetriplecticRungeKutta.plain`."""
         g, group = system.split(x)[1], system.group
         local = TurningSystem(system, self.order, g)
-        end = pulled(self.method, local).plain(local, local.around(x), h)
+        method: Any = pulled(self.method, local)
+        end = method.plain(local, local.around(x), h)
         return system.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
     def _turn(self, group, xi) -> jax.Array:

@@ -98,7 +98,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
         @jax.checkpoint  # what is computed again is not carried from step to step: a shorter program, and faster
         def rates(x) -> tuple[jax.Array, jax.Array]:
-            """Of the laws by the whole field: along the motion they change by rounding alone."""
+            """Those of the laws are by the whole field: along the motion they change by rounding alone."""
             dH = system.energy.gradient(x)
             dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
             field = system.here(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))

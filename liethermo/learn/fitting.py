@@ -91,7 +91,7 @@ def fit(
         What was measured, an array of any shape, in place of ``observed``: ``lambda x, R: R`` for attitudes. The data
         then have shape (m, ...), in the units of what it returns; solutions are observed by it.
 
-        Of states that are not observed in full the fit finds the initial ones: only the laws determine them. A system
+        If states are not observed in full, the fit finds the initial ones: only the laws determine them. A system
         without networks begins with those that move as the data do. One with networks begins with zeros.
     validation : float, optional
         Fraction of the trajectories that is held out (of a single trajectory the end). The fit returns the weights that
@@ -167,7 +167,7 @@ def fit(
         return losses.matching_of(own, [trajectory for trajectory, _ in part], sigma, found)
 
     def shot(part: list, free: bool) -> Task:
-        pieces = windows(*map(list, zip(*part, strict=True)), window, free)
+        pieces = windows([trajectory for trajectory, _ in part], [own for _, own in part], window, free)
         return losses.shooting(own, method, pieces, seen, units, substeps, free)
 
     phases = []

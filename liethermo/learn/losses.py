@@ -38,7 +38,7 @@ class Weights(NamedTuple):
 
     start: np.ndarray
     shapes: tuple[tuple[int, ...], ...]
-    system: Callable[[Any], System]
+    system: Callable[[Any], Any]
 
 
 def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:

@@ -18,13 +18,13 @@ from ..systems import AttitudeSystem, System
 from .quickly import quickly
 
 ITERATIONS = 30
-"""Of Levenberg and Marquardt, for the states in which runs begin."""
+"""Steps by Levenberg and Marquardt, for a state in which a run begins."""
 
 ATTITUDES = 16
 """From which the first state of a trajectory is looked for."""
 
 DAMPING, EASED, RAISED = 1e-2, 0.3, 10.0
-"""Their damping at first, and what it is multiplied by after a step that was taken and one that was not."""
+"""The damping at first, and what it is multiplied by after a step that was taken and one that was not."""
 
 
 class Observation(NamedTuple):
