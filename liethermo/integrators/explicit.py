@@ -186,11 +186,15 @@ class ExplicitMethod(TransportingMethod):
                 for i, (law, gradient) in enumerate(zip(laws, gradients, strict=True))
             ]
         )
-        raised = [system.raised(x, gradient) for gradient in gradients]
-        along = raised if system.surface is None else [system.surface.along(x, v) for v in raised]
-        move = towards(along, found, passes=min(len(system.blocks), 2))
-        near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
-        return jax.lax.stop_gradient(jnp.where(jnp.stack(near).all(), found, 0.0))
+
+        def allowed() -> jax.Array:
+            raised = [system.raised(x, gradient) for gradient in gradients]
+            along = raised if system.surface is None else [system.surface.along(x, v) for v in raised]
+            move = towards(along, found, passes=min(len(system.blocks), 2))
+            near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
+            return jnp.where(jnp.stack(near).all(), found, 0.0)
+
+        return jax.lax.stop_gradient(jax.lax.cond((found != 0.0).any(), allowed, lambda: found))
 
     def _own_changes(self, laws: list[Law], x, compensation, d) -> jax.Array:
         """What an uncorrected step changes the functions by that have to rise or fall, where that has the right sign.

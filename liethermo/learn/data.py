@@ -48,7 +48,7 @@ def _pairs(data: Any, own: Observation) -> list[tuple[Any, Any]]:
     if isinstance(data, tuple) and len(data) == 2 and _ndim(data[0]) == 1:
         t, x = data
         return [(t, x) for x in np.asarray(x)] if _ndim(x) == 2 + len(own.shape) else [(t, x)]
-    if not isinstance(data, Sequence):
+    if not isinstance(data, Sequence) or isinstance(data, str):
         raise InputError(
             f"data is a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such pairs, "
             f"or solutions, not {type(data).__name__}"

@@ -273,7 +273,10 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         If there is none, or it is damaged or of another kind.
     """
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        content = path.read_bytes()
+        if not content.startswith(b"PK"):
+            raise ValueError("it is no archive of arrays")
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         said = json.loads(arrays.pop("__json__").tobytes())
         if not isinstance(said, dict) or said.get("format") != kind:
