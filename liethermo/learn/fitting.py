@@ -201,7 +201,7 @@ def fit(
     settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
     if not phases:
         way = "matching" if seen.is_whole else "shooting, as not all of the states is observed"
-        raise InputError(f"there is nothing to do: give a number of iterations of the {way}")
+        raise InputError(f"there is nothing to do: give more than 0 iterations of the {way}")
     numbers = [values for trajectory in whole for values in trajectory]
     course = Course(
         phases, own.start, fingerprint(*numbers, own.start, sigma, seen.places, *seen.content(run), repr(settings))
