@@ -119,6 +119,9 @@ class ThermalJumps(Dissipation):
         if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
             raise InputError(f"bath is the number of a bath, from 0, not {bath!r}")
         self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(given))
+        for i, V in enumerate(self.operators):
+            if not np.asarray(V).any():
+                raise InputError(f"the coupling V[{i}] is zero: leave it out")
         self.rates = tuple(rate if callable(rate) else checked_rate(rate) for _, rate in given)
         self.bath, self.jumps, self.frame, self.isolated, self.keeps_energy = bath, (), None, False, True
 
@@ -162,14 +165,14 @@ class ThermalJumps(Dissipation):
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._inside(structure.matrix(a[:n])) for a in (x, dH, dS))
         fixed = _stacked(self.jumps)
-        V, adjoint, omega = jnp.asarray(fixed), jnp.asarray(_adjoint(fixed)), self._frequencies(structure, dH[:n])
+        V, back, omega = jnp.asarray(fixed), jnp.asarray(adjoint(fixed)), self._frequencies(structure, dH[:n])
         if self.isolated:
             T, shift = jnp.asarray(jnp.inf), jnp.zeros(len(self.jumps))
         else:
             T = dH[n + self.bath]
             shift, A = omega / (2.0 * T), A - (dS[n + self.bath] / T) * H
         image = log_mean(mf.spectral(jnp.log, rho), shift, _commutator(V, A)) * self._strengths(omega, T)[:, None, None]
-        moved = jnp.sum(_commutator(adjoint, image), axis=0)  # the adjoints add the adjoint
+        moved = jnp.sum(_commutator(back, image), axis=0)  # the adjoints add the adjoint
         return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
 
     has_generator = True
@@ -187,18 +190,16 @@ class ThermalJumps(Dissipation):
 
     def _inside(self, matrix):
         """A matrix in the frame, in which most entries of the jumps are zero."""
-        return matrix if self.frame is None else _adjoint(np.asarray(self.frame)) @ matrix @ np.asarray(self.frame)
+        return matrix if self.frame is None else adjoint(np.asarray(self.frame)) @ matrix @ np.asarray(self.frame)
 
     def _outside(self, matrix):
-        return matrix if self.frame is None else np.asarray(self.frame) @ matrix @ _adjoint(np.asarray(self.frame))
+        return matrix if self.frame is None else np.asarray(self.frame) @ matrix @ adjoint(np.asarray(self.frame))
 
     def _frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
         """The energies that the jumps take: linear in H, by a table that is known when programs are written."""
         fixed = _stacked(self.jumps)
-        adjoint = _adjoint(fixed)
-        along = (adjoint @ fixed - fixed @ adjoint) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
-        with jax.ensure_compile_time_eval():
-            return np.asarray(structure.vector(self._outside(along))) @ dH
+        along = _commutator(adjoint(fixed), fixed) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
+        return structure.vector(self._outside(along)) @ dH
 
     def _with_heat(self, system, dH, T, force) -> jax.Array:
         """The force with the entropy that the bath takes."""
@@ -223,7 +224,9 @@ class SteepestEntropyAscent(Dissipation):
     ``K = rate P^T L P`` with the metric ``L A = (rho A + A rho) / 2`` and P the projector, orthogonal for L, off the
     energy, the trace and what else is preserved. An eigenvalue of rho that is zero stays zero: so a state keeps its
     rank, and a pure state moves by the Hamiltonian alone. For such states take ``lt.VonNeumann(floor=...)``, and
-    ``lt.MetriplecticMidpoint``: it keeps the rank to rounding, the other methods to their order.
+    ``lt.MetriplecticMidpoint``: it keeps the rank to rounding, the other methods to their order. A run does not start
+    where the Hamiltonian turns the eigenvectors of the eigenvalue zero, as those of most pure states: the error of a
+    step would grow there.
 
     Parameters
     ----------
@@ -324,7 +327,8 @@ def _commutator(a, b):
     return a @ b - b @ a
 
 
-def _adjoint(a: np.ndarray) -> np.ndarray:
+def adjoint(a: np.ndarray) -> np.ndarray:
+    """The adjoints of matrices, shape (..., n, m)."""
     return a.conj().swapaxes(-1, -2)
 
 
@@ -343,16 +347,16 @@ def _stacked(jumps: tuple[Jump, ...]) -> np.ndarray:
 def _left(jumps: tuple[Jump, ...]) -> np.ndarray:
     """``V^H V`` of each jump, and then of each adjoint."""
     fixed = _stacked(jumps)
-    return np.concatenate([_adjoint(fixed) @ fixed, fixed @ _adjoint(fixed)])
+    return np.concatenate([adjoint(fixed) @ fixed, fixed @ adjoint(fixed)])
 
 
 def _jumped(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
     """``sum rate V rho V^H`` over the jumps and then their adjoints."""
     fixed = _stacked(jumps)
-    both = np.concatenate([fixed, _adjoint(fixed)])
+    both = np.concatenate([fixed, adjoint(fixed)])
     found = _table(jumps)
     if found is None:
-        return jnp.sum((rates[:, None, None] * both) @ rho @ _adjoint(both), axis=0)
+        return jnp.sum((rates[:, None, None] * both) @ rho @ adjoint(both), axis=0)
     which, source, factors = found
     return jnp.sum(rho.ravel()[source] * (rates[which] * factors), axis=-1).reshape(rho.shape)
 
@@ -364,7 +368,7 @@ def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     None where products of matrices are shorter, as with a few full matrices.
     """
     fixed = _stacked(jumps)
-    both = np.concatenate([fixed, _adjoint(fixed)])
+    both = np.concatenate([fixed, adjoint(fixed)])
     size = both.shape[-1]
     jump, i, j = np.nonzero(both)
     if np.sum(np.bincount(jump) ** 2) > 2 * both.size * size:
@@ -397,7 +401,7 @@ def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], 
     The Hamiltonians are those in the frame, in which the first one is diagonal.
     """
     V = np.asarray(operator)
-    energies, inside = np.diag(hamiltonians[0]).real, _adjoint(frame) @ V @ frame
+    energies, inside = np.diag(hamiltonians[0]).real, adjoint(frame) @ V @ frame
     gaps = energies[None, :] - energies[:, None]
     present = np.abs(inside) > 1e-14 * np.abs(V).max()
     spread = EIGEN * max(float(np.abs(energies).max()), 1e-300)

@@ -152,7 +152,8 @@ def integrate(
     if save_at is not None:
         course = Course(t_span, h, None, stops_of(save_at, course.start, course.end))
     x = begun(system, x0, course.start, attitude)
-    if reason := system.outside(x):
+    spared = system.has_generator and (isinstance(method, Reference) or method.explicit)
+    if reason := system.outside(x) or ("" if spared else system.singular(x)):
         raise InputError(f"the run cannot start at this x0: {reason}")
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:

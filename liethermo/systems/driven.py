@@ -103,6 +103,9 @@ class DrivenSystem(System):
     def outside(self, x) -> str:
         return self._now(x).outside(x[:-2])
 
+    def singular(self, x) -> str:
+        return self._now(x).singular(x[:-2])
+
     def sizes(self, k):
         clock = jnp.full((*k.shape[:-1], 2), self.unit)
         return jnp.concatenate([self.body.sizes(k[..., :-2]), clock], axis=-1)

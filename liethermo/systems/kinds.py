@@ -102,6 +102,10 @@ class Kind(Geometry):
         """Why a state lies outside the domain of the system, in words; empty where it does not."""
         return ""
 
+    def singular(self, x) -> str:
+        """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can."""
+        return ""
+
     def own_residuals(self, x) -> dict[str, jax.Array]:
         """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
         return {}

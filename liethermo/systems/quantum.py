@@ -14,7 +14,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 
 from ..dissipation.base import Dissipation, total
-from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, checked_hermitian, checked_matrix
+from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, adjoint, checked_hermitian, checked_matrix
 from ..errors import InputError
 from ..functions.density import Expectation, VonNeumann
 from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
@@ -230,23 +230,49 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        p = np.linalg.eigvalsh(self.structure.matrix(np.asarray(x)[: self.body_dim]))
-        entropy = next(term for term in self.entropy.terms)  # type: ignore[union-attr]
-        floor = getattr(entropy, "floor", getattr(getattr(entropy, "energy", None), "floor", 0.0))
+        p, vectors = np.linalg.eigh(self.structure.matrix(np.asarray(x)[: self.body_dim]))
         if abs(p.sum() - 1.0) > 1e-9:
             return f"the trace of its density matrix is {p.sum():.12g}, not 1"
-        if p[0] < -max(floor, 0.0):
+        if p[0] < -max(self._floor, 0.0):
             return (
                 f"its density matrix has the eigenvalue {p[0]:.3g}, outside the cone of positive matrices: a shorter "
                 "step stays inside"
             )
-        if p[0] <= 0.0 and floor == 0.0:
+        if p[0] <= 0.0 and self._floor == 0.0:
             return (
                 f"its density matrix has the eigenvalue {p[0]:.3g}, where the gradient of the entropy is infinite: mix "
                 "it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the system "
                 "entropy=lt.VonNeumann(floor=1e-12)"
             )
+        inside, kernel = vectors[:, p > self._floor], vectors[:, p <= self._floor]
+        turned = max((np.abs(adjoint(kernel) @ H @ inside).max(initial=0.0) for H in self.hamiltonians()), default=0.0)
+        if self._has(SteepestEntropyAscent) and turned > WITHIN:
+            return (
+                "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends of "
+                "steps have others, by the error of a step, which steepest ascent lets grow: mix it, as in "
+                "q.state(rho, mixed=1e-6)"
+            )
         return ""
+
+    def singular(self, x) -> str:
+        if is_traced(self) or not self._has(ThermalJumps):
+            return ""
+        least = np.linalg.eigvalsh(self.structure.matrix(np.asarray(x)[: self.body_dim]))[0]
+        if least > self._floor:
+            return ""
+        return (
+            f"its density matrix has the eigenvalue {least:.3g}, which jumps make larger, and the gradient of the "
+            "entropy is infinite there: take lt.MetriplecticRungeKutta, whose stages are without it, or mix the state, "
+            "as in q.state(rho, mixed=1e-6)"
+        )
+
+    @property
+    def _floor(self) -> float:
+        entropy = self.entropy.terms[0]  # type: ignore[union-attr]
+        return getattr(entropy, "floor", getattr(getattr(entropy, "energy", None), "floor", 0.0))
+
+    def _has(self, kind: type[Dissipation]) -> bool:
+        return self.dissipation is not None and any(isinstance(part, kind) for part in self.dissipation.terms)
 
     spectral = True
 
@@ -321,9 +347,7 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
         return structure.size, Linear(structure.vector(hamiltonian))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
-    structure = mf.DensityMatrices(len(H))
-    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        return len(H), Linear(structure.vector(H))
+    return len(H), Linear(mf.DensityMatrices(len(H)).vector(H))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:

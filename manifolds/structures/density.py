@@ -41,9 +41,9 @@ class DensityMatrices(PoissonBySharp):
 
     def vector(self, a) -> jax.Array:
         """The coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of :meth:`matrix`."""
-        a = jnp.asarray(a)
+        xp = np if isinstance(a, np.ndarray) else jnp
         turned, (_, (size, _), chosen) = a.swapaxes(-1, -2), _places(self.size)
-        parts = jnp.stack([(a.real + turned.real) * (0.5 / size), (a.imag - turned.imag) * (0.5 / size)], axis=-3)
+        parts = xp.stack([(a.real + turned.real) * (0.5 / size), (a.imag - turned.imag) * (0.5 / size)], axis=-3)
         return parts.reshape(*a.shape[:-2], -1)[..., chosen]
 
     def sharp(self, x, alpha) -> jax.Array:

@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -363,6 +364,37 @@ def test_a_pure_state_is_refused_with_what_to_do():
     assert np.linalg.eigvalsh(q.density(q.state([0.0, 1.0], mixed=1e-6)))[0] == pytest.approx(5e-7)
 
 
+TURNED = [0.6, 0.8]
+"""A pure state that the Hamiltonian of the qubit turns."""
+
+
+def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
+    """Steepest ascent would let the error of a step grow, and jumps take an infinite gradient in implicit steps."""
+    floor = lt.VonNeumann(floor=1e-12)
+    q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4), entropy=floor)
+    with pytest.raises(lt.InputError, match=r"the Hamiltonian turns their eigenvectors.*mix it"):
+        lt.integrate(q, q.state(TURNED), (0.0, 1.0), 0.1)
+    still = lt.integrate(q, q.state([1.0, 0.0]), (0.0, 1.0), 0.1)
+    assert np.abs(q.density(still.x[-1]) - np.diag([1.0, 0.0])).max() <= 1e-15
+    dephasing = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(Z, 0.3)]), entropy=floor)
+    with pytest.raises(lt.InputError, match=r"take lt\.MetriplecticRungeKutta"):
+        lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1)
+    end = lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).x[-1]
+    assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
+
+
+def test_eigenvectors_of_larger_matrices_are_those_of_lapack():
+    """Of eight levels: a loop of rotations was fifty times longer, in programs of the array engine too."""
+    H, V = np.diag(np.arange(8.0)), np.diag(np.sqrt(np.arange(1.0, 8.0)), 1)  # of one frequency: a table of many terms
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.1)]), baths=infinite())
+    rho = random_density(8)
+    jumps = [(V, 0.1 * np.exp(0.5 / T)), (V.T, 0.1 * np.exp(-0.5 / T))]
+    assert np.abs(motion(q, rho) - lindblad(rho, H, jumps)).max() <= 1e-14
+    text = jax.jit(q.entropy.value).lower(q.state(rho)[:64]).as_text()
+    assert "lapack" in text
+    assert "while" not in text
+
+
 def test_ensembles_over_rates_and_states():
     q = qubit()
     x0s = q.state(np.stack([random_density(2, seed) for seed in range(5)]))
@@ -378,6 +410,7 @@ BAD = {
         QUBIT, lt.ThermalJumps([(np.eye(3), 1.0)]), baths=infinite()
     ),
     "rate must be >= 0": lambda q: lt.ThermalJumps([(LOWER, -1.0)]),
+    r"V\[0\] is zero": lambda q: lt.ThermalJumps([(0.0 * LOWER, 1.0)]),
     "pairs": lambda q: lt.ThermalJumps([LOWER]),
     "bath 1, but there are 1": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
