@@ -262,7 +262,7 @@ class SteepestEntropyAscent(Dissipation):
                     raise InputError(
                         f"preserve[{i}] has shape {np.shape(f)}, and the Hamiltonian that of {structure.size}"
                     )
-                f = Function(_Observable(structure.vector(np.asarray(f))))
+                f = Function(_Observable(jnp.asarray(structure.vector(np.asarray(f)))))
             elif not isinstance(f, Energy):
                 f = Function(OfMatrix(f, structure))
             made.append(f)

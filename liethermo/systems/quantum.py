@@ -245,8 +245,8 @@ class QuantumSystem(System):
                 "entropy=lt.VonNeumann(floor=1e-12)"
             )
         inside, kernel = vectors[:, p > self._floor], vectors[:, p <= self._floor]
-        turned = max((np.abs(adjoint(kernel) @ H @ inside).max(initial=0.0) for H in self.hamiltonians()), default=0.0)
-        if self._has(SteepestEntropyAscent) and turned > WITHIN:
+        ascends = kernel.size and inside.size and self._has(SteepestEntropyAscent)
+        if ascends and any(np.abs(adjoint(kernel) @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
             return (
                 "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends of "
                 "steps have others, by the error of a step, which steepest ascent lets grow: mix it, as in "
@@ -347,7 +347,8 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
         return structure.size, Linear(structure.vector(hamiltonian))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
-    return len(H), Linear(mf.DensityMatrices(len(H)).vector(H))
+    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+        return len(H), Linear(jnp.asarray(mf.DensityMatrices(len(H)).vector(H)))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:

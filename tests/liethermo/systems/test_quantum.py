@@ -276,6 +276,13 @@ def test_noise_without_a_bath_at_the_order_of_the_method(method):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.2)
 
 
+def test_a_system_is_prepared_once():
+    """Numbers that could change in place are not remembered: each run would trace the series of the field again."""
+    ascent = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4, preserve=[Z]))
+    for q in (qubit(), ascent):
+        assert not any(isinstance(leaf, np.ndarray) for leaf in jax.tree_util.tree_leaves(q))
+
+
 def test_products_and_partial_traces():
     one = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, 0.3)]), baths=infinite(1.0), names=["A"])
     other = lt.QuantumSystem(2 * QUBIT, lt.ThermalJumps([(LOWER, 0.2)]), baths=infinite(0.5), names=["B"])
@@ -384,7 +391,7 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
 
 
 def test_eigenvectors_of_larger_matrices_are_those_of_lapack():
-    """Of eight levels: a loop of rotations was fifty times longer, in programs of the array engine too."""
+    """In programs of the array engine too, where a loop of rotations takes much longer."""
     H, V = np.diag(np.arange(8.0)), np.diag(np.sqrt(np.arange(1.0, 8.0)), 1)  # of one frequency: a table of many terms
     q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.1)]), baths=infinite())
     rho = random_density(8)
