@@ -80,14 +80,14 @@ def hole(w):
     return lambda x: jnp.where(jnp.abs(x[0] - 0.5) < w, jnp.nan, x[0] - 0.5)
 
 
-def watched(until, step, engine="compiled", order=8):
-    """Alone, and as an ensemble tells it."""
+def watched(until, step, engine="compiled", order=8, rounded=1e-13):
+    """Alone, and in an ensemble, whose program may round otherwise: by ``rounded``, in the time."""
     given = (0.0, 3.0), step, lt.MetriplecticRungeKutta(order)
     found = lt.integrate(OSCILLATOR, [1.0, 0.0], *given, until=until, engine=engine, on_failure="return")
     many = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [1.0, 0.0]], *given, until=until, engine=engine)
     assert [found.status.code] * 2 == [status.code for status in map(many.status_of, range(2))]
     times = np.nan if found.event_time is None else found.event_time
-    assert many.event_time == pytest.approx([times] * 2, abs=1e-13, nan_ok=True)
+    assert many.event_time == pytest.approx([times] * 2, abs=rounded, nan_ok=True)
     return found
 
 
@@ -143,7 +143,7 @@ ZEROS = {
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 def test_a_zero_is_an_event_however_it_is_rounded(name, engine, step):
     until, exact = ZEROS[name]
-    found = watched(until, step, engine)
+    found = watched(until, step, engine, rounded=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6
     assert found.event_time == pytest.approx(exact, abs=1e-6 if name != "of no slope" else 1e-4)
     assert found.audit().passed
 
