@@ -18,7 +18,7 @@ from .divided import ScalarFunction, scalar_function
 from .symmetric import eigh
 
 SMALL = 3
-"""Rows up to which eigenvectors are found by rotations where operations are unrolled; beyond, LAPACK is called."""
+"""Rows up to which eigenvectors are found by rotations; beyond, LAPACK is called."""
 
 
 def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
@@ -109,7 +109,7 @@ class Spectral:
     function: ScalarFunction
 
     def prepared(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
-        return _eigenvectors(a, unrolled)
+        return _eigenvectors(a)
 
     def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
         found = prepared
@@ -131,7 +131,7 @@ class Spectral:
         return vectors[0] @ middle @ adjoint[-1]
 
 
-def _eigenvectors(a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
+def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
     a = (a + a.conj().swapaxes(-1, -2)) / 2
     if a.shape[-1] > SMALL:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
