@@ -7,7 +7,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --no-deps
 
 # Extras with a lock of their own, of what they need beside requirements.lock.
-LOCKS := studies learn test docs bench
+LOCKS := studies learn quantum test docs bench
 
 # Held back where a newer release refuses an early 3.11.
 LOCK_CONSTRAINTS := soupsieve<3
@@ -44,7 +44,7 @@ help:
 	$(PIP_INSTALL) --no-build-isolation -e .
 	@touch $@
 
-# .venv/studies, .venv/learn, .venv/test, .venv/docs, .venv/bench: what one of them needs beside what a run needs.
+# .venv/studies, .venv/learn, .venv/quantum, .venv/test, .venv/docs, .venv/bench: what one of them needs beside what a run needs.
 .venv/%: requirements-%.lock .venv/installed
 	$(PIP_INSTALL) -r $<
 	@touch $@

@@ -10,6 +10,7 @@ MOST = 60
 BESIDE = {
     "studies": {"dask", "distributed", "zarr"},
     "learn": {"optax"},
+    "quantum": {"qutip"},
     "test": {"pytest", "hypothesis", "ruff", "mypy"},
     "docs": {"sphinx"},
     "bench": {"diffrax"},
