@@ -23,13 +23,16 @@ from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .paced import Many
-from .preparation import as_family, as_run, begun, check_choice, decided, laws_of
+from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
 from .timetable import Course, stops_of
 
 __all__ = ["THREADS", "Ensemble", "ensemble"]
+
+LOOKED_AT = 8192
+"""States that are looked at together, at most: bounded memory."""
 
 FOLLOWED = 256
 """Steps that an audit takes again of a trajectory by the array engine, whose steps are slow."""
@@ -140,10 +143,16 @@ def ensemble(
     given = member = decided(family.representative, states)
     one_body = _same_inertia(family, member)
     member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
-    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
     attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
     family, states = as_family(family, member), np.asarray(begun(member, states, course.start, attitude, batch=True))
     method.check(member)
+    if off := _off(family, member, method, states):
+        reasons = dict(reasons) | {int(run[i]): text for i, text in off.items()}
+        if len(off) == len(run):
+            raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
+        kept = np.setdiff1d(np.arange(len(run)), list(off))
+        run, family, states = run[kept], family.select(kept), states[kept]
+    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
     record = Record(family, member, states, course, outputs, np.nan if isinstance(step, Adaptive) else course.h)
     event = None if until is None else Event(until, member)
     pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
@@ -220,6 +229,32 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
     return states, reasons
 
 
+def _off(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
+    """The trajectories, as they are run, whose first states the method cannot start at, and why."""
+    found = _by_halves(lambda part: no_start(member, method, states[part]), len(states))
+    if family.size == 1:
+        return found
+    own = {i: no_start(family.member(i), method, states[i]) for i in {*found, *family.extremes()}}
+    return {i: text for i, text in own.items() if text}
+
+
+def _by_halves(complaint: Callable[[slice], str], size: int) -> dict[int, str]:
+    """Which of so many rows there is a complaint of, and which one: halves, as far as there is something to find."""
+    found: dict[int, str] = {}
+
+    def look(first: int, last: int) -> None:
+        text = complaint(slice(first, last))
+        if text and last - first == 1:
+            found[first] = text
+        elif text:
+            look(first, (first + last) // 2)
+            look((first + last) // 2, last)
+
+    for first in range(0, size, LOOKED_AT):
+        look(first, min(first + LOOKED_AT, size))
+    return found
+
+
 def _same_inertia(family: Family, member: System) -> bool:
     """Whether all members have the inertia of this one, by those with the smallest and largest parameters."""
     inertia = member.inertia
@@ -237,18 +272,7 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiub" or not len(rows):
             raise
-    bad: dict[int, str] = {}
-
-    def look(first: int, last: int) -> None:
-        """Halves, as far as there is something to find."""
-        complaint = why_not(lambda: member.numbers(rows[first:last], batch=True))
-        if complaint and last - first == 1:
-            bad[first] = complaint
-        elif complaint:
-            look(first, (first + last) // 2)
-            look((first + last) // 2, last)
-
-    look(0, len(rows))
+    bad = _by_halves(lambda part: why_not(lambda: member.numbers(rows[part], batch=True)), len(rows))
     good = [i for i in range(len(rows)) if i not in bad]
     if not good:
         raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")

@@ -16,7 +16,7 @@ from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import as_run, begun, check_choice, decided, prepared
+from .preparation import as_run, begun, check_choice, decided, no_start, prepared
 from .progress import Progress
 from .run import Run
 from .timetable import Course, stops_of
@@ -152,9 +152,8 @@ def integrate(
     if save_at is not None:
         course = Course(t_span, h, None, stops_of(save_at, course.start, course.end))
     x = begun(system, x0, course.start, attitude)
-    spared = system.has_generator and (isinstance(method, Reference) or method.explicit)
-    if reason := system.outside(x) or ("" if spared else system.singular(x)):
-        raise InputError(f"the run cannot start at this x0: {reason}")
+    if reason := no_start(system, method, x):
+        raise InputError(reason)
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:
         if isinstance(method, Reference):

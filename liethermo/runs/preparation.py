@@ -88,6 +88,13 @@ def begun(system: System, x0, t: float, attitude=None, batch: bool = False) -> j
     return system.begin(x0, t, batch) if isinstance(system, DrivenSystem) else system.numbers(x0, batch)
 
 
+def no_start(system: System, method, x) -> str:
+    """Why no run can start at x, or at one of several states, in words; empty where one can."""
+    spared = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
+    reason = system.outside(x) or ("" if spared else system.singular(x))
+    return reason and f"the run cannot start at this x0: {reason}"
+
+
 def as_family(family: Family, system: System) -> Family:
     """The family of what the members are run as, where the system is what one of them is."""
     if isinstance(system, AttitudeSystem):

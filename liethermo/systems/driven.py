@@ -101,10 +101,13 @@ class DrivenSystem(System):
         return np.column_stack([self.body.samples(count, seed, scale), self.unit * times, np.zeros(count)])
 
     def outside(self, x) -> str:
-        return self._now(x).outside(x[:-2])
+        return self._now_of_all(x).outside(x[..., :-2])
 
     def singular(self, x) -> str:
-        return self._now(x).singular(x[:-2])
+        return self._now_of_all(x).singular(x[..., :-2])
+
+    def _now_of_all(self, x) -> System:
+        return self._now(np.reshape(x, (-1, self.dim))[0])
 
     def sizes(self, k):
         clock = jnp.full((*k.shape[:-1], 2), self.unit)

@@ -82,12 +82,13 @@ class EmbeddedSystem(System):
         return OnLevels(_space(self.manifold), self.conforming)
 
     def outside(self, x) -> str:
-        space, x = _space(self.manifold), np.asarray(x)
+        space, x = _space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
-        if at_points(_inside, self.surface, x[None])[0] > 0.0:
+        inside = at_points(_inside, self.surface, x) > 0.0
+        if inside.all():
             return self.manifold.outside(x)
-        return f"the step leaves {space.name}: {space._why_off(np.asarray(self.points(x)), np.inf)}"
+        return f"the step leaves {space.name}: {space._why_off(np.asarray(self.points(x[inside.argmin()])), np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------
 

@@ -99,11 +99,17 @@ class Kind(Geometry):
         return found
 
     def outside(self, x) -> str:
-        """Why a state lies outside the domain of the system, in words; empty where it does not."""
+        """Why a state lies outside the domain of the system, in words; empty where it does not.
+
+        For several states at one time, shape (..., n), the text is about one that does.
+        """
         return ""
 
     def singular(self, x) -> str:
-        """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can."""
+        """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can.
+
+        For several states it is as in :meth:`outside`.
+        """
         return ""
 
     def own_residuals(self, x) -> dict[str, jax.Array]:

@@ -230,23 +230,26 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        p, vectors = np.linalg.eigh(self.structure.matrix(np.asarray(x)[: self.body_dim]))
-        if abs(p.sum() - 1.0) > 1e-9:
-            return f"the trace of its density matrix is {p.sum():.12g}, not 1"
-        if p[0] < -max(self._floor, 0.0):
+        p, vectors = np.linalg.eigh(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
+        traces, least = p.sum(axis=-1), p[:, 0].min()
+        trace = traces[np.abs(traces - 1.0).argmax()]
+        if abs(trace - 1.0) > 1e-9:
+            return f"the trace of its density matrix is {trace:.12g}, not 1"
+        if least < -max(self._floor, 0.0):
             return (
-                f"its density matrix has the eigenvalue {p[0]:.3g}, outside the cone of positive matrices: a shorter "
+                f"its density matrix has the eigenvalue {least:.3g}, outside the cone of positive matrices: a shorter "
                 "step stays inside"
             )
-        if p[0] <= 0.0 and self._floor == 0.0:
+        if least <= 0.0 and self._floor == 0.0:
             return (
-                f"its density matrix has the eigenvalue {p[0]:.3g}, where the gradient of the entropy is infinite: mix "
+                f"its density matrix has the eigenvalue {least:.3g}, where the gradient of the entropy is infinite: mix "
                 "it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the system "
                 "entropy=lt.VonNeumann(floor=1e-12)"
             )
-        inside, kernel = vectors[:, p > self._floor], vectors[:, p <= self._floor]
-        ascends = kernel.size and inside.size and self._has(SteepestEntropyAscent)
-        if ascends and any(np.abs(adjoint(kernel) @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
+        gone = p <= self._floor
+        kernel, inside = (((vectors * some[:, None]) @ adjoint(vectors)) for some in (gone, ~gone))
+        ascends = gone.any() and self._has(SteepestEntropyAscent)
+        if ascends and any(np.abs(kernel @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
             return (
                 "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends of "
                 "steps have others, by the error of a step, which steepest ascent lets grow: mix it, as in "
@@ -257,7 +260,7 @@ class QuantumSystem(System):
     def singular(self, x) -> str:
         if is_traced(self) or not self._has(ThermalJumps):
             return ""
-        least = np.linalg.eigvalsh(self.structure.matrix(np.asarray(x)[: self.body_dim]))[0]
+        least = np.linalg.eigvalsh(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))[:, 0].min()
         if least > self._floor:
             return ""
         return (

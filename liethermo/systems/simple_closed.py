@@ -196,7 +196,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     # -- checks -----------------------------------------------------------------------------------------------------
 
     def outside(self, x) -> str:
-        T = float(at_points(_temperature, self, np.asarray(x)[None])[0])
+        T = float(at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 
     def own_residuals(self, x) -> dict[str, jax.Array]:

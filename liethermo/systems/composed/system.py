@@ -186,7 +186,7 @@ class ComposedSystem(System):
         return factors
 
     def outside(self, x) -> str:
-        T = np.asarray(self.temperatures(x))
+        T = np.atleast_2d(self.temperatures(x)).min(axis=0)
         cold = np.flatnonzero(~(T > 0.0))
         if not cold.size:
             return ""

@@ -390,6 +390,35 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
 
 
+@pytest.mark.parametrize("driven", [False, True])
+def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
+    """Each trajectory by itself, and by the method too: stages without the gradient start there."""
+    H = (lambda t: (1.0 + 0.1 * t) * QUBIT) if driven else QUBIT
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(Z, 0.3)]), entropy=lt.VonNeumann(floor=1e-12))
+    x0s = np.stack([q.state(RHO)] * 5)
+    x0s[3] = q.state(TURNED)
+    many = lt.ensemble(q, x0s, (0.0, 0.2), 0.1)
+    assert np.flatnonzero(~many.ok).tolist() == [3]
+    assert many.message(3).startswith("trajectory 3: the run cannot start at this x0: its density matrix has")
+    with pytest.raises(lt.InputError) as one:
+        lt.integrate(q, x0s[3], (0.0, 0.2), 0.1)
+    assert many.message(3) == f"trajectory 3: {one.value}"
+    assert np.array_equal(many.x[4], lt.integrate(q, x0s[4], (0.0, 0.2), 0.1).x[-1])
+    with pytest.raises(lt.InputError, match=r"trajectory 0: the run cannot start.*take lt\.MetriplecticRungeKutta"):
+        lt.ensemble(q, q.state(TURNED), (0.0, 0.2), 0.1)
+    assert lt.ensemble(q, x0s, (0.0, 0.2), 0.1, lt.MetriplecticRungeKutta(4)).ok.all()
+
+
+def test_an_ensemble_over_rates_refuses_the_states_of_their_members():
+    x0s = np.stack([qubit().state(RHO)] * 4)
+    x0s[2] = qubit().state([0.0, 1.0])
+    many = lt.ensemble(
+        qubit(), x0s, (0.0, 0.2), 0.1, parameters={"dissipation.rates[0]": np.array([0.1, 0.2, 0.3, 0.4])}
+    )
+    assert np.flatnonzero(~many.ok).tolist() == [2]
+    assert "gradient of the entropy is infinite: mix it" in many.message(2)
+
+
 def test_eigenvectors_of_larger_matrices_are_those_of_lapack():
     """In programs of the array engine too, where a loop of rotations takes much longer."""
     H, V = np.diag(np.arange(8.0)), np.diag(np.sqrt(np.arange(1.0, 8.0)), 1)  # of one frequency: a table of many terms
