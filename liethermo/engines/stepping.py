@@ -161,7 +161,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     failure = jnp.where(solved.converged | ~solved.defined, int(Code.NON_FINITE), int(Code.NOT_CONVERGED))
     own = system.solved_for(x)[1]
     size = jnp.maximum(rules.size(own.size)(own), h * solved.noise)
-    residual = jnp.abs(h) * solved.residual / (size + jnp.abs(h) * rules.vanished)
+    residual = h * solved.residual / jnp.where(size > rules.vanished, size, 1.0)
     iterations = solved.fixed_point + solved.newton
     mean = 0.5 * (relaxing(system, state.energy, state.entropy) + relaxing(system, energy, entropy))
 
