@@ -125,9 +125,10 @@ class Family:
 
         try:
             program = traced(arrays_of, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.form.shapes))
-        except jax.errors.ConcretizationTypeError as error:
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise InputError(
-                f"the function that builds systems must accept traced JAX arrays, as under jax.vmap: {error}"
+                "the function that builds systems must accept traced JAX arrays, as under jax.vmap; or give a system "
+                f"and parameters= by the names of its own: {str(error).splitlines()[0]}"
             ) from error
         if fingerprint(rest) is None:
             return self

@@ -222,6 +222,10 @@ def test_what_cannot_be_compiled():
         ({"system": lambda p: 3.0, "parameters": np.ones(2)}, "must return a system"),
         ({"system": lambda p: lt.models.rigid_body(rate=float(p)), "parameters": np.ones(2)}, "traced JAX arrays"),
         (
+            {"system": lambda p: lt.QuantumSystem(np.diag([0.0, p])), "parameters": np.ones(2)},
+            "traced JAX arrays.* or give a system",
+        ),
+        (
             {"system": lambda p: lt.models.rigid_body(rate=p), "parameters": -np.ones(500)},
             "trajectory 0: .*must be >= 0",
         ),
