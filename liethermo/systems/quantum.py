@@ -242,9 +242,9 @@ class QuantumSystem(System):
             )
         if least <= 0.0 and self._floor == 0.0:
             return (
-                f"its density matrix has the eigenvalue {least:.3g}, where the gradient of the entropy is infinite: mix "
-                "it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the system "
-                "entropy=lt.VonNeumann(floor=1e-12)"
+                f"its density matrix has the eigenvalue {least:.3g}, where the gradient of the entropy is infinite: "
+                "mix it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the "
+                "system entropy=lt.VonNeumann(floor=1e-12)"
             )
         gone = p <= self._floor
         kernel, inside = (((vectors * some[:, None]) @ adjoint(vectors)) for some in (gone, ~gone))
