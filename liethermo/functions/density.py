@@ -149,3 +149,15 @@ class Expectation(Module):
 
     def __call__(self, x, t):
         return jnp.dot(self.structure.vector(self.hamiltonian(t)), x)
+
+
+class Modulated(Module):
+    """``tr(rho (H_0 + f_1(t) H_1 + ...))`` of the coordinates of rho, by those of the matrices."""
+
+    constant: jax.Array
+    terms: tuple[jax.Array, ...]
+    functions: tuple[Callable, ...]
+
+    def __call__(self, x, t):
+        moved = [f(t) * term for f, term in zip(self.functions, self.terms, strict=True)]
+        return jnp.dot(sum(moved, self.constant), x)

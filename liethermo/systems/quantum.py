@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from ..dissipation.base import Dissipation, total
 from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, adjoint, checked_hermitian, checked_matrix
 from ..errors import InputError
-from ..functions.density import Expectation, VonNeumann
+from ..functions.density import Expectation, Modulated, VonNeumann
 from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
 from ..functions.warmth import Reservoir, Warmth
 from ..functions.with_baths import WithBaths
@@ -37,8 +37,9 @@ class QuantumSystem(System):
 
     Parameters
     ----------
-    hamiltonian : array, shape (N, N), or function from t to one
-        H, Hermitian (energy; hbar = 1, so the unit of time is 1 / energy). It may be a ``Qobj`` of QuTiP.
+    hamiltonian : array, shape (N, N), function from t to one, or list of terms
+        H, Hermitian (energy; hbar = 1, so the unit of time is 1 / energy). It may be a ``Qobj`` of QuTiP. A term is a
+        matrix, or a pair of a matrix and a real function of t: ``[H0, (H1, f)]`` is ``H0 + f(t) H1``.
     dissipation : ThermalJumps, SteepestEntropyAscent, or a list of them; optional
         The part of the motion that produces entropy.
     baths : HeatBaths, optional
@@ -341,6 +342,8 @@ class QuantumSystem(System):
 
 def _energy(hamiltonian) -> tuple[int, Energy]:
     """The size of a Hamiltonian, and ``tr(rho H)`` of coordinates."""
+    if isinstance(hamiltonian, list | tuple) and any(map(_is_term, hamiltonian)):
+        return _sum_of_terms(hamiltonian)
     if callable(hamiltonian) and not callable(getattr(hamiltonian, "full", None)):
         for t in TIMES:
             found = checked_hermitian(np.asarray(hamiltonian(t)), f"the Hamiltonian at t = {t:.3g}")
@@ -352,6 +355,39 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         return len(H), Linear(jnp.asarray(mf.DensityMatrices(len(H)).vector(H)))
+
+
+def _is_term(part) -> bool:
+    """Whether it is a matrix, or begins with one, and not a row of numbers."""
+    if isinstance(part, list | tuple):
+        return bool(part) and (isinstance(part[0], list | tuple) or _is_term(part[0]))
+    return hasattr(part, "full") or np.ndim(part) == 2
+
+
+def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
+    """The same for ``[H0, (H1, f), ...]``."""
+    constant, moved, functions = [], [], []
+    for i, part in enumerate(given):
+        pair = isinstance(part, list | tuple) and len(part) == 2 and callable(part[1])
+        H, f = part if pair else (part, None)
+        if isinstance(H, list | tuple) and H and _is_term(H[0]):
+            raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
+        H = checked_hermitian(H, f"term {i} of the Hamiltonian")
+        if H.shape != (first := (constant + moved + [H])[0]).shape:
+            raise InputError(f"term {i} of the Hamiltonian has shape {H.shape}, and another one {first.shape}")
+        if f is None:
+            constant.append(H)
+            continue
+        value = f(TIMES[0])
+        if np.shape(value) or jnp.result_type(value).kind not in "fiu":
+            raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
+        moved.append(H)
+        functions.append(f)
+    structure = mf.DensityMatrices(len(H))
+    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+        still, *rows = (jnp.asarray(structure.vector(a)) for a in (sum(constant, np.zeros_like(H)), *moved))
+    energy = TimeDependent(Modulated(still, tuple(rows), tuple(functions))) if moved else Linear(still)
+    return structure.size, energy
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:
