@@ -11,6 +11,7 @@ import scipy.linalg
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.engines.rules import RULES
 
 LOWER = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=complex)
 X, Y, Z = (np.array(m, dtype=complex) for m in ([[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]))
@@ -202,6 +203,65 @@ def test_a_finite_bath():
     assert np.abs(np.trace(q.density(solution.x), axis1=-2, axis2=-1) - 1.0).max() <= 1e-14
 
 
+def levels(n, couplings, baths=None):
+    return lt.QuantumSystem(random_hermitian(n), couplings, baths)
+
+
+TWO = [lt.ThermalJumps([(FULL[:2, :2], RATE)]), lt.ThermalJumps([(FULL[1:, 1:], 0.1)], bath=1)]
+ALL = {
+    "no dissipation": lambda: levels(3, None),
+    "an infinite bath": lambda: levels(3, lt.ThermalJumps([(FULL, RATE)]), infinite()),
+    "a finite bath": lambda: levels(2, TWO[0], lt.HeatBaths(capacity=0.8, temperature=T)),
+    "two infinite baths": lambda: levels(2, TWO, lt.HeatBaths(capacity=[np.inf] * 2, temperature=[T, 1.1], number=2)),
+    "two finite baths": lambda: levels(2, TWO, lt.HeatBaths(capacity=[0.8, 2.0], temperature=[T, 1.1], number=2)),
+    "dephasing": lambda: levels(3, lt.ThermalJumps([(random_hermitian(3) @ random_hermitian(3), 0.05)])),
+    "unital noise": lambda: levels(3, lt.ThermalJumps([(FULL, 0.1)])),
+    "steepest ascent": lambda: levels(3, lt.SteepestEntropyAscent(0.4)),
+    "steepest ascent with a floor": lambda: lt.QuantumSystem(
+        random_hermitian(3), lt.SteepestEntropyAscent(0.4), entropy=lt.VonNeumann(floor=1e-12)
+    ),
+}
+STEPS = {
+    "Taylor": lt.MetriplecticTaylor(8),
+    "midpoint": lt.MetriplecticMidpoint(),
+    "explicit": lt.MetriplecticRungeKutta(4),
+    "Gauss": lt.MetriplecticGauss(2),
+}
+CROSSED = [
+    (name, by)
+    for name in ALL
+    for by in STEPS
+    if by != "Taylor" or not name.startswith(("no dissipation", "steepest"))  # refused: no series of the entropy
+]
+
+
+@pytest.mark.sampled("a finite bath-Taylor", "dephasing-midpoint", "unital noise-explicit")
+@pytest.mark.parametrize(("name", "by"), CROSSED)
+def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
+    """From random states; and from one next to a pure state, at which steps may be refused."""
+    q = ALL[name]()
+    size = q.structure.size
+    pure = np.array([0.6, 0.8j, 0.0])[:size]
+    states = [
+        q.state(pure, mixed=1e-3),
+        *(q.state(0.7 * random_density(size, i) + 0.3 * np.eye(size) / size) for i in range(5)),
+    ]
+    many = lt.ensemble(q, np.stack(states), (0.0, 3.0), 0.05, STEPS[by], outputs="trajectory")
+    assert many.ok[1:].all()
+    for i, kept in enumerate(np.isfinite(many.x).all(axis=2)):
+        assert many.ok[i] or "step" in many.message(i)
+        x, E, S = many.x[i, kept], many.energy[i, kept], many.entropy[i, kept]
+        rho = np.asarray(q.density(x))
+        assert np.array_equal(rho, rho.conj().swapaxes(-1, -2))
+        assert np.abs(np.trace(rho, axis1=-2, axis2=-1) - 1.0).max() <= 1e-13
+        assert np.linalg.eigvalsh(rho).min() >= -1e-14
+        assert q.energy_law is None or np.abs(E - E[0]).max() <= 1e-13
+        if q.entropy_law == "nondecreasing":
+            assert np.diff(S).min(initial=0.0) >= -2e-15
+        elif "entropy" not in many.laws.inexact:  # next to a pure state its gradient is steep
+            assert np.abs(np.diff(S)).max(initial=0.0) <= (2e-15 if i else 2 * RULES.corrected)
+
+
 def steepest(rho, H, rate, others=()):
     """Steepest ascent by a program of its own: a Gram determinant in place of a projector."""
     p, u = np.linalg.eigh(rho)
@@ -281,6 +341,28 @@ def test_a_system_is_prepared_once():
     ascent = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4, preserve=[Z]))
     for q in (qubit(), ascent):
         assert not any(isinstance(leaf, np.ndarray) for leaf in jax.tree_util.tree_leaves(q))
+
+
+def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
+    """Constant terms, pairs in tuples and in lists; and amplitudes of an ensemble, which a function hides."""
+    H0, H1, H2 = (random_hermitian(3, seed) for seed in (1, 2, 3))
+    by_terms = lt.QuantumSystem([H0, (H1, jnp.cos), [H2, lambda t: 0.3 * t], 0.5 * H0])
+    by_function = lt.QuantumSystem(lambda t: 1.5 * H0 + jnp.cos(t) * H1 + 0.3 * t * H2)
+    x = by_terms.state(random_density(3))
+    ends = [lt.integrate(q, x, (0.0, 2.0), 0.1, lt.MetriplecticMidpoint()) for q in (by_terms, by_function)]
+    assert np.abs(ends[0].x - ends[1].x).max() <= 1e-14
+    assert np.abs(ends[0].energy - ends[1].energy).max() <= 1e-14
+    assert not lt.QuantumSystem([H0, H1]).is_driven
+    assert np.array_equal(lt.QuantumSystem([H0, H1]).hamiltonians()[0], lt.QuantumSystem(H0 + H1).hamiltonians()[0])
+    assert not lt.QuantumSystem([[0.0, 1.0], [1.0, 0.0]]).is_driven
+
+    def driven(amplitude):
+        return lt.QuantumSystem([QUBIT, (X, lambda t: amplitude * jnp.cos(t))])
+
+    x = driven(0.4).state(RHO)
+    many = lt.ensemble(driven, x, (0.0, 1.0), 0.1, lt.MetriplecticMidpoint(), parameters=np.array([0.1, 0.4]))
+    alone = lt.integrate(driven(0.4), x, (0.0, 1.0), 0.1, lt.MetriplecticMidpoint())
+    assert np.abs(many.x[1] - alone.x[-1]).max() <= 1e-15
 
 
 def test_products_and_partial_traces():
@@ -440,6 +522,11 @@ def test_ensembles_over_rates_and_states():
 
 
 BAD = {
+    "term 1 of the Hamiltonian is not Hermitian": lambda q: lt.QuantumSystem([QUBIT, (LOWER, jnp.cos)]),
+    "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
+    "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
+    "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
+    "of term 1 of the Hamiltonian gives a real number": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t: 1j * t)]),
     "Hermitian": lambda q: lt.QuantumSystem(LOWER),
     "square": lambda q: lt.QuantumSystem(np.ones((2, 3))),
     r"V\[0\] has shape \(3, 3\)": lambda q: lt.QuantumSystem(
