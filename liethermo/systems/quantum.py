@@ -366,7 +366,9 @@ def _is_term(part) -> bool:
 
 def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
     """The same for ``[H0, (H1, f), ...]``."""
-    constant, moved, functions = [], [], []
+    constant: list[np.ndarray] = []
+    moved: list[np.ndarray] = []
+    functions = []
     for i, part in enumerate(given):
         pair = isinstance(part, list | tuple) and len(part) == 2 and callable(part[1])
         H, f = part if pair else (part, None)
