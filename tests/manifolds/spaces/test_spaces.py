@@ -457,6 +457,7 @@ def test_neighbours_keep_their_relative_accuracy():
 @pytest.mark.parametrize("space", [named(space, slow=True) for space in mf.registered_spaces()])
 def test_derivatives_at_zero_and_elsewhere(space):
     """``c -> log(exp(c))`` is the identity: its first derivative is I and its second 0, forward and reverse."""
+    needs_geodesics(space)
     x = space.random(21)
 
     def round_trip(c):
