@@ -41,13 +41,13 @@ class Problem(NamedTuple):
     about: str
     rates: Callable
     start: Callable[[np.random.Generator], np.ndarray]
-    end: float
     step: float
-    number: int
     steps: int
-    seeds: int
     poisson: mf.PoissonStructure
     entropy: Callable
+    end: float = 8.0
+    number: int = 100
+    seeds: int = 3
 
 
 def _gas(t, x):
@@ -78,11 +78,8 @@ PROBLEMS = {
         "descents end at losses about ten times larger, and more neurons do not help.",
         _gas,
         lambda r: np.array([1.0, 0.0, 2.0, 2.0]) + r.uniform(-1.0, 1.0, 4) * [0.8, 1.0, 1.0, 1.0],
-        8.0,
         0.02,
-        100,
         8000,
-        3,
         lt.learn.Poisson.canonical(1, 4),
         lambda x: x[2] + x[3],
     ),
@@ -93,11 +90,8 @@ PROBLEMS = {
         "larger.",
         _pendulum,
         lambda r: np.array([1.0, 0.0, 2.1, 0.0, 0.0, 0.5, 0.0, 1.0, 0.2, 0.4]) + r.uniform(-0.2, 0.2, 10),
-        8.0,
         0.05,
-        100,
         4000,
-        3,
         lt.learn.Poisson.canonical(4, 10),
         lambda x: x[8] + x[9],
     ),

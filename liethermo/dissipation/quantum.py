@@ -145,7 +145,7 @@ class ThermalJumps(Dissipation):
             kept = all(_small(_commutator(H, V), H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
             return self._replaced(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
         vectors = _eigenvectors(hamiltonians[0])
-        inside = [vectors.conj().T @ H @ vectors for H in hamiltonians]
+        inside = [adjoint(vectors) @ H @ vectors for H in hamiltonians]
         found = [_split(V, i, inside, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
         jumps = tuple(itertools.chain.from_iterable(found))
@@ -343,19 +343,24 @@ def _stacked(jumps: tuple[Jump, ...]) -> np.ndarray:
     return found if found.imag.any() else found.real
 
 
+def _both(jumps: tuple[Jump, ...]) -> np.ndarray:
+    """The matrices of jumps, and then their adjoints."""
+    fixed = _stacked(jumps)
+    return np.concatenate([fixed, adjoint(fixed)])
+
+
 @functools.lru_cache(maxsize=64)
 def _left(jumps: tuple[Jump, ...]) -> np.ndarray:
     """``V^H V`` of each jump, and then of each adjoint."""
-    fixed = _stacked(jumps)
-    return np.concatenate([adjoint(fixed) @ fixed, fixed @ adjoint(fixed)])
+    both = _both(jumps)
+    return adjoint(both) @ both
 
 
 def _jumped(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
     """``sum rate V rho V^H`` over the jumps and then their adjoints."""
-    fixed = _stacked(jumps)
-    both = np.concatenate([fixed, adjoint(fixed)])
     found = _table(jumps)
     if found is None:
+        both = _both(jumps)
         return jnp.sum((rates[:, None, None] * both) @ rho @ adjoint(both), axis=0)
     which, source, factors = found
     return jnp.sum(rho.ravel()[source] * (rates[which] * factors), axis=-1).reshape(rho.shape)
@@ -367,8 +372,7 @@ def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
     None where products of matrices are shorter, as with a few full matrices.
     """
-    fixed = _stacked(jumps)
-    both = np.concatenate([fixed, adjoint(fixed)])
+    both = _both(jumps)
     size = both.shape[-1]
     jump, i, j = np.nonzero(both)
     if np.sum(np.bincount(jump) ** 2) > 2 * both.size * size:

@@ -15,12 +15,11 @@ import manifolds as mf
 from ..dissipation.base import portions
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import towards
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, in_charts
-from .levels import ALONG, CORRECTIONS, LAWS, Law, corrected
+from .levels import ALONG, CORRECTIONS, LAWS, Law, corrected, correction, directions
 from .preserved import check_preserved, preserved_functions, seen_on
 
 SLOPE, ERROR, DEFECT, LEVELS, OWN = range(5)
@@ -188,9 +187,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def allowed() -> jax.Array:
-            raised = [system.raised(x, gradient) for gradient in gradients]
-            along = raised if system.surface is None else [system.surface.along(x, v) for v in raised]
-            move = towards(along, found, passes=min(len(system.blocks), 2))
+            move = correction(system, directions(system, x, gradients), found)
             near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
             return jnp.where(jnp.stack(near).all(), found, 0.0)
 

@@ -75,11 +75,6 @@ def corrected(
         ]
         return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
 
-    def directions(d, ends) -> list:
-        end = x + (compensation + d)
-        found = [system.raised(end, gradient) for gradient in ends]
-        return found if surface is None else [surface.along(end, v) for v in found]
-
     def measured(s: Ended) -> Ended:
         """What is missed with the correction that was found before, and the next one; and the lengths of directions.
 
@@ -88,14 +83,14 @@ def corrected(
         """
         d, left = landed(s.d + s.correction)
         ends = gradients(d)
-        defect, found = misses(d, ends), directions(d, ends)
+        defect, found = misses(d, ends), directions(system, x + (compensation + d), ends)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
         else:
             moved = jnp.linalg.norm(d)
             most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
             lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
-        return Ended(d, left, defect, lengths, towards(found, defect, passes=min(len(blocks), 2)))
+        return Ended(d, left, defect, lengths, correction(system, found, defect))
 
     def again(carry, _):
         s, ended = carry
@@ -117,6 +112,17 @@ def corrected(
     rounding = jax.lax.cond(ended, lambda: jnp.zeros_like(s.defect), hidden)
     vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
+
+
+def directions(system: System, x, gradients: Sequence[jax.Array]) -> list[jax.Array]:
+    """Those in which corrections of functions with these gradients at x move a state: along the surface."""
+    found, surface = [system.raised(x, gradient) for gradient in gradients], system.surface
+    return found if surface is None else [surface.along(x, v) for v in found]
+
+
+def correction(system: System, along: Sequence[jax.Array], changes: jax.Array) -> jax.Array:
+    """The displacement in the span of these directions that changes their functions by so much."""
+    return towards(along, changes, passes=min(len(system.blocks), 2))
 
 
 def ended(

@@ -248,9 +248,10 @@ class QuantumSystem(System):
                 "system entropy=lt.VonNeumann(floor=1e-12)"
             )
         gone = p <= self._floor
+        if not gone.any() or not self._has(SteepestEntropyAscent):
+            return ""
         kernel, inside = (((vectors * some[:, None]) @ adjoint(vectors)) for some in (gone, ~gone))
-        ascends = gone.any() and self._has(SteepestEntropyAscent)
-        if ascends and any(np.abs(kernel @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
+        if any(np.abs(kernel @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
             return (
                 "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends of "
                 "steps have others, by the error of a step, which steepest ascent lets grow: mix it, as in "
