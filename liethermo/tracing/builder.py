@@ -82,8 +82,8 @@ def _wrapped(a, bits: int, signed: bool):
 
 def _picked(place, *entries):
     """The entry at a place from zero; the first, or the last, where it lies outside."""
-    place = np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1)
-    return np.take_along_axis(np.stack(np.broadcast_arrays(place, *entries)[1:]), place[None], 0)[0][()]
+    place, *entries = np.broadcast_arrays(np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1), *entries)
+    return np.take_along_axis(np.stack(entries), place[None], 0)[0][()]
 
 
 SPECIAL: dict[str, Callable[..., Any]] = {
@@ -165,6 +165,39 @@ class LimitExceededError(Exception):
     """More instructions than allowed."""
 
 
+class Around:
+    """What is around a program that is one of its instructions.
+
+    Attributes
+    ----------
+    builder : Builder
+        Of that.
+    inside, outside : dict
+        The names that its variables have inside, and the inverse of that.
+    tables : dict
+        What is in its tables, by their names inside.
+    """
+
+    def __init__(self, builder: Builder):
+        self.builder = builder
+        self.inside: dict[Scalar, str] = {}
+        self.outside: dict[Scalar, Scalar] = {}
+        self.tables: dict[str, tuple[Scalar, ...]] = {}
+
+    def enter(self, a: Scalar) -> str:
+        """The name of a variable inside."""
+        if a not in self.inside:
+            self.inside[a] = name = f"x0_{len(self.inside)}"
+            self.outside[name] = a
+        return self.inside[a]
+
+    def table(self, entries: Sequence[Scalar]) -> str:
+        """The name inside of a table around, of what these are there."""
+        name = self.enter(self.builder.table([self.outside[a] if type(a) is str else a for a in entries]))
+        self.tables[name] = tuple(entries)
+        return name
+
+
 class Builder:
     """Collects instructions; each method returns the scalar that holds its result.
 
@@ -176,25 +209,22 @@ class Builder:
     ----------
     limit : int
         Instructions that it may collect.
-    around : (Builder, dict), optional
-        Of a program inside a loop, the builder of what is around it, and the names that scalars of that have inside.
+    around : Around, optional
+        What is around a program inside a loop, or in a routine.
 
     Attributes
     ----------
     routines : dict
         Functions that are written once: see :mod:`.scalarize`.
-    entries_of : dict
-        What is in the tables of what is around, by their names inside.
     """
 
-    def __init__(self, limit: int, around: tuple[Builder, dict[str, str]] | None = None):
+    def __init__(self, limit: int, around: Around | None = None):
         self.limit, self.around = limit, around
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
         self._branches: dict[tuple[str, ...], int] = {}
-        self.routines: dict[tuple, Any] = {} if around is None else around[0].routines
-        self.entries_of: dict[str, tuple[str, ...]] = {}
+        self.routines: dict[tuple, Any] = {} if around is None else around.builder.routines
         self.calls: dict[tuple, tuple] = {}
 
     @property
@@ -228,7 +258,12 @@ class Builder:
         return [a.item() if isinstance(a, np.generic | np.ndarray) else a for a in whole]
 
     def table(self, entries: Sequence[Scalar]) -> str:
-        """Entries as one variable, which a loop reads by their numbers: what another loop has made is left as it is."""
+        """Entries as one variable, which a loop reads by their numbers: what another loop has made is left as it is.
+
+        Inside a loop those of what is around it are a table there: it is made once.
+        """
+        if self.around is not None and not any(type(a) is str and a not in self.around.outside for a in entries):
+            return self.around.table(entries)
         first = self._made(entries[0]) if entries else None
         if first is not None and first.op == "item":
             whole, start = first.args[0], int(first.args[1])
@@ -242,23 +277,10 @@ class Builder:
         None where one is no input.
         """
         if self.around is not None:
-            outer, entered = self.around
-            inverse = {inner: a for a, inner in entered.items()}
-            outside = [inverse.get(a, 0.0) if isinstance(a, str) else a for a in entries]
-            return outer.given(outside)
+            return self.around.builder.given([self.around.outside.get(a, 0.0) for a in entries])
         if not all(type(a) is str and a[0] == "x" for a in entries):
             return None
         return [(int(place), int(number)) for place, number in (str(a)[1:].split("_") for a in entries)]
-
-    def held(self, entries: Sequence[str]) -> str:
-        """A table of such inputs, of the outermost program, as it is known here."""
-        if self.around is None:
-            return self.table(entries)
-        outer, entered = self.around
-        inverse = {inner: a for a, inner in entered.items()}
-        name = entered.setdefault(outer.held([inverse[a] for a in entries]), f"x0_{len(entered)}")
-        self.entries_of[name] = tuple(entries)
-        return name
 
     def _made(self, a: Scalar) -> Instruction | None:
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None

@@ -72,7 +72,7 @@ def held(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
     rows, columns = x.shape
     for steps in ((columns, 1), (1, rows)):
         if (numbers - numbers[0, 0] == np.add.outer(steps[0] * np.arange(rows), steps[1] * np.arange(columns))).all():
-            return b.held([names[i] for i in np.argsort(numbers, axis=None)]), steps
+            return b.table([names[i] for i in np.argsort(numbers, axis=None)]), steps
     return None
 
 

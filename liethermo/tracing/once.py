@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from .builder import Builder, Scalar
+from .builder import Around, Builder, Scalar
 from .calls import Product
 from .complex_numbers import arranged, flat, kinds
 from .primitives import OF_HELD
@@ -77,14 +77,14 @@ class _Once:
 
     @classmethod
     def of(cls, b, unroll, closed, arguments, avals, made, kept) -> _Once | None:
-        held: dict[str, str] = {}
         names: dict[str, int] = {}  # inside, and where they are among the arguments
-        own, entered, count = Builder(b.limit, (b, held)), [], 0
+        around = Around(b)
+        own, entered, count = Builder(b.limit, around), [], 0
         for x, aval, is_held in zip(arguments, avals, kept, strict=True):
             entries: list[Scalar] = []
             for kind, a in zip(kinds([aval]), flat([x]), strict=True):
                 if type(a) in (str, float):
-                    name = held.setdefault(str(a), f"x0_{len(held)}") if is_held else f"x1_{count}"
+                    name = around.enter(a) if is_held else f"x1_{count}"
                     names.setdefault(name, count)
                     a = _of_kind(own, kind, name)
                 entries.append(a)
@@ -99,7 +99,9 @@ class _Once:
         instructions, renamed = live(own.instructions, computed)
         used = list(dict.fromkeys(str(a) for i in instructions for a in i.args if type(a) is str and a[0] == "x"))
         program = Program((tuple(used),), instructions, (tuple(renamed[a] for a in computed),), ((len(computed),),))
-        given = tuple(names[a] if a in names else tuple(names[entry] for entry in own.entries_of[a]) for a in used)
+        given = tuple(
+            names[a] if a in names else tuple(names.get(entry, (entry,)) for entry in around.tables[a]) for a in used
+        )
         order = {a: i for i, a in enumerate(computed)}
         said = tuple(
             ("number", a) if type(a) is not str else ("argument", names[a]) if a in names else ("result", order[a])
@@ -108,7 +110,10 @@ class _Once:
         return cls(Routine(program), given, said)
 
     def called(self, b: Builder, scalars: Sequence[Scalar], made) -> list[np.ndarray]:
-        args = [scalars[i] if isinstance(i, int) else b.held([str(scalars[j]) for j in i]) for i in self.given]
+        args = [
+            scalars[i] if isinstance(i, int) else b.table([scalars[j] if isinstance(j, int) else j[0] for j in i])
+            for i in self.given
+        ]
         found, entries = b.block(self.routine, *args), []
         for kind, (what, a) in zip(kinds(made), self.results, strict=True):
             if what == "result":

@@ -292,7 +292,7 @@ def kinds_of(instructions: Sequence[Instruction]) -> dict[Scalar, str]:
         elif op in ("item", "column"):
             kinds[target] = blocks[args[0]].kinds[int(args[1])]
         elif op == "lookup":
-            kinds[target] = kinds[args[1]]
+            kinds[target] = kinds.get(args[1], "f")
         elif op in TESTS or op == "branch":
             kinds[target] = "b"
         elif op in ("int", "truncate", "quotient", "wrap"):

@@ -22,7 +22,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
-from .builder import Builder, LimitExceededError, Scalar, array, constant, elementwise
+from .builder import Around, Builder, LimitExceededError, Scalar, array, constant, elementwise
 from .complex_numbers import ComplexBuilder, arranged, flat, kinds
 from .once import has_products, written_once
 from .primitives import PARAMETERS, RULES
@@ -286,27 +286,21 @@ def _cond(b, eqn, index, *arguments):
     return chosen
 
 
-class _Inside:
-    """A program inside a loop, while it is made: the scalars around it that it reads are its first input.
-
-    Attributes
-    ----------
-    outer : dict
-        The names that those have inside.
-    """
-
-    def __init__(self, around: Builder):
-        self.around = around
-        self.outer: dict[str, str] = {}
+class _Inside(Around):
+    """A program inside a loop, while it is made: the scalars around it that it reads are its first input."""
 
     def entered(self, arrays: Sequence[np.ndarray], avals: Sequence) -> list[np.ndarray]:
         """Arrays as they are known inside."""
-        inner = (self.outer.setdefault(a, f"x0_{len(self.outer)}") if type(a) is str else a for a in flat(arrays))
-        return arranged(inner, avals)
+        return arranged((self.enter(a) if type(a) is str else a for a in flat(arrays)), avals)
 
     def unrolled(self, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> tuple[Builder, list[np.ndarray]]:
-        own = Builder(self.around.limit, (self.around, self.outer))
+        own = Builder(self.builder.limit, self)
         return own, _unroll(own, closed.jaxpr, closed.consts, arguments)
+
+    def read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
+        """What these programs with these results read: other passes have asked for more."""
+        names = {*results, *(a for b in builders for i in b.instructions for a in i.args)}
+        return {a: name for a, name in self.inside.items() if name in names}
 
 
 class _Carried:
@@ -378,14 +372,15 @@ def _while(b, eqn, *arguments):
         goes_on = testing.op("or", goes_on, one)
     if goes_on is False:
         return list(arguments[m:])
-    inputs = [tuple(inside.outer.values()), tuple(carried.entries[i] for i in carried.moving)]
     new = flat(results)
+    read = inside.read((testing, making), [goes_on, *new])
+    inputs = [read.values(), [carried.entries[i] for i in carried.moving]]
     loop = While(
         _program(testing, inputs, [[goes_on]], [()]),
         _program(making, inputs, [[new[i] for i in carried.moving]], [(len(carried.moving),)]).factored([1]),
         carried.kinds,
     )
-    return carried.after(b.block(loop, *inside.outer, *(carried.start[i] for i in carried.moving)))
+    return carried.after(b.block(loop, *read, *(carried.start[i] for i in carried.moving)))
 
 
 def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
@@ -449,12 +444,13 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
         if len(typical.instructions) * length <= HEAVY:
             return None
     moving, new, made = carried.moving, flat(results[: len(start)]), flat(results[len(start) :])
-    inputs = [tuple(inside.outer.values()), [carried.entries[i] for i in moving], names]
+    read = inside.read([own], [*new, *made])
+    inputs = [read.values(), [carried.entries[i] for i in moving], names]
     body = _program(own, inputs, [[new[i] for i in moving], made], [(len(moving),), (len(made),)])
     out = [var.aval for var in closed.jaxpr.outvars[len(start) :]]
     loop = Scan(length, eqn.params["reverse"], body, carried.kinds, kinds(out))
     tables = [b.table(column) for column in columns]
-    found = b.block(loop, *inside.outer, *(carried.start[i] for i in moving), *tables)
+    found = b.block(loop, *read, *(carried.start[i] for i in moving), *tables)
     rest = found[len(moving) :]
     each = [arranged((rest[j * length + i] for j in range(len(made))), out) for i in range(length)]
     stacked = [

@@ -121,7 +121,17 @@ def _scan(writer: Any, loop: Scan, args: Sequence[Any]) -> Results:
 
 
 class Table:
-    """Values of one kind in memory, by their numbers."""
+    """Values of one kind in memory, by their numbers.
+
+    Parameters
+    ----------
+    kind : ir.Type
+        A number, where lanes have several, is the same for all.
+    values : sequence of values, optional
+        What it holds; written there, or a constant.
+    length, start, step : int, value, int
+        How many there are, without values; where the first lies, and how far apart they are, if they lie somewhere.
+    """
 
     def __init__(
         self,
@@ -130,8 +140,9 @@ class Table:
         values: Sequence[ir.Value] = (),
         length: int = 0,
         start: ir.Value | None = None,
+        step: int = 1,
     ):
-        self.build, self.kind, self.writer = writer.builder, kind, writer
+        self.build, self.kind, self.writer, self.step = writer.builder, kind, writer, step
         self.length = max(len(values), length)
         self.widened = writer.kinds["i"] if kind == writer.kinds["b"] else None  # bits are awkward in memory
         if start is not None:
@@ -148,8 +159,24 @@ class Table:
         for i, value in enumerate(values):
             self.write(writer.whole_number(i), value)
 
+    def elsewhere(self, writer: Any, start: ir.Value) -> Table:
+        """The same in another function, which is told where it starts."""
+        return Table(writer, self.kind, length=self.length, start=start, step=self.step)
+
+    @property
+    def form(self) -> tuple:
+        """What a function that is given it has to know."""
+        return str(self.start.type), self.length, self.step
+
+    def _place(self, i: ir.Value) -> ir.Value:
+        if self.step != 1:
+            i = self.build.mul(i, self.writer.whole_number(self.step))
+        return self.build.gep(self.start, [i])
+
     def read(self, i: ir.Value) -> ir.Value:
-        found = self.build.load(self.build.gep(self.start, [i]))
+        found = self.build.load(self._place(i))
+        if isinstance(self.kind, ir.DoubleType):
+            return self.writer.splat(found)
         return self.build.trunc(found, self.kind) if self.widened else found
 
     def of_each_lane(self, places: ir.Value) -> ir.Value:
@@ -157,41 +184,19 @@ class Table:
         build, lanes, places = self.build, self.writer.lanes, inside(self.writer, places, self.length)
         if lanes == 1:
             return self.read(places)
-        kind = self.widened or self.kind
-        start = build.bitcast(self.start, kind.element.as_pointer())
-        found = ir.Constant(kind, ir.Undefined)
+        found: Any = None
         for lane in range(lanes):
             at = ir.Constant(PLACE, lane)
-            own = build.mul(build.extract_element(places, at), self.writer.whole_number(lanes))
-            value = build.load(build.gep(start, [build.add(own, self.writer.whole_number(lane))]))
-            found = build.insert_element(found, value, at)
+            value = build.load(self._place(build.extract_element(places, at)))
+            if isinstance(value.type, ir.VectorType):
+                value = build.extract_element(value, at)
+            kind = ir.VectorType(value.type, lanes)
+            found = build.insert_element(ir.Constant(kind, ir.Undefined) if found is None else found, value, at)
         return build.trunc(found, self.kind) if self.widened else found
 
     def write(self, i: ir.Value, value: ir.Value) -> None:
         value = self.build.zext(value, self.widened) if self.widened else value
-        self.build.store(value, self.build.gep(self.start, [i]))
-
-
-class Given:
-    """Numbers in memory that are the same for all lanes, such as parameters: nothing is copied."""
-
-    def __init__(self, writer: Any, start: ir.Value, length: int):
-        self.writer, self.start, self.length = writer, start, length
-
-    def read(self, i: ir.Value) -> ir.Value:
-        return self.writer.splat(self.writer.builder.load(self.writer.builder.gep(self.start, [i])))
-
-    def of_each_lane(self, places: ir.Value) -> ir.Value:
-        """What each lane has at a place of its own, or at the nearest."""
-        writer, build, places = self.writer, self.writer.builder, inside(self.writer, places, self.length)
-        if writer.lanes == 1:
-            return self.read(places)
-        found = ir.Constant(writer.number, ir.Undefined)
-        for lane in range(writer.lanes):
-            at = ir.Constant(PLACE, lane)
-            value = build.load(build.gep(self.start, [build.extract_element(places, at)]))
-            found = build.insert_element(found, value, at)
-        return found
+        self.build.store(value, self._place(i))
 
 
 class Results:
@@ -219,29 +224,24 @@ def table(writer: Any, values: Sequence[ir.Value]) -> Table:
 def _routine(writer: Any, routine: Routine, args: Sequence[Any]) -> Results:
     """By a function of its own, which all that need it call: numbers are handed over in memory, tables stay there."""
     build, count = writer.builder, len(routine.kinds)
-    tables = {i: a for i, a in enumerate(args) if isinstance(a, Table | Given)}
+    tables = {i: a for i, a in enumerate(args) if isinstance(a, Table)}
     numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
     given, found = Table(writer, writer.number, numbers, length=1), Table(writer, writer.number, length=count)
-    said = repr((routine, *((i, type(a).__name__, str(a.start.type)) for i, a in tables.items())))
+    said = repr((routine, *((i, a.form) for i, a in tables.items())))
     name = "routine_" + hashlib.sha256(said.encode()).hexdigest()[:16]
     function = build.module.globals.get(name) or _written(writer, routine, name, tables)
     build.call(function, [given.start, found.start, *(a.start for a in tables.values())])
     return Results([], [found], count)
 
 
-def _written(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table | Given]) -> ir.Function:
+def _written(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
     kinds = [writer.number.as_pointer()] * 2 + [a.start.type for a in tables.values()]
     function = ir.Function(writer.builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
     function.linkage = "internal"
     function.attributes.add("noinline")
     inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
     build, (given, found, *starts) = inside.builder, function.args
-    own: dict[int, Table | Given] = {}
-    for (i, a), start in zip(tables.items(), starts, strict=True):
-        if isinstance(a, Given):
-            own[i] = Given(inside, start, a.length)
-        else:
-            own[i] = Table(inside, a.kind, length=a.length, start=start)
+    own = {i: a.elsewhere(inside, start) for (i, a), start in zip(tables.items(), starts, strict=True)}
     order = {j: i for i, j in enumerate(j for j in range(len(routine.program.inputs[0])) if j not in tables)}
 
     def read(i: int, j: int) -> Any:
@@ -257,34 +257,33 @@ BESIDE = 8
 """Sums of a product of matrices that are made at a time: each waits for its own last term alone."""
 
 
-def _product(writer: Any, block: Product, args: Sequence[Table | Given]) -> Results:
+def _product(writer: Any, block: Product, args: Sequence[Table]) -> Results:
     """By a function of its own for these sizes; its sums are in the order of their terms."""
     build, (m, _, n) = writer.builder, block.sizes
     found = Table(writer, writer.number, length=m * n)
-    kinds = [a.start.type for a in args]
-    said = repr((block.sizes, block.steps, *map(str, kinds)))
+    said = repr((block.sizes, block.steps, *(a.form for a in args)))
     name = "product_" + hashlib.sha256(said.encode()).hexdigest()[:16]
-    function = build.module.globals.get(name) or _product_function(writer, block, kinds, name)
+    function = build.module.globals.get(name) or _product_function(writer, block, args, name)
     build.call(function, [*(a.start for a in args), found.start])
     return Results([], [found], m * n)
 
 
-def _product_function(writer: Any, block: Product, kinds: Sequence[ir.Type], name: str) -> ir.Function:
+def _product_function(writer: Any, block: Product, tables: Sequence[Table], name: str) -> ir.Function:
     m, k, n = block.sizes
-    signature = ir.FunctionType(ir.VoidType(), [*kinds, writer.number.as_pointer()])
+    signature = ir.FunctionType(ir.VoidType(), [*(a.start.type for a in tables), writer.number.as_pointer()])
     function = ir.Function(writer.builder.module, signature, name)
     function.linkage = "internal"
     function.attributes.add("noinline")
     inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
     build, number = inside.builder, inside.whole_number
-    *given, out = function.args
+    *starts, out = function.args
+    given = [a.elsewhere(inside, start) for a, start in zip(tables, starts, strict=True)]
     by_rows = m >= n  # which sums stand beside each other
 
     def entry(which: int, i: ir.Value, j: ir.Value) -> ir.Value:
         rows, columns = block.steps[which]
         place = build.add(build.mul(i, number(rows)), build.mul(j, number(columns)))
-        value = build.load(build.gep(given[which], [place]))
-        return value if value.type == inside.number else inside.splat(value)
+        return given[which].read(place)
 
     def sums(first: ir.Value, other: ir.Value, width: int) -> None:
         places = [build.add(first, number(w)) for w in range(width)]

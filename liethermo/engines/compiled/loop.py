@@ -18,6 +18,7 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.program import Program
+from .blocks import Table
 from .machine_code import MachineCode
 from .writer import NUMBER, WHOLE, Writer
 
@@ -229,10 +230,15 @@ class _Steps(Writer):
             array = piece.arguments[i]
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
-        def memory(i: int, j: int, count: int) -> ir.Value | None:
-            if piece.arguments[i] != "p" or any(own is not None for own in self.own[j : j + count]):
+        def memory(i: int, places: range) -> Table | None:
+            own = [self.own[j] for j in places]
+            if piece.arguments[i] != "p" or own.count(None) not in (0, len(own)):
                 return None
-            return build.gep(self.argument["p"], [self.whole_number(j)])
+            if own[0] is None:
+                start, kind = build.gep(self.argument["p"], [self.whole_number(places[0])]), NUMBER
+            else:  # those of an array are all each lane's own, in the same order
+                start, kind = self.place(self.layout.rows["p"] + own[0]), self.number
+            return Table(self, kind, start=start, length=len(places), step=places.step)
 
         for array, values in zip(piece.results, self.write(piece.program, read, memory), strict=True):
             for slot, value in zip(self.slots[array], values, strict=True):

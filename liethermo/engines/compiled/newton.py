@@ -8,9 +8,10 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.program import Program
+from .blocks import Table
 from .loop import DEFERRED, NUMBERS, Layout
 from .machine_code import MachineCode
-from .writer import WHOLE, Writer
+from .writer import NUMBER, WHOLE, Writer
 
 
 def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> MachineCode:
@@ -38,9 +39,11 @@ def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> M
             return build.load(place(first + j))
         return build.load(place(block.rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.whole_number(j)]))
 
-    def memory(i: int, j: int, count: int) -> ir.Value | None:
-        shared = i == 0 and not varies[j : j + count].any()
-        return build.gep(p, [writer.whole_number(j)]) if shared else None
+    def memory(i: int, places: range) -> Table | None:
+        if i or varies[places].any():
+            return None
+        start = build.gep(p, [writer.whole_number(places[0])])
+        return Table(writer, NUMBER, start=start, length=len(places), step=places.step)
 
     for i, value in enumerate(itertools.chain.from_iterable(writer.write(program, read, memory))):
         build.store(value, place(first + i))

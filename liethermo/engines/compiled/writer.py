@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import ChainMap, Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from llvmlite import ir
@@ -14,7 +14,7 @@ from ...tracing.branches import Branch, branched
 from ...tracing.builder import Block, Instruction, Scalar
 from ...tracing.program import Program
 from ...tracing.scalarize import UnsupportedPrimitive
-from .blocks import Given, Results, Table, picked, table, write_block
+from .blocks import Results, Table, picked, table, write_block
 from .exponential import exponential
 from .lapack import SPECIAL, declared
 
@@ -33,7 +33,7 @@ LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
 
 
 Read: TypeAlias = Callable[[int, int], ir.Value]
-Memory: TypeAlias = Callable[[int, int, int], ir.Value | None]
+Memory: TypeAlias = Callable[[int, range], Table | None]
 
 
 class Writer:
@@ -69,8 +69,8 @@ class Writer:
         ----------
         read : function from the places of an array among the inputs, and of an entry in it, to its value
             Asked for what the program uses.
-        memory : function from such places and a count of entries to their place in memory, optional
-            None where they do not lie one after another, or are not the same for all lanes. Tables are read there.
+        memory : function from the place of an array among the inputs, and those of entries in it, to a table, optional
+            None where they do not lie in memory at equal distances.
         """
         return [[self._as_number(value) for value in entries] for entries in self.values(program, read, memory)]
 
@@ -296,7 +296,7 @@ class _Written:
         self.products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
         self.sizes: set[Scalar] = set()  # numbers without a sign
         self.blocks: dict[Scalar, Results] = {}
-        self.tables: dict[Scalar, Table | Given] = {}
+        self.tables: dict[Scalar, Table] = {}
 
     def value(self, a: Scalar) -> ir.Value:
         if not isinstance(a, str):
@@ -304,6 +304,10 @@ class _Written:
         if a not in self.values:
             self.values[a] = self.read(*self.places[a])
         return self.values[a]
+
+    def operand(self, a: Scalar) -> Any:
+        """A value, or a table."""
+        return self.tables.get(a) or self.value(a)
 
     def all(self, items: Sequence[Instruction | Branch]) -> None:
         for item in items:
@@ -315,7 +319,7 @@ class _Written:
     def instruction(self, instruction: Instruction) -> None:
         writer, (target, op, args) = self.writer, instruction
         if isinstance(op, Block):
-            self.blocks[target] = write_block(writer, op, [self.tables.get(a) or self.value(a) for a in args])
+            self.blocks[target] = write_block(writer, op, [self.operand(a) for a in args])
             return
         if op == "item":
             self.values[target] = self.blocks[args[0]].item(int(args[1]))
@@ -326,7 +330,7 @@ class _Written:
             self.tables[target] = made or self.blocks[args[0]].column(int(args[1]))
             return
         if op == "lookup":
-            self.values[target] = self.tables[args[1]].of_each_lane(self.value(args[0]))
+            self.values[target] = self.operand(args[1]).of_each_lane(self.value(args[0]))
             return
         if op == "wrap":
             self.values[target] = writer.wrapped(self.value(args[0]), int(args[1]), bool(args[2]))
@@ -346,14 +350,15 @@ class _Written:
         if op == "abs" or unsigned:
             self.sizes.add(target)
 
-    def given(self, names: Sequence[Scalar]) -> Given | None:
-        """A table of inputs that lie in memory one after another."""
-        places = [self.places.get(a, (-1, -1)) if isinstance(a, str) else (-1, -1) for a in names]
-        (i, first), *_ = places
-        if self.memory is None or i < 0 or places != [(i, first + n) for n in range(len(names))]:
+    def given(self, names: Sequence[Scalar]) -> Table | None:
+        """A table of inputs that lie in memory at equal distances: nothing is copied."""
+        found = [self.places[a] for a in names if a in self.places]
+        if self.memory is None or len(found) < max(len(names), 2):
             return None
-        start = self.memory(i, first, len(names))
-        return None if start is None else Given(self.writer, start, len(names))
+        arrays, (first, second, *rest) = {i for i, _ in found}, [j for _, j in found]
+        last = rest[-1] if rest else second
+        places = range(first, last + 1, second - first) if second > first else range(0)
+        return self.memory(found[0][0], places) if len(arrays) == 1 and [*places] == [first, second, *rest] else None
 
     def branch(self, branch: Branch) -> None:
         """Each side where any lane takes it, then what each lane chooses."""

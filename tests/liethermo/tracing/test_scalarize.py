@@ -24,7 +24,7 @@ import manifolds as mf
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
 from liethermo.tracing.builder import Instruction, meaning
 from liethermo.tracing.primitives import RULES
-from liethermo.tracing.program import Program
+from liethermo.tracing.program import Program, Scan
 from liethermo.tracing.scalarize import CONTROL, UnsupportedPrimitive, scalarize
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.linear import solve
@@ -485,6 +485,23 @@ def test_a_long_loop_stays_one():
     program = program_of(f, square)
     assert len(program.instructions) < 200
     assert {str(op) for op in program.operations} >= {"scan", "column"}  # the loop backwards reads what is there
+
+
+def test_a_table_that_a_loop_looks_up_is_made_once():
+    """Around it: in a pass it would cost as much as all passes."""
+    rows = jnp.asarray(np.random.default_rng(0).standard_normal((40, 3)))
+
+    def f(w, a):
+        return lax.fori_loop(0, 40, lambda i, c: c + jnp.sin(w[i] @ a), 0.0)
+
+    a = jnp.array([0.3, 1.0, -0.5])
+    program = scalarize(jax.make_jaxpr(f)(rows, a))
+    loops = [i.op for i in program.instructions if isinstance(i.op, Scan)]
+    assert [i.op for loop in loops for i in loop.body.instructions].count("lookup") == 3
+    assert not any(i.op == "table" for loop in loops for i in loop.body.instructions)
+    at = np.stack([a, 2.0 * a])
+    (found,) = program.evaluate(np.stack([rows, rows]), at, batch=True)
+    np.testing.assert_allclose(found, [f(rows, one) for one in at], rtol=1e-14)
 
 
 def test_every_rule_is_tested():
