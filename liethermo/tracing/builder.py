@@ -82,8 +82,8 @@ def _wrapped(a, bits: int, signed: bool):
 
 def _picked(place, *entries):
     """The entry at a place from zero; the first, or the last, where it lies outside."""
-    place, *entries = np.broadcast_arrays(np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1), *entries)
-    return np.take_along_axis(np.stack(entries), place[None], 0)[0][()]
+    place, *found = np.broadcast_arrays(np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1), *entries)
+    return np.take_along_axis(np.stack(found), place[None], 0)[0][()]
 
 
 SPECIAL: dict[str, Callable[..., Any]] = {
@@ -211,11 +211,6 @@ class Builder:
         Instructions that it may collect.
     around : Around, optional
         What is around a program inside a loop, or in a routine.
-
-    Attributes
-    ----------
-    routines : dict
-        Functions that are written once: see :mod:`.scalarize`.
     """
 
     def __init__(self, limit: int, around: Around | None = None):
@@ -224,7 +219,6 @@ class Builder:
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
         self._branches: dict[tuple[str, ...], int] = {}
-        self.routines: dict[tuple, Any] = {} if around is None else around.builder.routines
         self.calls: dict[tuple, tuple] = {}
 
     @property

@@ -1,11 +1,10 @@
-"""Functions with products of matrices, such as networks, as routines that are written once."""
+"""Functions that are written once, as routines: those with products of matrices, such as networks, and long ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
@@ -15,9 +14,12 @@ from .calls import Product
 from .complex_numbers import arranged, flat, kinds
 from .primitives import OF_HELD
 from .program import Program, Routine, live
+from .remembered import Latest
 
-FEW = 2
-"""Products of matrices as loops from which a function is worth a routine."""
+FEW, LONG = 2, 500
+"""Products of matrices as loops, or instructions, from which a function is worth a routine."""
+
+_routines: Latest[tuple] = Latest(256)
 
 
 def has_products(jaxpr) -> bool:
@@ -32,9 +34,9 @@ def has_products(jaxpr) -> bool:
 
 
 def written_once(
-    b: Builder, unroll: Callable, closed: ClosedJaxpr, arguments: Sequence[np.ndarray], avals: Sequence, made: Sequence
-) -> list[np.ndarray] | None:
-    """The results of a function with products of matrices, such as a network, by a routine; None where it is short.
+    b: Builder, unroll: Callable, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """The results of a function, by a routine where that is worth it.
 
     Calls of one function, jitted, have one routine, whatever is known of the numbers that they hand over. Matrices
     that lie in memory as they are given, such as weights, stay there.
@@ -43,18 +45,14 @@ def written_once(
     ----------
     unroll : function
         What unrolls a jaxpr: that of :mod:`.scalarize`.
-    avals, made : sequence
-        The types of the arguments, and of the results.
     """
-    kept = [x.ndim > 1 and b.given(x.ravel().tolist()) is not None for x in arguments]
     scalars = flat(arguments)
+    held = [b.given(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
     known = [a if type(a) in (int, bool) else None for a in scalars]
-    places = [tuple(b.given(x.ravel().tolist()) or ()) if held else () for x, held in zip(arguments, kept, strict=True)]
-    key = (id(closed), tuple(places), tuple(known))
-    if key not in b.routines:
-        b.routines[key] = closed, _Once.of(b, unroll, closed, arguments, avals, made, kept)
-    once = b.routines[key][1]
-    return None if once is None else once.called(b, scalars, made)
+    key = id(closed), tuple(None if place is None else tuple(place) for place in held), tuple(map(repr, known))
+    # with the jaxpr, so that no other takes its place
+    once = _routines.find(key, lambda: (closed, _Once.of(b, unroll, closed, arguments, held)))[1]
+    return unroll(b, closed.jaxpr, closed.consts, arguments) if once is None else once.called(b, scalars, closed)
 
 
 @dataclass(frozen=True)
@@ -64,62 +62,52 @@ class _Once:
     Attributes
     ----------
     routine : Routine
-    given : tuple of (int or tuple of int)
-        What the routine is given: the places, among all entries of the arguments, of a number, or of those of a table.
-    results : tuple of (str, scalar)
-        For each entry of the results ``"result"`` and its place among those of the routine, ``"argument"`` and its
-        place among the entries of the arguments, or ``"number"`` and the number that it is.
+    given : tuple of (int or tuple)
+        What the routine is given: the place, among all entries of the arguments, of a number; or those of what is in a
+        table, a number that is known standing for itself, in a tuple.
+    results : tuple of (scalar, (int) or None)
+        For each entry of the results what it is, where that is known, or in a tuple its place among all entries of the
+        arguments; others are those of the routine, in order.
     """
 
     routine: Routine
-    given: tuple[int | tuple[int, ...], ...]
-    results: tuple[tuple[str, Any], ...]
+    given: tuple[int | tuple[int | tuple[Scalar], ...], ...]
+    results: tuple[Scalar | tuple[int] | None, ...]
 
     @classmethod
-    def of(cls, b, unroll, closed, arguments, avals, made, kept) -> _Once | None:
-        names: dict[str, int] = {}  # inside, and where they are among the arguments
-        around = Around(b)
-        own, entered, count = Builder(b.limit, around), [], 0
-        for x, aval, is_held in zip(arguments, avals, kept, strict=True):
-            entries: list[Scalar] = []
+    def of(cls, b: Builder, unroll: Callable, closed: ClosedJaxpr, arguments, held: Sequence) -> _Once | None:
+        around, names = Around(b), dict[Scalar, int]()  # inside, and where they are among the arguments
+        own, entries = Builder(b.limit, around), list[Scalar]()
+        for x, aval, place in zip(arguments, closed.in_avals, held, strict=True):
             for kind, a in zip(kinds([aval]), flat([x]), strict=True):
                 if type(a) in (str, float):
-                    name = around.enter(a) if is_held else f"x1_{count}"
-                    names.setdefault(name, count)
+                    name = f"x1_{len(entries)}" if place is None else around.enter(a)
+                    names.setdefault(name, len(entries))
                     a = _of_kind(own, kind, name)
                 entries.append(a)
-                count += 1
-            entered += arranged(iter(entries), [aval])
-        results = flat(unroll(own, closed.jaxpr, closed.consts, entered))
-        if sum(isinstance(i.op, Product) for i in own.instructions) < FEW and not any(
-            isinstance(i.op, Routine) for i in own.instructions
-        ):
+        results = flat(unroll(own, closed.jaxpr, closed.consts, arranged(iter(entries), closed.in_avals)))
+        made = [a for a in results if type(a) is str and a not in names]
+        instructions, renamed = live(own.instructions, made)
+        blocks = [i.op for i in instructions if isinstance(i.op, Product | Routine)]
+        if len(instructions) <= LONG and len(blocks) < FEW and not any(isinstance(op, Routine) for op in blocks):
             return None
-        computed: list[Scalar] = list(dict.fromkeys(a for a in results if type(a) is str and a not in names))
-        instructions, renamed = live(own.instructions, computed)
-        used = list(dict.fromkeys(str(a) for i in instructions for a in i.args if type(a) is str and a[0] == "x"))
-        program = Program((tuple(used),), instructions, (tuple(renamed[a] for a in computed),), ((len(computed),),))
-        given = tuple(
-            names[a] if a in names else tuple(names.get(entry, (entry,)) for entry in around.tables[a]) for a in used
-        )
-        order = {a: i for i, a in enumerate(computed)}
-        said = tuple(
-            ("number", a) if type(a) is not str else ("argument", names[a]) if a in names else ("result", order[a])
-            for a in results
-        )
+        used = list(dict.fromkeys(a for i in instructions for a in i.args if type(a) is str and a[0] == "x"))
+        given = tuple(names[a] if a in names else tuple(names.get(e, (e,)) for e in around.tables[a]) for a in used)
+        program = Program((tuple(used),), instructions, (tuple(renamed[a] for a in made),), ((len(made),),))
+        said = tuple((names[a],) if a in names else None if type(a) is str else a for a in results)
         return cls(Routine(program), given, said)
 
-    def called(self, b: Builder, scalars: Sequence[Scalar], made) -> list[np.ndarray]:
-        args = [
-            scalars[i] if isinstance(i, int) else b.table([scalars[j] if isinstance(j, int) else j[0] for j in i])
-            for i in self.given
-        ]
-        found, entries = b.block(self.routine, *args), []
-        for kind, (what, a) in zip(kinds(made), self.results, strict=True):
-            if what == "result":
-                a = _of_kind(b, kind, found[a])
-            entries.append(scalars[a] if what == "argument" else a)
-        return arranged(iter(entries), made)
+    def called(self, b: Builder, scalars: Sequence[Scalar], closed: ClosedJaxpr) -> list[np.ndarray]:
+        def handed(i) -> Scalar:
+            if isinstance(i, int):
+                return scalars[i]
+            return b.table([scalars[j] if isinstance(j, int) else j[0] for j in i])
+
+        found, entries = iter(b.block(self.routine, *map(handed, self.given))), list[Scalar]()
+        for kind, a in zip(kinds(closed.out_avals), self.results, strict=True):
+            known = scalars[a[0]] if isinstance(a, tuple) else a
+            entries.append(_of_kind(b, kind, next(found)) if known is None else known)
+        return arranged(iter(entries), closed.out_avals)
 
 
 def _of_kind(b: Builder, kind: str, a: Scalar) -> Scalar:

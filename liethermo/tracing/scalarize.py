@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -24,9 +23,9 @@ from manifolds.matrices import chains
 from ..errors import InputError, LiethermoError
 from .builder import Around, Builder, LimitExceededError, Scalar, array, constant, elementwise
 from .complex_numbers import ComplexBuilder, arranged, flat, kinds
-from .once import has_products, written_once
+from .once import LONG, has_products, written_once
 from .primitives import PARAMETERS, RULES
-from .program import Program, Routine, Scan, While, live
+from .program import Program, Scan, While, live
 
 LIMIT = 200_000
 """Instructions that a program may have: far more than compile in reasonable time."""
@@ -190,18 +189,15 @@ def _call(b, eqn, *arguments):
     entries = tuple(a if type(a) is str else repr(a) for a in flat(arguments))
     known = b.calls.get((id(jaxpr), entries))
     if known is None:  # with the jaxpr, so that no other takes its place
-        known = b.calls[id(jaxpr), entries] = jaxpr, _called(b, eqn, inner, arguments)
+        known = b.calls[id(jaxpr), entries] = jaxpr, _called(b, inner, arguments)
     return list(known[1])
 
 
-def _called(b, eqn, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _called(b, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     if not isinstance(inner, ClosedJaxpr):
         return _unroll(b, inner, (), arguments)
     if has_products(inner.jaxpr):
-        avals, made = ([var.aval for var in both] for both in (eqn.invars, eqn.outvars))
-        found = written_once(b, _unroll, inner, arguments, avals, made)
-        if found is not None:
-            return found
+        return written_once(b, _unroll, inner, arguments)
     return _unroll(b, inner.jaxpr, inner.consts, arguments)
 
 
@@ -209,60 +205,38 @@ def _chain(b, eqn, *arguments):
     """Functions of matrices, whose derivatives have been taken: at one place after another, by the same routines."""
     (out,), rank = (var.aval for var in eqn.outvars), arguments[0].ndim - 2
     function, slots = eqn.params["function"], eqn.params["slots"]
-    avals = [var.aval.update(shape=var.aval.shape[rank:]) for var in eqn.invars]
+    avals = [jax.ShapeDtypeStruct(var.aval.shape[rank:], var.aval.dtype) for var in eqn.invars]
     count, result = len(arguments) - len(slots), np.empty(out.shape, object)
     for place in np.ndindex(*out.shape[:rank]):
         own = [x[tuple(i if n > 1 else 0 for i, n in zip(place, x.shape, strict=False))] for x in arguments]
         given: list[np.ndarray] = []
         kinds_given: list = []
         for x, aval in zip(own[:count], avals, strict=False):  # of equal matrices once, since what is equal merges
-            found, made = _by_routine(b, _Prepared(function), [x], [aval])
-            given += found
-            kinds_given += made
-        rest = _Chain(function, slots, len(given) // count)
-        (result[place],), _ = _by_routine(b, rest, [*given, *own[count:]], [*kinds_given, *avals[count:]])
+            closed = _traced(_prepared, function, aval)
+            given += written_once(b, _unroll, closed, [x])
+            kinds_given += closed.out_avals
+        closed = _traced(_of_prepared, (function, slots, len(given) // count), *kinds_given, *avals[count:])
+        (result[place],) = written_once(b, _unroll, closed, [*given, *own[count:]])
     return result
 
 
-@dataclass(frozen=True)
-class _Prepared:
+def _prepared(function: chains.Chained, a):
     """What is prepared of a matrix for chains of a function."""
-
-    function: chains.Chained
-
-    def __call__(self, a):
-        return self.function.prepared(a, unrolled=True)
+    return function.prepared(a, unrolled=True)
 
 
-@dataclass(frozen=True)
-class _Chain:
-    """A chain of a function, from what is prepared of its matrices: so many arrays each."""
-
-    function: chains.Chained
-    slots: tuple[int, ...]
-    each: int
-
-    def __call__(self, *arguments):
-        end = len(arguments) - len(self.slots)
-        prepared = [arguments[i : i + self.each] for i in range(0, end, self.each)]
-        return (self.function.chain(prepared, self.slots, arguments[end], arguments[end + 1 :], unrolled=True),)
-
-
-def _by_routine(b, function, arguments: Sequence[np.ndarray], avals: Sequence) -> tuple[list[np.ndarray], list]:
-    """The results of a function of arrays, unrolled here or by a routine where that is long, and their types."""
-    closed, routine = _routine(function, tuple(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
-    made = [var.aval for var in closed.jaxpr.outvars]
-    if len(routine.program.instructions) <= LONG:
-        return _unroll(b, closed.jaxpr, closed.consts, arguments), made
-    return arranged(iter(b.block(routine, *flat(arguments))), made), made
+def _of_prepared(chain: tuple[chains.Chained, tuple[int, ...], int], *arguments):
+    """A chain of a function at some slots, from what is prepared of its matrices: so many arrays each."""
+    function, slots, each = chain
+    end = len(arguments) - len(slots)
+    prepared = [arguments[i : i + each] for i in range(0, end, each)]
+    return (function.chain(prepared, slots, arguments[end], arguments[end + 1 :], unrolled=True),)
 
 
 @functools.lru_cache(maxsize=256)
-def _routine(function, avals: tuple) -> tuple[ClosedJaxpr, Routine]:
-    closed = jax.make_jaxpr(function)(*avals)
-    own, names = Builder(LIMIT), [f"x0_{i}" for i in range(len(kinds(avals)))]
-    found = flat(_unroll(own, closed.jaxpr, closed.consts, arranged(iter(names), avals)))
-    return closed, Routine(_program(own, [names], [found], [(len(found),)]))
+def _traced(function, first, *avals) -> ClosedJaxpr:
+    """One object for equal functions, which have one routine."""
+    return jax.make_jaxpr(functools.partial(function, first))(*avals)
 
 
 def _linear_solve(b, eqn, *arguments):
@@ -388,10 +362,10 @@ def _lifted(tests: np.ndarray, ndim: int) -> np.ndarray:
     return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
 
 
-LONG, SHORT, HEAVY = 500, 32, 50_000
-"""Instructions of an unrolled loop from which it stays a loop; passes up to which it is short, and instructions from
-which a short one stays a loop if its passes differ: what is known of single ones, such as zeros, makes unrolled code
-the faster one. Passes that count nothing and read no table are alike, and unrolling them gains nothing."""
+SHORT, HEAVY = 32, 50_000
+"""Passes up to which a loop is short, and instructions, unrolled, from which a short one stays a loop if its passes
+differ; others do from LONG on. What is known of single ones, such as zeros, makes unrolled code the faster one. Passes
+that count nothing and read no table are alike, and unrolling them gains nothing."""
 
 
 def _scan(b, eqn, *arguments):
