@@ -160,7 +160,7 @@ class Table:
             self.write(writer.whole_number(i), value)
 
     def elsewhere(self, writer: Any, start: ir.Value) -> Table:
-        """The same in another function, which is told where it starts."""
+        """The same in another function, at an address of its own."""
         return Table(writer, self.kind, length=self.length, start=start, step=self.step)
 
     @property
