@@ -215,10 +215,10 @@ class ExplicitMethod(TransportingMethod):
         if system.has_generator:
             return system.generated(x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
+        if system.dissipation is None:
+            return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        if system.dissipation is None:
-            return system.field(x, dH, dS, dL), jnp.zeros(len(laws))
         parts = list(portions(system.dissipation, dL))
 
         def rate(law: Law) -> jax.Array:

@@ -140,7 +140,20 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     # -- the stage equations ------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        found = self._on_leaf(system, x, compensation, h, k)
+        if found is not None:
+            return found
         return jax.vmap(lambda *stage: self._slope(system, *stage))(*self._at_stages(system, x, compensation, h, k))
+
+    def _on_leaf(self, system: System, x, compensation, h, k) -> jax.Array | None:
+        """The slopes of a motion that Casimirs alone have a part in, where the structure knows the leaf through x."""
+        functions = self._kept(system) | _made_of(system)
+        casimirs = functions.keys() <= {ENTROPY, *self._casimirs(system)}
+        if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
+            return None
+        dH = self._of_energy(system, self._stages(x, compensation, h, k), x, compensation, h, k)
+        points = system.poisson.on_leaf(x + compensation, dH, h * gauss(self.number).A)
+        return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
     def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         names = tuple(system.preserved_by_name())
@@ -153,7 +166,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def _at_stages(self, system: System, x, compensation, h, k) -> tuple:
         """The stages, shape (s, n), and there what the step takes for dH, dS and the other gradients, by name."""
         A, b, _ = gauss(self.number)
-        u = x + (compensation + h * (A @ k))
+        u = self._stages(x, compensation, h, k)
 
         def at_stages(C: Energy) -> Gradients:
             plain = jax.vmap(C.gradient)(u)
@@ -162,8 +175,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             return Gradients(stage_gradients(C, x, compensation, h, k, A, b, finer(self.number)), plain)
 
         S, parts = system.entropy, _made_of(system)
-        symmetries = self._symmetries(system, u)
-        dH = stage_gradients(system.energy, x, compensation, h, k, A, b, finer(self.number), symmetries)
+        dH = self._of_energy(system, u, x, compensation, h, k)
         known = {name: at_stages(C) for name, C in (self._kept(system) | parts | system.preserved_by_name()).items()}
         if S is None:
             dS = jnp.zeros_like(k)
@@ -173,6 +185,15 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             discrete = jnp.stack([known[name].discrete for name in parts])
             dS = composed_gradients(S, list(parts.values()), discrete, x, compensation, h, k, A, b)
         return u, dH, dS, known
+
+    def _stages(self, x, compensation, h, k) -> jax.Array:
+        return x + (compensation + h * (gauss(self.number).A @ k))
+
+    def _of_energy(self, system: System, u, x, compensation, h, k) -> jax.Array:
+        """What the step takes for dH at the stages u, shape (s, n)."""
+        A, b, _ = gauss(self.number)
+        symmetries = self._symmetries(system, u)
+        return stage_gradients(system.energy, x, compensation, h, k, A, b, finer(self.number), symmetries)
 
     def _slope(self, system: System, u, dH, dS, known: dict[str, Gradients]) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""

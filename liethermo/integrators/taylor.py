@@ -104,7 +104,7 @@ class MetriplecticTaylor(ExplicitMethod):
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
-        if system.entropy is not None and not system.has_generator:
+        if system.entropy is not None and system.dissipation is not None and not system.has_generator:
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:

@@ -229,6 +229,10 @@ class _OfClock(PoissonBySharp):
     def sharp(self, x, alpha) -> jax.Array:
         return _clock(alpha, self.unit)
 
+    def on_leaf(self, x, alpha, A) -> jax.Array:
+        """Any points: the tensor is constant."""
+        return jnp.broadcast_to(x, alpha.shape)
+
 
 def _clock(dH, unit: float) -> jax.Array:
     """The velocities of t and W, shape (2,), from a gradient of the energy."""

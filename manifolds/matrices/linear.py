@@ -7,19 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 
 
+def adjoint(a):
+    """The adjoints of matrices, shape (..., n, m), those of NumPy too."""
+    return a.conj().swapaxes(-1, -2)
+
+
 def polar(a) -> jax.Array:
     """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
-    _, inverse_root, success = _square_root(a.conj().swapaxes(-1, -2) @ a)
+    _, inverse_root, success = _square_root(adjoint(a) @ a)
     u = a @ inverse_root
     for _ in range(2):  # the root squares the condition number of a
         u = orthonormalized(u)
-    success &= largest(u.conj().swapaxes(-1, -2) @ u - np.eye(a.shape[-1])) < 1e-12
+    success &= largest(adjoint(u) @ u - np.eye(a.shape[-1])) < 1e-12
     return jnp.where(success[..., None, None], u, jnp.nan)
 
 
 def orthonormalized(u) -> jax.Array:
     """One step of Newton and Schulz towards :func:`polar`: it squares the distance of ``u^H u`` from I."""
-    return 1.5 * u - 0.5 * u @ (u.conj().swapaxes(-1, -2) @ u)
+    return 1.5 * u - 0.5 * u @ (adjoint(u) @ u)
 
 
 def complement(u) -> jax.Array:
@@ -116,6 +121,23 @@ def lyapunov(g, c) -> jax.Array:
 def inverse(a) -> jax.Array:
     """Inverse matrix, with entries that are not finite where a is singular."""
     return solve(a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape))
+
+
+def turned_by(B, w, A) -> jax.Array:
+    """``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
+
+    Parameters
+    ----------
+    B : array, shape (s, n, n)
+        Skew-Hermitian matrices at the stages.
+    w : array, shape (n, n)
+    A : array, shape (s, s)
+        The matrix of a Runge-Kutta method, times the step.
+    """
+    s, n = B.shape[:2]
+    table = (A[:, None, :, None] * B.swapaxes(0, 1)).reshape(s * n, s * n)
+    stages = solve(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
+    return stages @ w @ adjoint(stages)
 
 
 def spectral_radius(X) -> jax.Array:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..matrices.linear import turned_by
 from .poisson import PoissonBySharp
 
 
@@ -49,6 +50,10 @@ class DensityMatrices(PoissonBySharp):
     def sharp(self, x, alpha) -> jax.Array:
         product = self.matrix(alpha) @ self.matrix(x)
         return self.vector(-2j * product)  # whose Hermitian part has both terms of the commutator
+
+    def on_leaf(self, x, alpha, A) -> jax.Array:
+        """``U_i rho U_i^H``, the U_i the stages of ``U' = -i H U`` from the identity; the eigenvalues of rho stay."""
+        return self.vector(turned_by(-1j * self.matrix(alpha), self.matrix(x), A))
 
 
 @functools.lru_cache(maxsize=64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import abstractmethod
 from collections.abc import Callable
 
@@ -13,7 +14,9 @@ import numpy as np
 from .._arrays import real_components
 from .._module import Module, forwarded
 from ..algebras.lie_algebra import LieAlgebra
+from ..algebras.on_demand import OnDemand
 from ..errors import ParameterError, ShapeError
+from ..matrices.linear import adjoint, turned_by
 
 
 class PoissonStructure(Module):
@@ -36,6 +39,22 @@ class PoissonStructure(Module):
     def sharp(self, x, alpha) -> jax.Array:
         """``Pi(x) alpha``, shape (n,), for a covector alpha, shape (n,)."""
         return self.tensor(x) @ alpha
+
+    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+        """Points of stages whose motions add up to one along the symplectic leaf of x, shape (s, n); None: not known.
+
+        With the weights b of a symplectic Runge-Kutta method, ``x + sum_i b_i Pi(u_i) alpha_i`` is on the leaf, and has
+        all Casimirs of x, wherever their gradients depend on each other [Modin & Viviani 2020].
+
+        Parameters
+        ----------
+        x : array, shape (n,)
+        alpha : array, shape (s, n)
+            Covectors at the stages.
+        A : array, shape (s, s)
+            The matrix of the method, times the step.
+        """
+        return None
 
     def bracket(self, f: Callable, g: Callable) -> Callable:
         """The function ``{f, g}``: ``x -> grad f @ Pi(x) @ grad g``."""
@@ -82,6 +101,31 @@ class LiePoisson(PoissonStructure):
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.algebra.ad_star(alpha, x)
+
+    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+        """Known for the matrices of u(n), su(n) and so(n)."""
+        found = _skew_matrices(self.algebra)
+        if found is None:
+            return None
+        basis, dual = found
+        turned = turned_by(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
+        return jnp.einsum("sij,aji->sa", turned, basis).real
+
+
+@functools.lru_cache(maxsize=64)
+def _skew_matrices(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray] | None:
+    """A basis of all skew-Hermitian matrices of a size, of those of trace zero or of the real ones, and its dual basis.
+
+    None of an algebra that is none of these: its group is not all that keeps a form.
+    """
+    basis = None if isinstance(algebra, OnDemand) else algebra.basis  # which may be too large to be made
+    if basis is None or np.abs(basis + adjoint(basis)).max() > 1e-14 * np.abs(basis).max():
+        return None
+    n = basis.shape[-1]
+    if algebra.dim not in ((n**2, n**2 - 1) if np.iscomplexobj(basis) else (n * (n - 1) // 2,)):
+        return None
+    products = np.einsum("aij,bji->ab", basis, basis).real
+    return basis, np.tensordot(np.linalg.inv(products), basis, 1)
 
 
 class Canonical(PoissonStructure):
@@ -180,6 +224,12 @@ class Beside(PoissonStructure):
         n = self.first.dim
         return jnp.concatenate([self.first.sharp(x[:n], alpha[:n]), self.second.sharp(x[n:], alpha[n:])])
 
+    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+        n = self.first.dim
+        first = self.first.on_leaf(x[:n], alpha[:, :n], A)
+        second = self.second.on_leaf(x[n:], alpha[:, n:], A)
+        return None if first is None or second is None else jnp.concatenate([first, second], axis=-1)
+
 
 class NoPoisson(PoissonStructure):
     """``Pi = 0``: nothing moves by itself, and every function is a Casimir."""
@@ -195,6 +245,9 @@ class NoPoisson(PoissonStructure):
 
     def sharp(self, x, alpha) -> jax.Array:
         return jnp.zeros_like(alpha)
+
+    def on_leaf(self, x, alpha, A) -> jax.Array:
+        return jnp.broadcast_to(x, alpha.shape)
 
     def jacobi_residual(self, x) -> jax.Array:
         return jnp.zeros(())
