@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
@@ -314,22 +315,17 @@ def checked_matrix(matrix, what: str) -> np.ndarray:
 def checked_hermitian(matrix, what: str) -> np.ndarray:
     """A Hermitian matrix."""
     found = checked_matrix(matrix, what)
-    residual, size = float(np.abs(found - found.conj().T).max()), float(np.abs(found).max())
+    residual, size = float(np.abs(found - adjoint(found)).max()), float(np.abs(found).max())
     if residual > 1e-12 * size:
         raise InputError(
             f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}; its Hermitian part is "
             "(A + A.conj().T) / 2"
         )
-    return (found + found.conj().T) / 2
+    return (found + adjoint(found)) / 2
 
 
 def _commutator(a, b):
     return a @ b - b @ a
-
-
-def adjoint(a: np.ndarray) -> np.ndarray:
-    """The adjoints of matrices, shape (..., n, m)."""
-    return a.conj().swapaxes(-1, -2)
 
 
 def _eigenvectors(H: np.ndarray) -> np.ndarray:
@@ -392,7 +388,7 @@ def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _hermitian(V) -> bool:
     V = np.asarray(V)
-    return bool(np.abs(V - V.conj().T).max() <= 1e-12 * np.abs(V).max())
+    return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
 
 
 def _small(residual, H, V) -> bool:

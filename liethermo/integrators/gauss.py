@@ -46,12 +46,16 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     for all smooth H, S and C and every step whose equations are solved. The order is 2s, since alpha is O(h^{2s})
     [Hairer, Lubich & Wanner, II.1].
 
-    The motion ``Pi gH`` has to keep S and C too. There are four cases:
+    The motion ``Pi gH`` has to keep S and C too. There are five cases:
 
     - A quadratic Casimir: collocation keeps it, and so it keeps an entropy that is a function of quadratic Casimirs;
       see :func:`composed_gradients`.
     - A quadratic momentum map J: d_i is k_i less its component along the symmetry ``Pi grad J``, so that gH_i is
       invariant as grad H is [Gonzalez 1996].
+    - Any other Casimir, without dissipation, where the structure knows the leaf of a state, as of density matrices,
+      u(n), su(n) and so(n): the motion is ``Pi(v_i) gH_i`` at points v_i for which x' is on the leaf of x. So all
+      Casimirs are kept, also where their gradients depend on each other [Modin & Viviani 2020;
+      :meth:`manifolds.PoissonStructure.on_leaf`].
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 
 import manifolds as mf
+from manifolds.matrices.linear import adjoint
 
 from ..errors import InputError
 from .parameters import whole
@@ -182,7 +183,7 @@ class QuantisedSphere:
         if W.shape != (self.N, self.N):
             raise InputError(f"a vorticity matrix has shape ({self.N}, {self.N}), not {W.shape}")
         size = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
-        skew, trace = float(np.linalg.norm(W + W.conj().T)) / size, float(abs(np.trace(W))) / size
+        skew, trace = float(np.linalg.norm(W + adjoint(W))) / size, float(abs(np.trace(W))) / size
         if not skew <= MOST_TRACE:
             raise InputError(f"a vorticity matrix is anti-Hermitian, and this one is not, by {skew:.3g} of its norm")
         if not trace <= MOST_TRACE:
@@ -232,7 +233,7 @@ class QuantisedSphere:
             vectors = self.harmonics(m, len(a) - 1)
             on = np.arange(self.N - m)
             W[on, on + m] = 1j * (vectors @ a[m:, m])
-        return self.algebra.from_dual_matrix(W - np.triu(W, 1).conj().T)
+        return self.algebra.from_dual_matrix(W - adjoint(np.triu(W, 1)))
 
     def coefficients(self, mu, most: int | None = None) -> np.ndarray:
         """The coefficients of a state up to degree ``most``, shape (most + 1, most + 1): see the inverse above."""

@@ -12,9 +12,10 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds.matrices.linear import adjoint
 
 from ..dissipation.base import Dissipation, total
-from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, adjoint, checked_hermitian, checked_matrix
+from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, checked_hermitian, checked_matrix
 from ..errors import InputError
 from ..functions.density import Expectation, Modulated, VonNeumann
 from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
@@ -203,7 +204,7 @@ class QuantumSystem(System):
             raise InputError(f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}")
         if not np.isfinite(rho).all():
             raise InputError("the density matrix is not finite")
-        asymmetry = float(np.abs(rho - rho.conj().swapaxes(-1, -2)).max())
+        asymmetry = float(np.abs(rho - adjoint(rho)).max())
         if asymmetry > WITHIN:
             raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
         trace = np.trace(rho, axis1=-2, axis2=-1).real
@@ -221,7 +222,7 @@ class QuantumSystem(System):
         """Random states, ``count`` of them: density matrices by Ginibre's ensemble, and entropies of baths."""
         rng, size = np.random.default_rng(seed), self.structure.size
         root = rng.standard_normal((count, size, size, 2)) @ np.array([1.0, 1.0j])
-        rho = root @ root.conj().swapaxes(-1, -2)
+        rho = root @ adjoint(root)
         rho = rho / np.trace(rho, axis1=-2, axis2=-1)[:, None, None]
         x = np.asarray(self.structure.vector(rho))
         if self.baths is None:

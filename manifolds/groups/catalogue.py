@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..algebras import catalogue
-from ..matrices.linear import orthonormalized
+from ..matrices.linear import adjoint, orthonormalized
 from . import closed_forms as closed
 from . import maps
 from .matrix_group import MatrixGroup, register
@@ -34,7 +34,7 @@ def SO(n: int) -> MatrixGroup:
         f"SO({n})",
         catalogue.so(n),
         closed.unitary_defect,
-        closed.unitary_inverse,
+        adjoint,
         log_map=rotation_log,
         adjoint_cayley_map=None,
         restore_map=orthonormalized,
@@ -79,7 +79,7 @@ def SU(n: int) -> MatrixGroup:
         f"SU({n})",
         catalogue.su(n),
         closed.unitary_defect,
-        closed.unitary_inverse,
+        adjoint,
         restore_map=closed.unitary_restored,
         equations=closed.unitary_equations,
     )

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
-from ..matrices.linear import determinant, inverse, largest, orthonormalized
+from ..matrices.linear import adjoint, determinant, inverse, largest, orthonormalized
 from ..matrices.stumpff import HALF_TURN_MARGIN, _root, _square, arc, leading_sign, stumpff
 
 
@@ -161,7 +161,7 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 def unitary_defect(g) -> jax.Array:
     """Distance of ``g^H g`` from I, or of ``det g`` from 1."""
-    return jnp.maximum(largest(unitary_inverse(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
+    return jnp.maximum(largest(adjoint(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
 
 def rigid_defect(g) -> jax.Array:
@@ -225,17 +225,12 @@ def unimodular_equations(g) -> jax.Array:
 def unitary_equations(g) -> jax.Array:
     """Those entries of ``g g^H - I``, real parts and imaginary ones, and the imaginary part of ``det g``."""
     n = g.shape[-1]
-    rest = g @ g.conj().swapaxes(-1, -2) - np.eye(n)
+    rest = g @ adjoint(g) - np.eye(n)
     parts = rest.real[..., *np.triu_indices(n)], rest.imag[..., *np.triu_indices(n, 1)]
     return jnp.concatenate([*parts, determinant(g).imag[..., None]], axis=-1)
 
 
 # -- inverses -----------------------------------------------------------------------------------------------------
-
-
-def unitary_inverse(g) -> jax.Array:
-    """Conjugate transpose."""
-    return g.conj().swapaxes(-1, -2)
 
 
 def rigid_inverse(g) -> jax.Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from .chains import chain
 from .divided import ScalarFunction, scalar_function
+from .linear import adjoint
 from .symmetric import eigh
 
 SMALL = 3
@@ -81,7 +82,7 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
     """
     a, b = jnp.asarray(a), jnp.asarray(b)
     found = chain(Spectral(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)])
-    return (found + found.conj().swapaxes(-1, -2)) / 2
+    return (found + adjoint(found)) / 2
 
 
 def log_mean(logs, shift, x) -> jax.Array:
@@ -118,21 +119,21 @@ class Spectral:
             (found[slot][0] + shifts[..., j, None])[(..., *(slice(None) if i == j else None for i in range(k + 1)))]
             for j, slot in enumerate(slots)
         ]
-        weights, adjoint = self.function.divided(*points), [u.conj().swapaxes(-1, -2) for u in vectors]
-        inner = [adjoint[j] @ E @ vectors[j + 1] for j, E in enumerate(directions)]
+        weights, adjoints = self.function.divided(*points), [adjoint(u) for u in vectors]
+        inner = [adjoints[j] @ E @ vectors[j + 1] for j, E in enumerate(directions)]
         if k == 0:
-            return (vectors[0] * weights[..., None, :]) @ adjoint[0]
+            return (vectors[0] * weights[..., None, :]) @ adjoints[0]
         if k > 1:  # sum over all places but the first and the last
             letters = "abcdefghijklm"[: k + 1]
             pairs = ",".join("..." + letters[j : j + 2] for j in range(k))
             middle = jnp.einsum(f"...{letters},{pairs}->...{letters[0]}{letters[-1]}", weights, *inner)
         else:
             middle = weights * inner[0]
-        return vectors[0] @ middle @ adjoint[-1]
+        return vectors[0] @ middle @ adjoints[-1]
 
 
 def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
-    a = (a + a.conj().swapaxes(-1, -2)) / 2
+    a = (a + adjoint(a)) / 2
     if a.shape[-1] > SMALL:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
         return values, vectors

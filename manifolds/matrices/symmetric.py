@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .exponential import expm
-from .linear import largest, orthonormalized
+from .linear import adjoint, largest, orthonormalized
 from .stumpff import hyperbolic_stumpff
 
 _NEARLY_ONE = 0.5
@@ -51,8 +51,7 @@ def solve_lower(L, b) -> jax.Array:
 
 def orthonormal_columns(a) -> jax.Array:
     """The Q of ``a = Q R`` with R upper triangular and its diagonal positive, for a of full rank, shape (..., n, p)."""
-    adjoint = a.conj().swapaxes(-1, -2)
-    q = solve_lower(cholesky(adjoint @ a), adjoint).conj().swapaxes(-1, -2)
+    q = adjoint(solve_lower(cholesky(adjoint(a) @ a), adjoint(a)))
     for _ in range(3):  # the product squares the condition number of a
         q = orthonormalized(q)
     return q
@@ -87,9 +86,9 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
         plane, upper = jnp.outer(e, e) + jnp.outer(f, f), jnp.outer(e, f)
         turn = upper * (entry / divisor) - upper.T * (entry.conj() / divisor) if is_complex else upper - upper.T
         J = np.eye(n) + (cosine - 1.0) * plane + sine * turn
-        return (J.conj().swapaxes(-1, -2) @ a @ J, vectors @ J), None
+        return (adjoint(J) @ a @ J, vectors @ J), None
 
-    start = (a + a.conj().swapaxes(-1, -2)) / 2, jnp.broadcast_to(np.eye(n, dtype=a.dtype), a.shape)
+    start = (a + adjoint(a)) / 2, jnp.broadcast_to(np.eye(n, dtype=a.dtype), a.shape)
     (d, vectors), _ = jax.lax.scan(rotate, start, axes)
     values = jnp.diagonal(d, axis1=-2, axis2=-1).real
     converged = largest(d * (1.0 - np.eye(n))) <= 1e-14 * largest(a)

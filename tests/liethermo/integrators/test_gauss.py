@@ -370,3 +370,18 @@ def test_without_the_projector_the_entropy_falls():
     assert fall(with_projector) <= ENTROPY
     assert fall(without) > 1e-9
     assert without.audit().energy_drift <= 1e-14  # the first law does not need it
+
+
+def test_casimirs_whose_gradients_depend_on_each_other():
+    """As on the small orbits of su(3), where two eigenvalues are equal: no projector off the gradients is defined."""
+    g = mf.su(3)
+    inertia = np.random.default_rng(1).normal(size=(8, 8))
+    body = lt.LiePoissonSystem(g, lt.Quadratic(inertia @ inertia.T))
+    matrix = np.diag([1.0, 1.0, -2.0]) * 1j
+    x0 = np.array([np.trace(matrix.conj().T @ e).real for e in g.basis])
+    gradients = np.stack([C.gradient(x0) for C in body.casimirs().values()])
+    assert len(gradients) == 2
+    assert np.linalg.matrix_rank(gradients, tol=1e-9) == 1
+    run = lt.integrate(body, x0, (0.0, 0.5), 0.005, lt.MetriplecticGauss(2))
+    assert run.audit().passed
+    assert max(np.ptp(values) for values in run.casimirs.values()) <= 2e-15 * np.dot(x0, x0)

@@ -64,3 +64,41 @@ def test_a_tensor_of_ones_own():
         mf.PoissonTensor(np.zeros((2, 3)))
     with pytest.raises(mf.ParameterError):
         mf.Canonical(0)
+
+
+LEAVES = [mf.LiePoisson(mf.su(3)), mf.LiePoisson(mf.so(5)), mf.LiePoisson(mf.u(2)), mf.DensityMatrices(3)]
+
+
+@pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
+def test_stages_on_a_leaf(P):
+    """With any covectors, at long steps, and at states of small orbits; the control: stages that are not on it."""
+    rng, (A, b) = np.random.default_rng(3), gauss_of_two()
+    matrices = P.matrix if isinstance(P, mf.DensityMatrices) else lambda x: jnp.tensordot(x, dual(P.algebra), 1)
+    x, alpha = rng.standard_normal(P.dim), rng.standard_normal((2, P.dim))
+
+    def moved(points):
+        return x + 0.7 * b @ np.stack([P.sharp(u, a) for u, a in zip(points, alpha, strict=True)])
+
+    def spectrum(x):
+        return np.sort(np.linalg.eigvals(matrices(x)).imag + np.linalg.eigvals(matrices(x)).real)
+
+    points = P.on_leaf(x, alpha, 0.7 * A)
+    assert np.abs(spectrum(moved(points)) - spectrum(x)).max() <= 2e-14
+    assert np.abs(spectrum(moved([x, x])) - spectrum(x)).max() >= 1e-3
+    slopes = np.stack([P.sharp(u, a) for u, a in zip(P.on_leaf(x, alpha, 1e-6 * A), alpha, strict=True)])
+    assert np.abs(P.on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
+
+
+def gauss_of_two():
+    root = np.sqrt(3.0) / 6.0
+    return np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]]), np.array([0.5, 0.5])
+
+
+def dual(g):
+    basis = np.asarray(g.basis)
+    return np.tensordot(np.linalg.inv(np.einsum("aij,bji->ab", basis, basis).real), basis, 1)
+
+
+def test_other_leaves_are_not_known():
+    for P in (mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.g2()), mf.LiePoisson(mf.sl(3)), mf.LiePoisson(mf.su(20))):
+        assert P.on_leaf(np.ones(P.dim), np.ones((1, P.dim)), np.eye(1)) is None
