@@ -103,7 +103,7 @@ class LiePoisson(PoissonStructure):
         return self.algebra.ad_star(alpha, x)
 
     def on_leaf(self, x, alpha, A) -> jax.Array | None:
-        """Known for the matrices of u(n), su(n) and so(n)."""
+        """By A as for every structure; known for the matrices of u(n), su(n) and so(n)."""
         found = _skew_matrices(self.algebra)
         if found is None:
             return None
