@@ -52,7 +52,7 @@ class DensityMatrices(PoissonBySharp):
         return self.vector(-2j * product)  # whose Hermitian part has both terms of the commutator
 
     def on_leaf(self, x, alpha, A) -> jax.Array:
-        """``U_i rho U_i^H``, the U_i the stages by A of ``U' = -i H U`` from the identity: the eigenvalues of rho stay."""
+        """``U_i rho U_i^H``, the U_i stages by A of ``U' = -i H U`` from the identity; the eigenvalues stay."""
         return self.vector(turned_by(-1j * self.matrix(alpha), self.matrix(x), A))
 
 
