@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,15 +31,17 @@ def advance(
     rules: Rules = RULES,
     noise=None,
     newton: bool = True,
+    first=None,
 ):
     """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
 
     The three are arrays, so that one program serves all. Returns the new state and, for each of ``capacity`` saves, the
     state vector, energy and entropy, and whether it was reached. ``noise`` has the increments of each step, shape
     (steps, increments); steps without any where it is None. Without ``newton`` a step fails where fixed-point iteration
-    does not solve its equations.
+    does not solve its equations. A call that goes on with another is told the number of the first step of that: it
+    takes the steps that are left, and keeps what is not kept.
     """
-    first, second = state.step, None if newton else given_up
+    first, second = state.step if first is None else first, None if newton else given_up
     system, method, state, back = in_order(system, method, state, rules)
 
     def step(s: State) -> State:
@@ -49,7 +50,7 @@ def advance(
 
     def one_save(index, carry: tuple[State, tuple]):
         state, kept = carry
-        target = state.step + every
+        target = first + (index + 1) * every
 
         def goes_on(s: State):
             return (s.status == Code.COMPLETED) & (s.step < target)
@@ -75,24 +76,35 @@ def portion_of(system: System) -> int:
 
 
 class OnDemand:
-    """Calls of programs that take steps, without Newton's method until a step needs it.
+    """Calls of programs that take steps, without Newton's method until a step needs it: the call goes on from there.
 
-    It is two thirds of what there is to compile. The call that the step is in begins again with it, and so do those
-    that follow.
+    It is two thirds of what there is to compile.
     """
 
     def __init__(self, method: OneStepMethod):
         # Where there are no equations it makes no difference; a reference solver has none of its own.
         self.newton = not isinstance(method, OneStepMethod) or method.explicit
 
-    def __call__(self, steps: Callable[[bool], Any], code: Callable = lambda found: found[0].status) -> Any:
-        """What ``steps(newton)`` finds; ``code`` reads from it how steps ended, those of one trajectory or of many."""
-        if not self.newton:
-            found = steps(False)
-            if not np.isin(code(found), UNTAKEN).any():
-                return found
-            self.newton = True
-        return steps(True)
+    def advance(self, call: Callable, state: State, every) -> tuple[State, tuple]:
+        """The state after ``call(state, newton, first)``, that of one trajectory or of many, and what is kept."""
+        first = state.step
+        state, kept = call(state, self.newton, first)
+        lacking = np.isin(state.status, UNTAKEN)
+        if self.newton or not lacking.any():
+            return state, kept
+        self.newton = True
+        done = np.arange(kept[-1].shape[-1]) < (np.asarray(state.step - first) // every)[..., None]
+        state, more = call(state._replace(status=jnp.where(lacking, 0, state.status)), True, first)
+        old = [done.reshape(*done.shape, *[1] * (a.ndim - done.ndim)) for a in kept]
+        return state, tuple(jnp.where(where, a, b) for where, a, b in zip(old, kept, more, strict=True))
+
+    def follow(self, call: Callable, pace):
+        """The pace after ``call(pace, newton)``, of one trajectory or of many."""
+        pace = call(pace, self.newton)
+        if self.newton or not np.isin(pace.cause, UNTAKEN).any():
+            return pace
+        self.newton = True
+        return call(pace, True)
 
 
 class ArrayEngine:
@@ -109,8 +121,8 @@ class ArrayEngine:
         return begin(self.system, self.method, x)
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
-        given = self.system, self.method, state, jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), self.portion
-        return self._on_demand(lambda newton: advance(*given, self.rules, rows(noise), newton))
+        given = jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), self.portion, self.rules, rows(noise)
+        return self._on_demand.advance(lambda s, *how: advance(self.system, self.method, s, *given, *how), state, every)
 
     def step(self, state: State, h, noise=None) -> State:
         return self.advance(state, h, 1, 1, noise)[0]

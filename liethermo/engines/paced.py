@@ -129,8 +129,8 @@ class SinglePaces(_ArrayPaces):
     def attempts(self, most: int) -> dict[str, np.ndarray]:
         del most  # one, which nothing else follows
         if self._step is None:
-            given = self.system, self.method, self.pacing, self.pace, jnp.asarray(1), RULES
-            self.pace = self._on_demand(lambda newton: follow(*given, newton), last_cause)
+            given, one = (self.system, self.method, self.pacing), jnp.asarray(1)
+            self.pace = self._on_demand.follow(lambda p, newton: follow(*given, p, one, RULES, newton), self.pace)
         else:
             self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
         return {name: self.read(name) for name in TOLD}
@@ -146,13 +146,8 @@ class VmapPaces(_ArrayPaces):
         self.pace = _begin_all(form, parameters, axes, method, pacing, jnp.asarray(x), *times)
 
     def follow(self, most: int) -> None:
-        given = self.form, self.parameters, self.axes, self.method, self.pacing, self.pace, jnp.asarray(most)
-        self.pace = self._on_demand(lambda newton: _follow_all(*given, newton), last_cause)
-
-
-def last_cause(pace: Pace) -> jax.Array:
-    """How the last attempt ended, of one trajectory or of each."""
-    return pace.cause
+        given, count = (self.form, self.parameters, self.axes, self.method, self.pacing), jnp.asarray(most)
+        self.pace = self._on_demand.follow(lambda p, newton: _follow_all(*given, p, count, newton), self.pace)
 
 
 @program

@@ -454,7 +454,7 @@ def begin(system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, len
 def follow(
     system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, most, rules: Rules, newton: bool = True
 ) -> Pace:
-    """The pace after so many attempts, or where it pauses; without ``newton`` also where a step fails that lacks it."""
+    """The pace after so many attempts, or where it pauses; without ``newton`` also before one that lacks it."""
     second = None if newton else given_up
 
     def goes_on(carry):
@@ -463,7 +463,11 @@ def follow(
 
     def again(carry):
         pace, attempts = carry
-        return attempted(system, method, pacing, pace, rules, second), attempts + 1
+        after = attempted(system, method, pacing, pace, rules, second)
+        if not newton:
+            lacking = pace._replace(cause=after.cause), after.cause == Code.COMPLETED
+            after = jax.tree_util.tree_map(lambda a, b: jnp.where(lacking[1], a, b), after, lacking[0])
+        return after, attempts + 1
 
     return jax.lax.while_loop(goes_on, again, (pace, jnp.zeros((), dtype=jnp.int64)))[0]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._module import Module, forwarded
+from manifolds.retractions.charts import RETRACTIONS
 
 from ..errors import InputError
 from ..functions.conditions import numbers, require
@@ -57,8 +58,9 @@ class OneStepMethod(Module):
 
     def __check_init__(self):
         given = getattr(self, "retraction", None)
-        if not isinstance(given, str | mf.Retraction | None):
-            raise InputError(f"retraction is the name of one, such as 'exp', or a manifolds.Retraction, not {given!r}")
+        if not isinstance(given, mf.Retraction | None) and given not in tuple(RETRACTIONS):
+            names = ", ".join(map(repr, RETRACTIONS))
+            raise InputError(f"retraction is a manifolds.Retraction, or the name of one ({names}), not {given!r}")
 
     # -- every method gives -------------------------------------------------------------------------------------------
 

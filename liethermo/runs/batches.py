@@ -236,15 +236,15 @@ def advanced(
     ``given`` is form, parameters, their axes, and method.
     """
     form, parameters, axes, method = given
-    own = form, parameters, axes, method, state, jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), capacity, noise
-    state, kept = on_demand(lambda newton: advance_all(*own, newton))
+    own, count = (form, parameters, axes, method), (jnp.asarray(saves), jnp.asarray(every), capacity, noise)
+    state, kept = on_demand.advance(lambda s, *how: advance_all(*own, s, jnp.asarray(h), *count, *how), state, every)
     x, energy, entropy = (np.asarray(values)[:, :saves] for values in kept[:3])
     return state, np.concatenate([x, energy[..., None], entropy[..., None]], axis=-1)
 
 
 @program
-def advance_all(form, parameters, axes, method, state, h, saves, every, capacity: int, noise, newton: bool):
-    def one(p, state, h, noise):
-        return array.advance(form.rebuild(p), method, state, h, saves, every, capacity, RULES, noise, newton)
+def advance_all(form, parameters, axes, method, state, h, saves, every, capacity: int, noise, newton: bool, first):
+    def one(p, state, h, noise, first):
+        return array.advance(form.rebuild(p), method, state, h, saves, every, capacity, RULES, noise, newton, first)
 
-    return jax.vmap(one, in_axes=(axes, 0, 0, 0))(parameters, state, h, noise)
+    return jax.vmap(one, in_axes=(axes, 0, 0, 0, 0))(parameters, state, h, noise, first)

@@ -15,7 +15,7 @@ from ..engines.stepping import finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-from .preparation import begun, of_steps
+from .preparation import of_steps, started
 from .timetable import Timetable
 
 
@@ -78,7 +78,7 @@ def flow(
     x, table = system.state(x0), Timetable(t_span, step, save_every)
     n, shown = system.dim, system
     system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
-    x = jnp.asarray(begun(system, x, table.start, attitude))
+    x = jnp.asarray(started(system, method, x, table.start, attitude))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes = np.array([h for h, _, _ in calls])
     path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))

@@ -16,7 +16,7 @@ from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import as_run, begun, check_choice, decided, no_start, prepared
+from .preparation import as_run, check_choice, decided, prepared, started
 from .progress import Progress
 from .run import Run
 from .timetable import Course, stops_of
@@ -151,9 +151,7 @@ def integrate(
     course = Course(t_span, h, save_every)
     if save_at is not None:
         course = Course(t_span, h, None, stops_of(save_at, course.start, course.end))
-    x = begun(system, x0, course.start, attitude)
-    if reason := no_start(system, method, x):
-        raise InputError(reason)
+    x = started(system, method, x0, course.start, attitude)
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:
         if isinstance(method, Reference):

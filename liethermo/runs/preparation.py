@@ -88,6 +88,20 @@ def begun(system: System, x0, t: float, attitude=None, batch: bool = False) -> j
     return system.begin(x0, t, batch) if isinstance(system, DrivenSystem) else system.numbers(x0, batch)
 
 
+def started(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
+    """The state of a run of a method that starts from one of its user.
+
+    Raises
+    ------
+    InputError
+        If there is an attitude and no group, or no run can start there.
+    """
+    x = begun(system, x0, t, attitude)
+    if not is_traced(system, x) and (reason := no_start(system, method, x)):
+        raise InputError(reason)
+    return x
+
+
 def no_start(system: System, method, x) -> str:
     """Why no run can start at x, or at one of several states, in words; empty where one can."""
     spared = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)

@@ -18,7 +18,7 @@ from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKu
 from ..integrators.taylor import order_for
 from ..systems import System
 from .adaptive import Adaptive, pacing_of
-from .preparation import begun, of_steps
+from .preparation import of_steps, started
 from .stepwise import Outcome, Steps, follow
 
 
@@ -159,7 +159,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
 def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
     system, used = of_steps(system, method, rtol)
     used.check(system)
-    x = np.asarray(begun(system, x0, t0))
+    x = np.asarray(started(system, used, x0, t0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")

@@ -141,6 +141,9 @@ class AttitudeSystem(System):
     def outside(self, x) -> str:
         return self.body.outside(self.points(x))
 
+    def singular(self, x) -> str:
+        return self.body.singular(self.points(x))
+
     def sizes(self, k):
         """Those of momenta, which have a unit, and of attitudes, which have none."""
         n, m = self.body.dim, self.dim - self.in_space(k).shape[-1]

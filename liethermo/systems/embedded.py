@@ -92,6 +92,7 @@ class EmbeddedSystem(System):
 
     # -- states -------------------------------------------------------------------------------------------------------
 
+    singular = forwarded("manifold")
     points = forwarded("manifold")
     numbers = forwarded("manifold")
     on_states = forwarded("manifold")

@@ -14,7 +14,6 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds.algebras.on_demand import OnDemand
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
@@ -280,11 +279,8 @@ def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
 
 @functools.lru_cache(maxsize=64)
 def _of_a_body(algebra: mf.LieAlgebra) -> bool:
-    """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body.
-
-    Those have their structure constants; an algebra that forms them on demand is a larger one.
-    """
-    return algebra.dim >= 3 and not isinstance(algebra, OnDemand) and _acts(mf.so(3), algebra)
+    """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body."""
+    return algebra.dim >= 3 and _acts(mf.so(3), algebra)
 
 
 LARGEST_BODY = 64

@@ -197,7 +197,7 @@ class MidpointRetraction(Retraction):
         return f"MidpointRetraction({self.chart!r})"
 
 
-_BY_NAME: dict[str, Callable[[Space], Retraction]] = {
+RETRACTIONS: dict[str, Callable[[Space], Retraction]] = {
     "midpoint": lambda space: MidpointRetraction(RiemannianRetraction(space)),
     "exp": RiemannianRetraction,
     "euclidean": EuclideanRetraction,
@@ -239,6 +239,6 @@ def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction
     True
     """
     space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
-    if kind not in _BY_NAME:
-        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(_BY_NAME)}")
-    return _BY_NAME[kind](space)
+    if kind not in RETRACTIONS:
+        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(RETRACTIONS)}")
+    return RETRACTIONS[kind](space)

@@ -134,8 +134,11 @@ CASES = {
     "K(x, y)": (lambda: with_form(lt.FrictionOperator(lambda x, y: x)), "friction operator K could not be evaluated"),
     "quadratic": (lambda: lt.Quadratic([1.0], b=["a"]), "b of a quadratic function is made of real numbers, not list"),
     # schemes
-    "retraction": (lambda: V("verlet", retraction=3), "retraction is the name of one, such as 'exp', or a .*, not 3"),
-    "of Gauss": (lambda: lt.MetriplecticGauss(2, retraction=3), "retraction is the name of one"),
+    "retraction": (
+        lambda: V("verlet", retraction=3),
+        r"retraction is a .*, or the name of one \('midpoint', .*\), not 3",
+    ),
+    "of Gauss": (lambda: lt.MetriplecticGauss(2, retraction=3), "or the name of one"),
     "weight": (lambda: lt.FiniteDifference(0.5, weight="a"), "must be > 0 and finite, not 'a'"),
     "S0": (lambda: V("verlet").state(oscillator(), [1.0], [1.0], [0.0, 1.0], 0.1), "S0 is one number, not an array"),
     "h": (lambda: V("verlet").state(oscillator(), [1.0], [1.0], 0.0, "a"), "the step h is made of real numbers"),

@@ -15,6 +15,7 @@ from liethermo.engines.krylov import krylov
 from liethermo.engines.rules import RULES
 from liethermo.engines.stages import Equations, Iteration, solve_stages
 from liethermo.engines.stepping import begin
+from liethermo.runs.preparation import as_run, started
 
 COUNT = 5_000
 
@@ -108,6 +109,33 @@ def test_newtons_method_is_compiled_when_a_step_needs_it():
         whole, of_whole = array.advance(system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.portion)
         assert int(after.step) == int(whole.step) == 8
         assert np.abs(np.asarray(kept[0]) - np.asarray(of_whole[0])).max() <= 1e-15
+
+
+def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
+    """A torque spins a body up, until fixed-point iteration no longer solves its steps."""
+    body = lt.LiePoissonSystem(
+        mf.so(3), lambda p: 0.5 * p @ (p / jnp.array([3.0, 2.0, 1.0])), torque=lambda t, mu: jnp.array([0.5, 0.4, 0.3])
+    )
+    begun, advance = [], array.advance
+
+    def watched(system, method, state, *rest):
+        begun.append((int(state.step), rest[-2]))
+        return advance(system, method, state, *rest)
+
+    monkeypatch.setattr(array, "advance", watched)
+    system, method = as_run(body, lt.MetriplecticMidpoint())
+    engine = array.ArrayEngine(system, method)
+    start = engine.begin(started(system, method, [0.1, 0.1, 0.1], 0.0))
+    after, kept = engine.advance(start, 0.5, 10, 4)
+    assert begun[0] == (0, False)
+    assert begun[1] == (begun[1][0], True)
+    assert 1 < begun[1][0] < 40
+    assert begun[1][0] % 4  # in the middle between two states that are kept
+    whole, of_whole = advance(system, method, start, *map(jnp.asarray, (0.5, 10, 4)), engine.portion)
+    assert int(after.newton) == int(whole.newton) > 0
+    assert int(after.fixed_point) == int(whole.fixed_point)
+    for a, b in zip(kept, of_whole, strict=True):
+        np.testing.assert_allclose(a[:10], b[:10], rtol=1e-13, atol=1e-13)
 
 
 def stiff(n, rate):

@@ -545,6 +545,9 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     dephasing = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(Z, 0.3)]), entropy=floor)
     with pytest.raises(lt.InputError, match=r"take lt\.MetriplecticRungeKutta"):
         lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1)
+    for what in (lambda x: lt.flow(dephasing, x, (0.0, 1.0), 0.1), lambda x: lt.suggest_step(dephasing, x)):
+        with pytest.raises(lt.InputError, match=r"cannot start at this x0.*take lt\.MetriplecticRungeKutta"):
+            what(dephasing.state(TURNED))
     end = lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).x[-1]
     assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
 
