@@ -38,7 +38,7 @@ def advance(
     The three are arrays, so that one program serves all. Returns the new state and, for each of ``capacity`` saves, the
     state vector, energy and entropy, and whether it was reached. ``noise`` has the increments of each step, shape
     (steps, increments); steps without any where it is None. Without ``newton`` a step fails where fixed-point iteration
-    does not solve its equations. A call that goes on with another is told the number of the first step of that: it
+    does not solve its equations. A call that goes on with another is given the number of the first step of that: it
     takes the steps that are left, and keeps what is not kept.
     """
     first, second = state.step if first is None else first, None if newton else given_up
