@@ -16,7 +16,7 @@ from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
 from .preparation import of_steps, started
-from .timetable import Timetable
+from .timetable import Course
 
 
 @by_own_settings
@@ -75,13 +75,13 @@ def flow(
     >>> jax.jacfwd(end)(0.5).shape
     (3,)
     """
-    x, table = system.state(x0), Timetable(t_span, step, save_every)
+    x, table = system.state(x0), Course(t_span, step, save_every)
     n, shown = system.dim, system
     system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
     x = jnp.asarray(started(system, method, x, table.start, attitude))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
-    sizes = np.array([h for h, _, _ in calls])
-    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every in calls))
+    sizes = np.array([h for h, *_ in calls])
+    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every, _ in calls))
     path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
     return path[-1] if save_every is None else path
 

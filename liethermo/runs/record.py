@@ -76,7 +76,7 @@ class Record:
         self.finished = np.zeros(size, dtype=bool)
         self.status = np.full(size, Code.INTERRUPTED, dtype=np.int8)
         self.steps, self.iterations, self.rejected = (np.zeros(size, dtype=np.int64) for _ in range(3))
-        self.rows["first_step"][:] = course.parts[0].longest
+        self.rows["first_step"][:] = course.longest[0]
         self.rows["end_time"][:] = course.start
         self.x = np.empty((size, member.dim)) if outputs == "final" else None
         self.path = np.full((size, len(self.times), member.dim + 2), np.nan) if outputs == "trajectory" else None

@@ -6,6 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,23 +17,44 @@ CHUNK_STEPS = 100_000
 """Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
 
 
-class Timetable:
-    """Steps of one size over a span of time, and a shorter one where the span is no multiple of it.
+class Part(NamedTuple):
+    """Equal steps from one time to another, and a shorter one, of size ``last``, where they do not arrive there."""
+
+    start: float
+    end: float
+    full: int
+    last: float
+
+    @classmethod
+    def of(cls, start: float, end: float, h: float) -> Part:
+        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
+        full = math.floor((end - start) / h * (1 + 1e-12))
+        last = end - (start + full * h)
+        return cls(start, end, full, last if last > 1e-12 * (end - start) else 0.0)
+
+    @property
+    def steps(self) -> int:
+        return self.full + (self.last > 0.0)
+
+
+class Course:
+    """Steps of one size over a span of time, from stop to stop.
 
     Parameters
     ----------
     span : (float, float)
     step : float
     every : int or None
-        Keep the states of every ``save_every``-th step, and the last; None keeps the last alone.
+        Keep the states of every ``save_every``-th step, and the last; None keeps those at the stops alone.
+    stops : array, optional
+        Times at which steps end, the end of the span the last, which is the only one otherwise.
 
     Attributes
     ----------
     start, end, h : float
-    last : float
-        Size of the shorter last step; 0 where there is none.
-    full, steps : int
-        How many full steps there are, and steps in all.
+    parts : list of Part
+    steps : int
+        How many there are.
 
     Raises
     ------
@@ -40,96 +62,34 @@ class Timetable:
         If the span or the step cannot be used.
     """
 
-    def __init__(self, span, step, every: int | None):
+    def __init__(self, span, step, every: int | None, stops: np.ndarray | None = None):
         self.start, self.end = _checked_span(span)
         self.h = _checked_step(step, self.start, self.end)
         if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
             raise InputError(f"save_every must be a positive integer, not {every!r}")
-        self.every = every
-        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
-        self.full = math.floor((self.end - self.start) / self.h * (1 + 1e-12))
-        self.last = self.end - (self.start + self.full * self.h)
-        if self.last <= 1e-12 * (self.end - self.start):
-            self.last = 0.0
-        self.steps = self.full + (self.last > 0.0)
-
-    def time(self, step: int) -> float:
-        """The time after so many steps."""
-        return float(self.reached(np.asarray(step)))
-
-    def reached(self, steps: np.ndarray) -> np.ndarray:
-        """The times after so many steps."""
-        return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
-
-    @functools.cached_property
-    def counts(self) -> np.ndarray:
-        """Steps after which states are kept, 0 (the start) and the last among them."""
-        kept = np.arange(0, self.full + 1, self.every or self.steps)
-        ends = {self.steps} if self.every is None else {self.full, self.steps}
-        return np.append(kept, np.array(sorted(n for n in ends if n > kept[-1]), dtype=kept.dtype))
-
-    @property
-    def times(self) -> np.ndarray:
-        """The times at :attr:`counts`."""
-        return self.reached(self.counts)
-
-    @property
-    def longest(self) -> float:
-        """The longest of the steps."""
-        return self.h if self.full else self.last
-
-    def calls(
-        self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES, each: bool = False
-    ) -> Iterator[tuple[float, int, int]]:
-        """The run in calls ``(h, saves, every)`` of an engine: so many saves, each after so many steps of size h.
-
-        None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save. With ``each``
-        every state is saved.
-        """
-        done, own = 0, 1 if each else self.every
-        while done < self.full:
-            left = self.full - done
-            every = min(own or limit, left)
-            kept = 1 if own is None else max(1, min(saves, limit // every, left // every))
-            yield self.h, kept, every
-            done += kept * every
-        if self.last:
-            yield self.last, 1, 1
-
-
-class Course:
-    """Equal steps from stop to stop: a :class:`Timetable` for each part of a span, one after another.
-
-    Parameters
-    ----------
-    span, step, every
-        As for :class:`Timetable`.
-    stops : array, optional
-        Times at which steps end and states are kept, the end of the span the last; without them, every n-th state.
-
-    Attributes
-    ----------
-    start, end, h : float
-    parts : list of Timetable
-    """
-
-    def __init__(self, span, step, every: int | None, stops: np.ndarray | None = None):
-        whole = Timetable(span, step, every)
-        self.start, self.end, self.h = whole.start, whole.end, whole.h
-        self.every, self.parts = every, [whole]
-        if stops is not None:
-            ends = [float(t) for t in stops if t > self.start]
-            self.parts = [Timetable(part, step, None) for part in itertools.pairwise([self.start, *ends])]
+        ends = [self.end] if stops is None else [float(t) for t in stops if t > self.start]
+        self.every, self.parts = every, [Part.of(*ends, self.h) for ends in itertools.pairwise([self.start, *ends])]
+        self.steps = sum(part.steps for part in self.parts)
 
     def calls(
         self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES, each: bool = False
     ) -> Iterator[tuple[float, int, int, bool]]:
-        """The run in calls of an engine as those of :meth:`Timetable.calls`, and whether what they save is kept."""
+        """The run in calls ``(h, saves, every, kept)`` of an engine: so many saves, each after so many steps of size h.
+
+        None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save. With ``each``
+        every state is saved. The last tells whether what is saved is kept.
+        """
+        own = 1 if each else self.every
         for part in self.parts:
             done = 0
-            for h, kept, every in part.calls(limit, saves, each):
-                done += kept * every
-                yield h, kept, every, each or part.every is not None or done >= part.steps
+            while done < part.full:
+                left = part.full - done
+                every = min(own or limit, left)
+                count = 1 if own is None else max(1, min(saves, limit // every, left // every))
+                done += count * every
+                yield self.h, count, every, own is not None or done >= part.steps
+            if part.last:
+                yield part.last, 1, 1, True
 
     def size(self, step: int) -> float:
         """The size of the step after so many; of the last where there are no more."""
@@ -137,40 +97,40 @@ class Course:
             if step < part.steps or part is self.parts[-1]:
                 break
             step -= part.steps
-        return part.last if step >= part.full else part.h
+        return part.last if step >= part.full else self.h
 
     @property
     def longest(self) -> np.ndarray:
         """The longest of the steps after each state that is kept."""
-        return np.concatenate([np.full(len(part.counts) - 1, part.longest) for part in self.parts])
+        longest = [self.h if part.full else part.last for part in self.parts]
+        return np.array(longest) if self.every is None else np.full(len(self.counts) - 1, longest[0])
 
-    @property
-    def steps(self) -> int:
-        """How many steps there are."""
-        return sum(part.steps for part in self.parts)
-
-    @property
+    @functools.cached_property
     def counts(self) -> np.ndarray:
         """Steps after which states are kept, 0 (the start) and the last among them."""
-        first, *others = self.parts
-        before = np.cumsum([part.steps for part in self.parts])
-        return np.concatenate([first.counts, *(n + part.counts[1:] for n, part in zip(before, others, strict=False))])
+        if self.every is None:
+            return self._before
+        kept = np.arange(0, self.parts[0].full + 1, self.every)
+        return np.append(kept, [n for n in sorted({self.parts[0].full, self.steps}) if n > kept[-1]]).astype(int)
+
+    @functools.cached_property
+    def _before(self) -> np.ndarray:
+        """The steps before each part, and all."""
+        return np.cumsum([0, *(part.steps for part in self.parts)])
 
     @property
     def times(self) -> np.ndarray:
         """The times at :attr:`counts`."""
-        first, *others = self.parts
-        return np.concatenate([first.times, *(part.times[1:] for part in others)])
+        return self.reached(self.counts)
 
     def reached(self, steps: np.ndarray) -> np.ndarray:
         """The times after so many steps."""
         if len(self.parts) == 1:
-            return self.parts[0].reached(steps)
-        before = np.cumsum([0, *(part.steps for part in self.parts)])
-        place = np.clip(np.searchsorted(before, steps, side="right") - 1, 0, len(self.parts) - 1)
+            return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
+        place = np.clip(np.searchsorted(self._before, steps, side="right") - 1, 0, len(self.parts) - 1)
         starts, ends = (np.array([getattr(part, name) for part in self.parts])[place] for name in ("start", "end"))
-        last = steps >= before[place + 1]
-        return np.where(last, ends, np.minimum(starts + (steps - before[place]) * self.h, ends))
+        last = steps >= self._before[place + 1]
+        return np.where(last, ends, np.minimum(starts + (steps - self._before[place]) * self.h, ends))
 
 
 def stops_of(save_at, start: float, end: float) -> np.ndarray:

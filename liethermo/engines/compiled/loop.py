@@ -231,8 +231,8 @@ class _Steps(Writer):
             return self.parameter(j) if array == "p" else build.load(self.slots[array][j])
 
         def memory(i: int, places: range) -> Table | None:
-            own = [self.own[j] for j in places]
-            if piece.arguments[i] != "p" or own.count(None) not in (0, len(own)):
+            own = [self.own[j] for j in places] if piece.arguments[i] == "p" else []
+            if not own or own.count(None) not in (0, len(own)):
                 return None
             if own[0] is None:
                 start, kind = build.gep(self.argument["p"], [self.whole_number(places[0])]), NUMBER
