@@ -77,7 +77,7 @@ class Course:
         """The run in calls ``(h, saves, every, kept)`` of an engine: so many saves, each after so many steps of size h.
 
         None has more than ``saves`` saves, nor more than ``limit`` steps unless that is a single save. With ``each``
-        every state is saved. The last tells whether what is saved is kept.
+        every state is saved. ``kept`` is whether what is saved is kept.
         """
         own = 1 if each else self.every
         for part in self.parts:
