@@ -309,6 +309,15 @@ ROUNDINGS = 30.0
 """Roundings that solved slopes may differ by."""
 
 
+def generator_linearised(system: System, stages: Callable, k) -> Callable:
+    """:meth:`OneStepMethod.linearised` by the form of the motion without the entropy, at the stages that k makes.
+
+    The slopes differ from it by the corrections of their gradients alone, which are of the order of the method, and its
+    derivative has no eigenvectors in it.
+    """
+    return jax.linearize(lambda k: jax.vmap(system.generated)(stages(k)) - k, k)[1]
+
+
 def collocation_error(system: System, x, compensation, h, k) -> jax.Array:
     """A local error O(h^{2s+1}) of collocation at s Gauss nodes, from how far its polynomial u misses the field.
 

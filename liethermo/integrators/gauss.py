@@ -24,7 +24,16 @@ from ..functions.gradients import stage_gradients
 from ..systems import System
 from ..systems.base import gradients_of
 from ..tracing.interpret import at_points
-from .base import GaussMethod, OneStepMethod, TransportingMethod, checked_stages, collocation_error, moved, register
+from .base import (
+    GaussMethod,
+    OneStepMethod,
+    TransportingMethod,
+    checked_stages,
+    collocation_error,
+    generator_linearised,
+    moved,
+    register,
+)
 from .charts import in_charts
 from .composed_entropy import composed_gradients
 from .preserved import check_preserved, preserved_functions, seen_on
@@ -298,6 +307,11 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             return None
         sharp = system.poisson.sharp
         return jax.vmap(lambda point: jnp.stack([sharp(point, J.gradient(point)) for J in maps]))(u)
+
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+        if not system.has_generator:
+            return super().linearised(system, x, compensation, h, k)
+        return generator_linearised(system, lambda k: self._stages(x, compensation, h, k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error(system, x, compensation, h, k)

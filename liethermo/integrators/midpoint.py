@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 
@@ -10,7 +12,7 @@ from manifolds._module import forwarded
 
 from ..functions.gradients import DiscreteGradient, discrete_gradient
 from ..systems import System
-from .base import OneStepMethod, TransportingMethod, collocation_error, register
+from .base import OneStepMethod, TransportingMethod, collocation_error, generator_linearised, register
 from .charts import in_charts
 
 
@@ -80,6 +82,11 @@ class MetriplecticMidpoint(TransportingMethod):
 
     def transports(self, system: System) -> bool:
         return True
+
+    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+        if not system.has_generator:
+            return super().linearised(system, x, compensation, h, k)
+        return generator_linearised(system, lambda k: x + (compensation + 0.5 * h * k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error(system, x, compensation, h, k)

@@ -365,6 +365,30 @@ def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
     assert np.abs(many.x[1] - alone.x[-1]).max() <= 1e-15
 
 
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
+)
+def test_newtons_method_takes_the_derivative_of_the_generator(method):
+    """The slopes differ from it by the order of the method; the control: the identity alone is far off."""
+    q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=lt.HeatBaths(capacity=0.8, temperature=T))
+    x, h, off = q.state(RHO), 0.05, jnp.zeros(q.dim)
+    k = jnp.tile(q.vector_field(x), (method.stages, 1))
+    d = jnp.cos(jnp.arange(float(k.size))).reshape(k.shape)
+    by_slopes = functools.partial(lt.integrators.base.OneStepMethod.linearised, method)
+    found, wanted = (
+        np.asarray(jax.jit(lambda k, d, made=made: made(q, x, off, h, k)(d))(k, d))
+        for made in (method.linearised, by_slopes)
+    )
+    assert np.abs(found - wanted).max() <= 0.1 * np.abs(wanted + d).max()
+
+
+def test_tables_of_unknowns_are_no_tables_of_parameters():
+    """Three stages of sixteen numbers are more than the parameters, beside which the compiled loop looked them up."""
+    H, V = np.diag(np.arange(4.0)), np.diag(np.sqrt(np.arange(1.0, 4.0)), 1)
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.1)]), baths=infinite())
+    assert lt.integrate(q, q.state(random_density(4)), (0.0, 0.2), 0.1, lt.MetriplecticGauss(3)).audit().passed
+
+
 def test_products_and_partial_traces():
     one = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, 0.3)]), baths=infinite(1.0), names=["A"])
     other = lt.QuantumSystem(2 * QUBIT, lt.ThermalJumps([(LOWER, 0.2)]), baths=infinite(0.5), names=["B"])
