@@ -13,6 +13,7 @@ from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
 from ..matrices.linear import complement, largest, skew
+from ..matrices.spectral import spectral
 from ..matrices.symmetric import eigh, orthonormal_columns, symmetrized
 from .base import CUT_MARGIN, Space, register
 
@@ -21,6 +22,12 @@ _GAP = 1e-8
 
 _SETTLED = 60
 """Newton's steps for the sign of a matrix: enough for that gap."""
+
+_SMALL = 1 / 8
+"""``sin^2`` of an angle below which a series in it is summed, whose derivatives do not cancel."""
+
+_SERIES = [math.factorial(k) / math.prod(j + 1.5 for j in range(k)) for k in reversed(range(24))]
+"""``t / (sin(t) cos(t)) = 1 + 2/3 s + 8/15 s^2 + …`` in powers of ``s = sin(t)^2``, the highest first."""
 
 
 @register((3, 1), (4, 2))
@@ -162,20 +169,10 @@ class Grassmann(Space):
         return symmetrized(turn @ x @ turn.swapaxes(-1, -2))
 
     def _log(self, x, y):
-        """From ``sin^2`` of the principal angles and the directions of the turn, which x and y give."""
-        gap = y - x
-        along = self._project_tangent(x, gap)  # its singular values are sin(t) cos(t)
-        values, vectors = eigh(symmetrized(x @ (np.eye(self.n) - y) @ x))  # sin(t)^2 in the subspace, 0 outside
-        sine = jnp.clip(values, 0.0, 1.0)
-        angle = jnp.arctan2(
-            jnp.sqrt(jnp.where(sine > 0.0, sine, 1.0)), jnp.sqrt(1.0 - jnp.where(sine > 0.0, sine, 0.0))
-        )
-        both = jnp.sqrt(jnp.where(sine > 0.0, sine, 1.0) * (1.0 - jnp.where(sine > 0.0, sine, 0.0)))
-        ratio = jnp.where(sine > 1e-18, angle / both, 1.0)
-        scaled = (vectors * ratio[..., None, :]) @ vectors.swapaxes(-1, -2) @ x @ along
-        v = self._project_tangent(x, scaled + scaled.swapaxes(-1, -2))
-        defined = (1.0 - sine).min(axis=-1) > (math.pi / 2 * CUT_MARGIN) ** 2
-        return jnp.where(defined[..., None, None], v, jnp.nan)
+        """A function of ``sin^2`` of the principal angles and the directions of the turn, which x and y give."""
+        along = self._project_tangent(x, y - x)  # its singular values are sin(t) cos(t)
+        scaled = spectral(_stretch, symmetrized(x @ (np.eye(self.n) - y) @ x)) @ x @ along
+        return self._project_tangent(x, scaled + scaled.swapaxes(-1, -2))
 
     def _transport(self, x, v, u):
         turn = expm(_bracket(v, x))
@@ -183,6 +180,15 @@ class Grassmann(Space):
 
     def _why_no_log(self, x, y):
         return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
+
+
+def _stretch(square):
+    """``t / (sin(t) cos(t))`` for a square of sin(t), by its series where it is small; NaN at a right angle."""
+    small = square < _SMALL
+    series = jnp.polyval(jnp.asarray(_SERIES), jnp.where(small, square, 0.0))
+    sine = jnp.where(small, 0.5, square)
+    cosine = 1.0 - jnp.where(sine < 1.0 - (math.pi / 2 * CUT_MARGIN) ** 2, sine, jnp.nan)
+    return jnp.where(small, series, jnp.arctan2(jnp.sqrt(sine), jnp.sqrt(cosine)) / jnp.sqrt(sine * cosine))
 
 
 def _bracket(a, b):

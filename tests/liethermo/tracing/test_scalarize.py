@@ -49,7 +49,8 @@ def nudged(program: Program, args, seed: int) -> list[np.ndarray]:
     with np.errstate(all="ignore"):
         for target, op, operands in program.instructions:
             value = meaning(op)(*(values[a] if isinstance(a, str) else a for a in operands))
-            values[target] = value * (1.0 + EPS * noise.uniform(-4, 4)) if isinstance(value, np.float64) else value
+            real = not isinstance(value, tuple) and np.asarray(value).dtype == np.float64
+            values[target] = value * (1.0 + EPS * noise.uniform(-4, 4, np.shape(value))) if real else value
     return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
 
 

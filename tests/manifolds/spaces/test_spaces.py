@@ -34,6 +34,7 @@ TOLERANCES = {
     "exact": (1e-14, "results of order one; at most 4e-15 seen, roundings of a distance near pi"),
     "hyperbolic": (4e-14, "times cosh(distance from the apex)^2, as for all coordinates there; at most 8e-15 seen"),
     "spd": (4e-14, "entries up to 20, and products of five such matrices; at most 1e-14 seen"),
+    "correlation": (3e-15, "times the condition number; at most 4e-16 seen in 1200 points"),
     "grassmann": (1e-13, "angles up to 81 degrees, whose tangents amplify; at most 3e-14 seen"),
     "oracle": (5e-14, "against geomstats, a few times its own roundings; at most 1e-14 seen"),
     "oracle_log": (1e-11, "against geomstats where its logarithm iterates, to 1e-13"),
@@ -92,6 +93,8 @@ def rounding(space, *points) -> tuple[str, float]:
         return "hyperbolic", max(largest(np.asarray(x)[..., 0]) for x in points) ** 2
     if space.name == "SL(2)":  # the condition number of such a matrix
         return "exact", max(largest(x) for x in points) ** 2
+    if "Corr" in space.name:  # coordinates are entries of a Cholesky factor over its diagonal: eps / L_ii^2
+        return "correlation", max(largest(np.linalg.cond(x)) for x in points)
     return next((name, 1.0) for name in ("spd", "grassmann", "exact") if OF_ONE_KIND.get(name, "") in space.name)
 
 
