@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,3 +69,20 @@ def real_array(value) -> jax.Array:
     if is_traced(value):  # some of its entries
         return jnp.asarray(value, dtype=jnp.float64)
     return jnp.asarray(np.asarray(value, dtype=np.float64))
+
+
+SELECTED = 4
+"""Arrays up to which the entries of one are selected among them."""
+
+
+def interleaved(columns: Sequence[jax.Array]) -> jax.Array:
+    """Arrays of one shape as the columns of one, shape (..., columns).
+
+    A few by selection: the loop of a concatenation has a branch for every entry.
+    """
+    if len(columns) > SELECTED:
+        return jnp.stack(columns, axis=-1)
+    *others, found = (column[..., None] for column in columns)
+    for i, column in enumerate(others):
+        found = jnp.where(np.arange(len(columns)) == i, column, found)
+    return found

@@ -36,6 +36,18 @@ def _gradient(energy: Energy, x) -> jax.Array:
     return jax.grad(energy.value)(x)
 
 
+LARGE = 1_000
+"""Components from which a gradient is put into memory before anything is made of it."""
+
+
+def _in_memory(function: Callable, x) -> jax.Array:
+    """``function(x)`` of the shape of x, computed once: XLA computes elementwise results anew for each use of an entry.
+
+    It keeps what a branch returns. NaN where the first entry of x is not finite.
+    """
+    return jax.lax.cond(jnp.isfinite(x[0]), function, lambda x: jnp.full_like(x, jnp.nan), x)
+
+
 LARGEST_CLIQUE = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
 
@@ -52,7 +64,8 @@ class Energy(Module):
 
     def gradient(self, x) -> jax.Array:
         """The gradient at one state, shape (n,)."""
-        return _gradient(self, real(x))
+        x = real(x)
+        return _gradient(self, x) if x.size < LARGE else _in_memory(lambda x: _gradient(self, x), x)
 
     def sensitivity(self, x) -> jax.Array:
         """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.

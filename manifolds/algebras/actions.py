@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import interleaved
+
 UNROLLED = 64
 """Structure constants other than zero up to which the bracket of many copies is written out, term by term."""
 
@@ -58,4 +60,4 @@ def written_out(terms: tuple[tuple[int, int, int, float], ...], x, y, dim: int) 
         product = x[..., a] * y[..., b]
         columns[c].append(product if value == 1.0 else value * product)
     zero = jnp.zeros(jnp.broadcast_shapes(x.shape, y.shape)[:-1])
-    return jnp.stack([sum(column[1:], column[0]) if column else zero for column in columns], axis=-1)
+    return interleaved([sum(column[1:], column[0]) if column else zero for column in columns])

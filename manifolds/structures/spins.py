@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import real_array
+from .._arrays import interleaved, real_array
 from .._sizes import checked_size
 from ..errors import ParameterError
 from .poisson import PoissonBySharp
@@ -144,15 +144,6 @@ def state_of(spins: Planes, others, planar: bool = False) -> jax.Array:
 def planes(v) -> Planes:
     """The components of vectors in space, shape (..., 3)."""
     return v[..., 0], v[..., 1], v[..., 2]
-
-
-def interleaved(spins: Planes) -> jax.Array:
-    """The vectors of some components, shape (..., 3).
-
-    By selection: the loop of a concatenation has a branch for every entry.
-    """
-    a, b, c = (component[..., None] for component in spins)
-    return jnp.where(np.array([True, False, False]), a, jnp.where(np.array([False, True, False]), b, c))
 
 
 def cross_planes(u: Planes, v: Planes) -> Planes:
