@@ -451,13 +451,9 @@ def array(scalars: Sequence[Any], shape) -> np.ndarray:
 
 def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
     """Apply a function entry by entry."""
-    arrays = np.broadcast_arrays(*arrays)
+    if len({np.shape(x) for x in arrays}) > 1:
+        arrays = np.broadcast_arrays(*arrays)
     return array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
-
-
-def integers(x: np.ndarray) -> np.ndarray:
-    """An array of indices that are known: see :mod:`.indexing` for others."""
-    return x.astype(np.int64)
 
 
 def entries_along(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:

@@ -9,12 +9,11 @@ from functools import reduce
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from . import indexing
 from . import linear_algebra as algebra
-from .builder import ELEMENTARY, Pair, Scalar, array, constant, elementwise, entries_along, integers, pair
+from .builder import ELEMENTARY, Pair, Scalar, array, constant, elementwise, entries_along, pair
 from .calls import Deferred
 from .complex_numbers import arranged, flat, kinds
 
@@ -231,23 +230,13 @@ def _slice(x, params):
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
-def _window(x: np.ndarray, starts, sizes) -> tuple[slice, ...]:
-    """The window of a dynamic slice: moved inside the array where it sticks out."""
-    starts = [min(max(int(integers(i)), 0), n - m) for i, n, m in zip(starts, x.shape, sizes, strict=True)]
-    return tuple(slice(i, i + m) for i, m in zip(starts, sizes, strict=True))
-
-
 def _dynamic_slice(b, eqn, x, *starts):
-    if not indexing.known(*starts):
-        return indexing.window(b, x, [i.item() for i in starts], eqn.params["slice_sizes"])
-    return x[_window(x, starts, eqn.params["slice_sizes"])]
+    return indexing.window(b, x, [i.item() for i in starts], eqn.params["slice_sizes"])
 
 
 def _dynamic_update_slice(b, eqn, x, update, *starts):
-    if not indexing.known(*starts):
-        return indexing.updated(b, x, update, [i.item() for i in starts])
     result = x.copy()
-    result[_window(x, starts, update.shape)] = update
+    indexing.update(b, result, [i.item() for i in starts], update.shape, lambda old: update)
     return result
 
 
@@ -272,56 +261,16 @@ def _split(x, params):
     return np.split(x, np.cumsum([int(n) for n in params["sizes"]])[:-1], axis=params["axis"])
 
 
-# Gathering and scattering have intricate rules for indices. JAX itself is asked where each entry goes: the primitive is
-# run on the numbers of the entries.
-
-
-SHORT = 256
-"""Entries gathered or scattered that are placed one by one; for more it is worth to compile what JAX does."""
-
-
 def _gather(b, eqn, x, indices):
-    fill_value = eqn.params["fill_value"]
-    if fill_value is None:
-        fill_value = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
-    if not indexing.known(indices) or math.prod(eqn.outvars[0].aval.shape) <= SHORT:
-        return indexing.gathered(b, eqn, x, indices, fill_value)
-    numbers = jnp.arange(x.size).reshape(x.shape)
-    where = integers(indices).astype(_dtype(eqn, 1))
-    came_from = np.asarray(eqn.primitive.bind(numbers, where, **{**eqn.params, "fill_value": -1}))
-    entries = [*x.ravel().tolist(), fill_value]
-    return array([entries[i] for i in came_from.ravel()], came_from.shape)
+    filling = eqn.params["fill_value"]
+    if filling is None:
+        filling = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
+    return indexing.gathered(b, eqn, x, indices, filling)
 
 
-def _scatter(b, eqn, x, indices, updates):
-    if not indexing.known(indices) or updates.size <= SHORT:
-        return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: new)
-    numbers = jnp.arange(x.size + updates.size)
-    old, new = numbers[: x.size].reshape(x.shape), numbers[x.size :].reshape(updates.shape)
-    where = integers(indices).astype(_dtype(eqn, 1))
-    came_from = np.asarray(eqn.primitive.bind(old, where, new, **eqn.params))
-    entries = x.ravel().tolist() + updates.ravel().tolist()
-    return array([entries[i] for i in came_from.ravel()], came_from.shape)
-
-
-def _scatter_combining(combine: Callable[..., Scalar]) -> Rule:
+def _scatter(combine: Callable[..., Scalar]) -> Rule:
     def rule(b, eqn, x, indices, updates):
-        if not indexing.known(indices) or updates.size <= SHORT:
-            return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: combine(b, old, new))
-        where = integers(indices).astype(_dtype(eqn, 1))
-        options = {key: eqn.params[key] for key in ("dimension_numbers", "mode")}
-
-        def scatter(u):
-            return jax.lax.scatter_add(jnp.zeros(x.shape), where, u, **options)
-
-        # The transpose of scattering tells each update which entry it goes to; 0 for one that is dropped.
-        (goes_to,) = jax.linear_transpose(scatter, jnp.zeros(updates.shape))(
-            jnp.arange(1.0, x.size + 1).reshape(x.shape)
-        )
-        entries = [0.0, *x.ravel().tolist()]
-        for i, u in zip(np.asarray(goes_to, int).flat, updates.flat, strict=True):
-            entries[i] = combine(b, entries[i], u) if i else 0.0
-        return array(entries[1:], x.shape)
+        return indexing.scattered(b, eqn, x, indices, updates, lambda old, new: combine(b, old, new))
 
     return rule
 
@@ -372,12 +321,12 @@ RULES: dict[str, Rule] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
-    "scatter": _scatter,
-    "scatter-add": _scatter_combining(_method("add")),
-    "scatter-sub": _scatter_combining(_method("sub")),
-    "scatter-mul": _scatter_combining(_method("mul")),
-    "scatter-min": _scatter_combining(_method("min")),
-    "scatter-max": _scatter_combining(_method("max")),
+    "scatter": _scatter(lambda b, old, new: new),
+    "scatter-add": _scatter(_method("add")),
+    "scatter-sub": _scatter(_method("sub")),
+    "scatter-mul": _scatter(_method("mul")),
+    "scatter-min": _scatter(_method("min")),
+    "scatter-max": _scatter(_method("max")),
     "real": lambda b, eqn, x: elementwise(lambda a: pair(a).re, x),
     "imag": lambda b, eqn, x: elementwise(lambda a: pair(a).im, x),
     "conj": lambda b, eqn, x: elementwise(b.conj, x),
