@@ -47,7 +47,7 @@ def window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Place) -> np.ndarr
 
 
 def update(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Place, change: Callable, sure: Scalar = True) -> None:
-    """Put ``change(old)`` in the place of the entries in a window, where a truth value holds."""
+    """Change the entries in a window to ``change(old)``, where a truth value holds."""
     number, places = _windows(b.real, x.shape, starts, sizes)
     for i, place in enumerate(places):
         hit = b.real.op("and", sure, b.real.op("eq", number, i)) if len(places) > 1 else sure
