@@ -84,8 +84,8 @@ class ThermalJumps(Dissipation):
     ----------
     couplings : list of (V, rate)
         V is a dimensionless matrix, shape (N, N). A Hermitian V acts once, any other together with its adjoint. The
-        rate is a number >= 0 (1 / time), or a function of omega and T that is even in omega, such as
-        ``g / (2 sinh(omega / 2T))`` for a bath of bosons.
+        rate is a number >= 0 (1 / time), or a function of omega >= 0 and T, such as ``g / (2 sinh(omega / 2T))`` for a
+        bath of bosons. Where a Hamiltonian that depends on time changes the sign of omega, it has to be even in omega.
     bath : int
         The number of the bath, from 0.
 
@@ -123,7 +123,9 @@ class ThermalJumps(Dissipation):
         for i, V in enumerate(self.operators):
             if not np.asarray(V).any():
                 raise InputError(f"the coupling V[{i}] is zero: leave it out")
-        self.rates = tuple(rate if callable(rate) else checked_rate(rate) for _, rate in given)
+        self.rates = tuple(
+            _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(given)
+        )
         self.bath, self.jumps, self.frame, self.isolated, self.keeps_energy = bath, (), None, False, True
 
     @property
@@ -305,7 +307,7 @@ def checked_matrix(matrix, what: str) -> np.ndarray:
     """A square complex matrix; that of a ``Qobj`` too, which is read by its ``full()``."""
     full: Callable | None = getattr(matrix, "full", None)
     found = np.asarray(full() if callable(full) else matrix)
-    if found.dtype.kind not in "fiuc" or found.ndim != 2 or found.shape[0] != found.shape[1]:
+    if found.dtype.kind not in "fiuc" or found.ndim != 2 or found.shape[0] != found.shape[1] or not found.size:
         raise InputError(f"{what} is a square matrix of numbers, not an array of {found.dtype}, shape {found.shape}")
     if not np.isfinite(found).all():
         raise InputError(f"{what} is not finite")
@@ -386,6 +388,20 @@ def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return which, source, factors
 
 
+def _checked_function(rate: Callable, i: int) -> Callable:
+    """A rate as a function of omega and T, tried where both are one."""
+    what = f"the rate of V[{i}] is a number, or a function of omega and T to a number >= 0"
+    try:
+        value = rate(1.0, 1.0)
+    except TypeError as error:
+        raise InputError(f"{what}: {error}") from None
+    if np.shape(value) or jnp.result_type(value).kind not in "fiu":
+        raise InputError(f"{what}, not to {value!r}")
+    if not isinstance(value, jax.core.Tracer) and value < 0.0:
+        raise InputError(f"{what}: at omega = 1 and T = 1 it is {float(value):.6g}")
+    return rate
+
+
 def _hermitian(V) -> bool:
     V = np.asarray(V)
     return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
@@ -423,5 +439,6 @@ def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], 
                     f"the coupling V[{source}] has no parts with [H, V] = -omega V at all times: the eigenvectors of "
                     "the Hamiltonian turn. Jumps are for Hamiltonians whose eigenvalues alone depend on time"
                 )
+        part = part if omega >= -spread else adjoint(part)  # both act, and a rate is asked at a positive omega
         parts.append(Jump(Operator(part), source, 0.5 if still else 1.0))
     return parts

@@ -131,7 +131,7 @@ class QuantumSystem(System):
         """
         full = getattr(rho, "full", None)
         rho = full() if callable(full) else rho
-        if isinstance(rho, jax.core.Tracer) or np.shape(rho)[-1:] == (self.dim,):
+        if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
         matrices = self._checked(np.asarray(rho), mixed)
         front, m = matrices.shape[:-2], self.dim - self.body_dim
@@ -143,10 +143,14 @@ class QuantumSystem(System):
 
     def numbers(self, x, batch: bool = False):
         """What :meth:`state` makes of x; a density matrix stands for the state with every bath at entropy zero."""
-        size = self.structure.size
-        if not isinstance(x, jax.core.Tracer) and np.shape(x)[-2:] == (size, size) and np.iscomplexobj(x):
+        if not isinstance(x, jax.core.Tracer) and self._is_matrix(x, batch):
             x = np.asarray(self.state(x))
         return super().numbers(x, batch)
+
+    def _is_matrix(self, x, batch: bool) -> bool:
+        """Whether it is one density matrix or, with ``batch``, several; of one level a row of states looks like one."""
+        size = self.structure.size
+        return np.shape(x)[-2:] == (size, size) and (size > 1 or not batch)
 
     def density(self, x) -> jax.Array:
         """The density matrices of states, shape (..., n) to (..., N, N)."""
@@ -178,6 +182,10 @@ class QuantumSystem(System):
     def expectation(self, x, observable) -> jax.Array:
         """``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
         observable = checked_hermitian(observable, "the observable")
+        if observable.shape != (self.structure.size,) * 2:
+            raise InputError(
+                f"the observable has shape {observable.shape}, and the state that of {self.structure.size}"
+            )
         return jnp.asarray(x)[..., : self.body_dim] @ self.structure.vector(observable)
 
     def bloch(self, x, part: int | str = 0) -> jax.Array:
@@ -214,7 +222,7 @@ class QuantumSystem(System):
         least = float(np.linalg.eigvalsh(rho)[..., 0].min())
         if least < -WITHIN:
             raise InputError(f"the density matrix is not positive: its least eigenvalue is {least:.3g}")
-        if not 0.0 <= mixed <= 1.0:
+        if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
             raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
         return (1.0 - mixed) * rho + mixed * np.eye(size) / size
 
@@ -286,9 +294,10 @@ class QuantumSystem(System):
 
     def hamiltonians(self) -> list[np.ndarray]:
         """The Hamiltonian, at a few times where it depends on one."""
-        n, systems = self.body_dim, self.at_some_times() if self.is_driven else [self]
+        n, energies = self.body_dim, [s.energy for s in (self.at_some_times() if self.is_driven else [self])]
+        energies = [E.body if isinstance(E, WithBaths) else E for E in energies]  # temperatures may be traced
         with jax.ensure_compile_time_eval():
-            return [np.asarray(self.structure.matrix(s.energy.gradient(jnp.zeros(self.dim))[:n])) for s in systems]
+            return [np.asarray(self.structure.matrix(E.gradient(jnp.zeros(n)))) for E in energies]
 
     def casimirs(self) -> dict[str, Energy]:
         """The trace, and of a system without dissipation the purity: what relaxes keeps none but the trace."""
@@ -322,7 +331,8 @@ class QuantumSystem(System):
         parts = self.parts + other.parts
         names = self.names + other.names if len(self.names + other.names) == len(parts) else ()
         names = names if len(set(names)) == len(names) else ()
-        return QuantumSystem(whole, terms or None, _joined(self.baths, other.baths), parts=parts, names=names)
+        baths, floor = _joined(self.baths, other.baths), max(self._floor, other._floor)
+        return QuantumSystem(whole, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
         """The system with ``H + interaction``, a Hermitian matrix, shape (N, N); the couplings are split anew."""
@@ -334,7 +344,7 @@ class QuantumSystem(System):
             )
         terms = () if self.dissipation is None else self.dissipation.terms
         H = self._constant_hamiltonian() + interaction
-        return QuantumSystem(H, list(terms) or None, self.baths, parts=self.parts, names=self.names)
+        return QuantumSystem(H, list(terms) or None, self.baths, VonNeumann(self._floor), self.parts, self.names)
 
     def _constant_hamiltonian(self) -> np.ndarray:
         if self.is_driven:

@@ -80,6 +80,8 @@ def test_a_hermitian_coupling_acts_once_and_a_rate_may_depend_on_frequency_and_t
     q = lt.QuantumSystem(H, lt.ThermalJumps([(X, bosons)]), baths=infinite())
     n = 1 / np.expm1(1.3 / T)
     assert np.abs(motion(q, rho) - lindblad(rho, H, [(LOWER, 0.1 * (n + 1)), (LOWER.T, 0.1 * n)])).max() <= 1e-15
+    raising = lt.QuantumSystem(H, lt.ThermalJumps([(LOWER.T, bosons)]), baths=infinite())  # at a positive omega too
+    assert np.array_equal(motion(raising, rho), motion(q, rho))
     both = lt.QuantumSystem(H, lt.ThermalJumps([(Z, 0.3)]), baths=infinite())
     assert np.abs(motion(both, rho) - lindblad(rho, H, [(Z, 0.3)])).max() <= 1e-15
 
@@ -526,6 +528,36 @@ def test_long_taylor_steps_obey_both_laws():
     assert abs((rho[0, 0] - rho[1, 1]).real - rest - ((RHO[0, 0] - RHO[1, 1]).real - rest) * np.exp(-fast * t)) <= 1e-13
 
 
+def test_a_matrix_is_a_state_whatever_its_numbers_are():
+    """Real numbers and integers too, and of one level."""
+    q = lt.QuantumSystem([[0, 0], [0, 1]])
+    ends = [lt.integrate(q, rho, (0.0, 0.2), 0.1).x for rho in ([[0.5, 0], [0, 0.5]], q.state(np.eye(2) / 2))]
+    assert np.array_equal(*ends)
+    one = lt.QuantumSystem([[2.0]])
+    run = lt.integrate(one, [[1.0]], (0.0, 0.2), 0.1)
+    assert run.audit().passed
+    assert np.array_equal(one.density(run.x[-1]), [[1.0]])
+
+
+def test_couplings_and_products_keep_the_floor_of_the_entropy():
+    floor = lt.VonNeumann(floor=1e-10)
+    q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.2), entropy=floor)
+    assert q.coupled(0.1 * Z).entropy == floor
+    assert (lt.QuantumSystem(QUBIT, entropy=floor) * lt.QuantumSystem(QUBIT)).entropy == floor
+
+
+def test_an_ensemble_over_the_temperatures_of_a_function():
+    """The couplings are split by the Hamiltonian, which is known where temperatures are not."""
+
+    def system(temperature):
+        return lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=infinite(temperature))
+
+    x = qubit().state(RHO)
+    many = lt.ensemble(system, x, (0.0, 1.0), 0.1, lt.MetriplecticGauss(2), parameters=np.array([0.5, T]))
+    alone = lt.integrate(qubit(), x, (0.0, 1.0), 0.1, lt.MetriplecticGauss(2)).x[-1]
+    assert np.abs(many.x[1] - alone).max() <= 1e-15
+
+
 def test_a_study_over_quantum_systems():
     """A point is a system of its own, made by a function."""
 
@@ -644,6 +676,12 @@ BAD = {
     ),
     "leave out baths": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
     "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
+    r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
+    "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
+    r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
+    r"not an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
+    "the observable has shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
+    "mixed is a share": lambda q: q.state(RHO, mixed="half"),
     "matrix is not Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),
     "least eigenvalue is": lambda q: q.state(np.diag([1.2, -0.2])),
     "trace 0.7": lambda q: q.state(0.7 * RHO),
