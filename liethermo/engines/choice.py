@@ -16,7 +16,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
-from .compiled.paced import lane_pace, paced_stepper_for
+from .compiled.paced import LanePaces
 from .compiled.stepper import CompiledEngine
 from .paced import OnePace, SinglePaces
 from .pacing import Pacing
@@ -129,9 +129,9 @@ class Chosen:
 
     def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> OnePace:
         """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
-        self._choose(lambda _: paced_stepper_for(self.system, self.method, pacing)[0].operations)
+        self._choose(lambda compiled: compiled.paced(pacing)[0].operations)
         if isinstance(self._engine, CompiledEngine):
-            return _Compiled(self, pacing, x, t, stop, length)
+            return _Compiled(self, self._engine, pacing, x, t, stop, length)
         return self._single(pacing).begin(x, t, stop, length)
 
     def _single(self, pacing: Pacing) -> SinglePaces:
@@ -192,10 +192,12 @@ class Chosen:
 class _Compiled:
     """A compiled run with a pace, that the array engine takes over where it meets what cannot be unrolled."""
 
-    def __init__(self, chosen: Chosen, pacing: Pacing, x, t: float, stop: float, length: float):
+    def __init__(self, chosen: Chosen, engine: CompiledEngine, pacing: Pacing, x, t: float, stop: float, length: float):
         self._chosen, self._pacing, self._start = chosen, pacing, (x, t, stop, length)
         try:
-            self._paces: OnePace = lane_pace(chosen.system, chosen.method, pacing, x, t, stop, length)
+            stepper, whole = engine.paced(pacing)
+            x = np.asarray(x, dtype=np.float64)[None]
+            self._paces: OnePace = LanePaces(stepper, whole, whole, x, t, stop, length)
         except UnsupportedPrimitive as error:
             self._take_over(error)
 

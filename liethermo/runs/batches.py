@@ -17,8 +17,9 @@ import numpy as np
 
 from ..engines import array
 from ..engines.choice import COMPILED_DIM
-from ..engines.compiled import stepper as compiled
 from ..engines.compiled.form import numbers_of
+from ..engines.compiled.stepper import stepper_of
+from ..engines.pacing import Pacing
 from ..engines.rules import RULES
 from ..engines.stepping import TELLING, State, begin
 from ..integrators import OneStepMethod
@@ -104,13 +105,13 @@ def _cores() -> int:
 
 
 class Lanes:
-    """The stepper of a family and a method, and the parameters of its trajectories."""
+    """The stepper of a family, a method and a pacing, and the parameters of its trajectories."""
 
-    def __init__(self, family: Family, method: OneStepMethod, lanes: int = LANES):
-        self.family, self.own = family, numbers_of(method)
+    def __init__(self, family: Family, method: OneStepMethod, pacing: Pacing | None = None):
+        self.family, self.own = family, numbers_of(method, *([] if pacing is None else [pacing]))
         self.first = np.append(family.flat(slice(0, 1), 1)[0], self.own)
         self.varies = np.append(family.varies, np.zeros(len(self.own), dtype=bool))
-        self.stepper = compiled.stepper_of(family.form, self.first, method, lanes, self.varies)
+        self.stepper = stepper_of(family.form, self.first, method, pacing, LANES, self.varies)
 
     def parameters(self, chosen: slice, number: int) -> np.ndarray:
         if not self.varies.any():

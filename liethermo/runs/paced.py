@@ -8,13 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from ..engines.codes import Code
-from ..engines.compiled.form import numbers_of
-from ..engines.compiled.paced import LanePaces, paced_stepper_of
+from ..engines.compiled.paced import LanePaces
 from ..engines.paced import Guide, ManyPaces, VmapPaces
 from ..engines.pacing import ARRIVED, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
-from .batches import ARRAY_BATCH, KEPT_BEFORE, LANES, Lanes, Tally, by_threads, in_whole_vectors
+from .batches import ARRAY_BATCH, KEPT_BEFORE, Lanes, Tally, by_threads, in_whole_vectors
 from .family import Family
 from .record import Record
 
@@ -51,15 +50,11 @@ class Many:
 
     def run_compiled(self) -> None:
         """In lanes over threads; those that are at their end leave their lanes to others."""
-        lanes, size = Lanes(self.family, self.method), len(self.record.x0)
-        stepper, whole = paced_stepper_of(self.family.form, lanes.first, self.method, self.pacing, LANES, lanes.varies)
-        added = numbers_of(self.pacing)
+        lanes, size = Lanes(self.family, self.method, self.pacing), len(self.record.x0)
 
         def work(chosen: slice, stop: threading.Event) -> None:
-            number = chosen.stop - chosen.start
-            own = lanes.parameters(chosen, number)
-            own = whole if own.ndim == 1 else np.hstack([own, np.broadcast_to(added, (number, len(added)))])
-            paces = LanePaces(stepper, whole, own, self.record.x0[chosen], *self._times)
+            own = lanes.parameters(chosen, chosen.stop - chosen.start)
+            paces = LanePaces(lanes.stepper, lanes.first, own, self.record.x0[chosen], *self._times)
             self._follow(paces, np.arange(chosen.start, chosen.stop), paces.only, stop.is_set)
 
         by_threads(work, size)

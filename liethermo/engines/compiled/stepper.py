@@ -26,7 +26,9 @@ from ...tracing.calls import deferred
 from ...tracing.remembered import Latest
 from ...tracing.scalarize import scalarize
 from ..array import portion_of
+from ..pacing import TOLD, Pace, Pacing, attempted, begun, shape_seen
 from ..rules import RULES, Rules
+from ..searching import NONE
 from ..stages import Solved, by_newton
 from ..stepping import State, equations, first_state, take_step
 from .form import Form, numbers_of
@@ -35,6 +37,8 @@ from .machine_code import MachineCode
 from .newton import solver
 
 FIELDS = State._fields
+OWN = tuple(name for name in Pace._fields if name != "state")
+"""Those of a pace beside them."""
 GIVEN = ("dW", "x", "compensation", "h", "k", "before")
 """What it is given."""
 SOLVED = ("converged", "defined", "residual", "newton", "noise", "k")
@@ -60,6 +64,11 @@ class CompiledEngine:
     def _stepper(self) -> Stepper:
         """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
         return stepper_of(self._form, self._parameters, self._method, rules=self._rules)
+
+    def paced(self, pacing: Pacing) -> tuple[Stepper, np.ndarray]:
+        """The stepper of a run with a pace, and its parameters."""
+        whole = np.append(self._parameters, numbers_of(pacing))
+        return stepper_of(self._form, whole, self._method, pacing, rules=self._rules), whole
 
     @property
     def operations(self) -> int:
@@ -96,41 +105,59 @@ class CompiledEngine:
 class Stepper:
     """The step loop of one method on systems of one form, compiled; parameters are arguments.
 
+    With a pacing a step is an attempt, whose size the loop chooses.
+
     Parameters
     ----------
-    form, own : Form
-        Of the system and of the method.
+    forms : sequence of Form
+        Of the system and of the method, and of the pacing where there is one.
     parameters : array, shape (p,)
-        Those of one system and method of these forms. Zeros among them hold for all, unless they vary.
+        Those of one of each, one after another. Zeros among them hold for all, unless they vary.
     method : OneStepMethod
+    pacing : Pacing or None
     lanes : int
         Trajectories that advance together, a block.
     varies : array of bool, shape (p,)
         Which parameters are each trajectory's own.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The fields of a trajectory.
+    begins, given : tuple of str
+        The input of a run besides its x, and what a step is given besides the fields.
+    kept : tuple of str
+        The fields that are written down at each save.
     """
 
     def __init__(
         self,
-        form: Form,
-        own: Form,
+        forms: Sequence[Form],
         parameters: np.ndarray,
         method: OneStepMethod,
+        pacing: Pacing | None,
         lanes: int,
         varies: np.ndarray,
-        rules: Rules = RULES,
+        rules: Rules,
     ):
         self.lanes, self._rules, self._varies = lanes, rules, varies
         self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
         self._lock = threading.Lock()
         self._newton: MachineCode | None = None
-        self._form, self._own, self._own_start = form, own, form.size
-        system = form.build(parameters)
+        self._forms = forms
+        system = forms[0].build(parameters[: forms[0].size])
         n, slopes = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "compensation": (n,), "k": slopes, "p": parameters.shape}
         self._shapes |= {
             "before": (0 if method.explicit else method.stages, slopes[1]),
             "dW": (noise_dimension(method),),
         }
+        self.names: tuple[str, ...] = FIELDS if pacing is None else (*FIELDS, *OWN)
+        self.kept = ("x", "energy", "entropy") if pacing is None else TOLD
+        self.begins = () if pacing is None else ("t", "stop", "length")
+        self.given = ("p", "dW", "h") if pacing is None else ("p", "dW")
+        if pacing is not None:
+            self._shapes |= {"seen": shape_seen(system, method, pacing), "search": NONE.shape}
         step = self._piece(self.step, (*self.given, *self.names), self.names)
         if method.explicit:
             changing = [i for i, a in enumerate(step.arguments) if a not in ("p", "h")]
@@ -149,19 +176,28 @@ class Stepper:
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
-    def both(self, p) -> tuple[System, OneStepMethod]:
-        """System and method with the parameters p."""
-        return self._form.build(p[: self._own_start]), self._own.build(p[self._own_start :])
+    def built(self, p) -> list[Any]:
+        """System and method, and pacing, with the parameters p."""
+        ends = itertools.accumulate(form.size for form in self._forms)
+        return [form.build(p[end - form.size : end]) for form, end in zip(self._forms, ends, strict=True)]
 
-    def begun(self, p, x, *others) -> tuple:
+    def begun(self, p, x, *times) -> tuple:
         """The fields of a run about to start at x."""
-        assert not others
-        return first_state(*self.both(p), x)
+        system, method, *way = self.built(p)
+        if not way:
+            return first_state(system, method, x)
+        pace = begun(system, method, way[0], x, *times)
+        return *pace.state, *pace[1:]
 
-    def step(self, p, dW, h, *fields) -> tuple:
-        """The fields after a step."""
-        system, method = self.both(p)
-        return take_step(system, driven_by(method, dW), State(*fields), h, self._rules, self._second(dW))
+    def step(self, p, dW, *given) -> tuple:
+        """The fields after a step, or an attempt, from its size and those before, or these alone."""
+        system, method, *way = self.built(p)
+        if not way:
+            h, *fields = given
+            return take_step(system, driven_by(method, dW), State(*fields), h, self._rules, self._second(dW))
+        before = Pace(State(*given[: len(FIELDS)]), *given[len(FIELDS) :])
+        pace = attempted(system, method, way[0], before, self._rules, self._second(dW))
+        return *pace.state, *pace[1:]
 
     def _second(self, dW) -> Callable:
         """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
@@ -176,7 +212,7 @@ class Stepper:
 
     def _by_newton(self, p, handed) -> tuple:
         """What takes the place of what is handed over."""
-        system, method = self.both(p)
+        system, method, *_ = self.built(p)
         shapes = [self.shape(name) for name in (*SOLVED, *GIVEN)]
         ends = itertools.accumulate(map(math.prod, shapes))
         parts = [handed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
@@ -184,18 +220,6 @@ class Stepper:
         own = equations(system, driven_by(method, dW), x, compensation, h, k, before, self._rules, jax.lax.map)
         found = by_newton(own, self._rules)
         return tuple(1.0 * getattr(found, name) for name in SOLVED)
-
-    names: tuple[str, ...] = FIELDS
-    """The fields of a trajectory."""
-
-    begins: tuple[str, ...] = ()
-    """The input of a run besides its x."""
-
-    given: tuple[str, ...] = ("p", "dW", "h")
-    """What a step is given besides them."""
-
-    kept: tuple[str, ...] = ("x", "energy", "entropy")
-    """The fields that are written down at each save."""
 
     @property
     def operations(self) -> int:
@@ -364,30 +388,22 @@ def stepper_of(
     form: Form,
     parameters: np.ndarray,
     method: OneStepMethod,
+    pacing: Pacing | None = None,
     lanes: int = 1,
     varies: np.ndarray | None = None,
     rules: Rules = RULES,
 ) -> Stepper:
-    """The stepper for systems of a form, and a method.
+    """The stepper for systems of a form, a method, and a pacing.
 
     Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
 
     Parameters
     ----------
     parameters : array, shape (p,)
-        Of a system of that form, then of the method: see :func:`numbers_of`.
+        Of a system of that form, of the method, and of the pacing: see :func:`numbers_of`.
     """
-    own, varies = Form.of(method), np.zeros(len(parameters), dtype=bool) if varies is None else varies
-    key = key_of((form, own), parameters, varies, lanes, rules)
-    return remembered_stepper(key, lambda: Stepper(form, own, parameters, method, lanes, varies, rules))
-
-
-def key_of(forms: Sequence[Form], parameters: np.ndarray, varies: np.ndarray, lanes: int, rules: Rules) -> tuple:
-    """What tells a stepper from others."""
-    known = (parameters == 0.0) & ~varies
-    return *((form.key, form.shapes) for form in forms), known.tobytes(), varies.tobytes(), lanes, rules
-
-
-def remembered_stepper(key: tuple, make: Callable[[], Any]) -> Any:
-    """The stepper with a key, made where there is none."""
-    return _steppers.find(key, make)
+    forms = [form, Form.of(method), *([] if pacing is None else [Form.of(pacing)])]
+    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
+    known = ((parameters == 0.0) & ~varies).tobytes(), varies.tobytes()
+    key = *((form.key, form.shapes) for form in forms), *known, lanes, rules
+    return _steppers.find(key, lambda: Stepper(forms, parameters, method, pacing, lanes, varies, rules))
