@@ -1,5 +1,5 @@
 """How the definition of a step becomes fast code.
 
-An :class:`.choice.Engine` takes the steps of one method on one system: arrays in JAX, machine code for small systems,
+An engine takes the steps of one method on one system: arrays in JAX, machine code for small systems,
 sparse matrices for large networks. :class:`.choice.Chosen` picks one.
 """

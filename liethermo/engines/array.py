@@ -108,7 +108,13 @@ class OnDemand:
 
 
 class ArrayEngine:
-    """The array engine for one system and method: an :class:`.choice.Engine`."""
+    """The array engine for one system and method.
+
+    Attributes
+    ----------
+    portion : int
+        Saves that one call takes at most.
+    """
 
     name = "array"
 
@@ -118,17 +124,23 @@ class ArrayEngine:
         self._on_demand = OnDemand(method)
 
     def begin(self, x) -> State:
+        """The state of a run about to start at x."""
         return begin(self.system, self.method, x)
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
+        """Up to ``saves <= portion`` times ``every`` steps of size h: see :func:`advance`."""
         given = jnp.asarray(h), jnp.asarray(saves), jnp.asarray(every), self.portion, self.rules, rows(noise)
         return self._on_demand.advance(lambda s, *how: advance(self.system, self.method, s, *given, *how), state, every)
 
     def step(self, state: State, h, noise=None) -> State:
+        """The state after one step, or as it was with the status of a failure."""
         return self.advance(state, h, 1, 1, noise)[0]
 
     def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
+        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken.
+
+        Each is the first step of a run of its own.
+        """
         found, block = np.empty_like(x), min(TOGETHER, self.portion)
         for first in range(0, len(x), block):
             some = np.minimum(np.arange(first, first + block), len(x) - 1)  # of one length, for one program

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -39,42 +39,8 @@ SPARSE_DIM = 200
 """Components from which a system that knows its sparsity is solved by it."""
 
 
-class Engine(Protocol):
-    """Takes the steps of one method on one system."""
-
-    name: str
-    portion: int  # saves that one call takes at most
-
-    def begin(self, x) -> State:
-        """The state of a run about to start at x."""
-        ...
-
-    def advance(self, state: State, h, saves: int, every: int, noise=None) -> tuple[State, tuple]:
-        """Up to ``saves <= portion`` times ``every`` steps of size h; stops where a step fails.
-
-        Returns the new state and, for each save, the state vector, energy and entropy, and whether it was reached.
-        ``noise`` has the increments that drive each step, an array of shape (steps, increments), where there are any.
-        """
-        ...
-
-    def step(self, state: State, h, noise=None) -> State:
-        """The state after one step, or as it was with the status of a failure."""
-        ...
-
-    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Where steps of sizes h, shape (m,), end that begin at states x, shape (m, n); NaN where one cannot be taken.
-
-        Each is the first step of a run of its own.
-        """
-        ...
-
-
-class Noise(Protocol):
-    """Where the increments of a trajectory come from."""
-
-    def rows(self, first: int, steps: int, h) -> np.ndarray:
-        """Those of so many steps of size h from a step on, shape (steps, increments)."""
-        ...
+Engine: TypeAlias = ArrayEngine | CompiledEngine | SparseEngine
+"""Takes the steps of one method on one system: see :class:`.array.ArrayEngine`."""
 
 
 class CompiledEngineWarning(UserWarning):
@@ -92,11 +58,11 @@ class Chosen:
     asked : one of ENGINES
     steps : int
         How many are to be taken.
-    noise : Noise, optional
-        What drives the steps: those with the same number are driven by the same.
+    noise : function of (first, steps, h), optional
+        The increments of so many steps of size h from a first one on, shape (steps, increments).
     """
 
-    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int, noise: Noise | None = None):
+    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int, noise: Callable | None = None):
         self.system, self.method, self.asked, self.steps, self.noise = system, method, asked, steps, noise
         self._engine: Engine = ArrayEngine(system, method)
         self._chosen = False
@@ -125,18 +91,25 @@ class Chosen:
         return self._attempt(lambda engine, _: engine.ends(x, h))
 
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
-        return None if self.noise is None else self.noise.rows(int(state.step), steps, h)
+        return None if self.noise is None else self.noise(int(state.step), steps, h)
 
     def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> OnePace:
         """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
         self._choose(lambda compiled: compiled.paced(pacing)[0].operations)
-        if isinstance(self._engine, CompiledEngine):
-            return _Compiled(self, self._engine, pacing, x, t, stop, length)
-        return self._single(pacing).begin(x, t, stop, length)
 
-    def _single(self, pacing: Pacing) -> SinglePaces:
-        step = self._engine.step if self._engine.name == "sparse" else None
-        return SinglePaces(self.system, self.method, pacing, step)
+        def begun(engine: Engine, _) -> OnePace:
+            if isinstance(engine, CompiledEngine):
+                stepper, whole = engine.paced(pacing)
+                return LanePaces(stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)
+            step = engine.step if isinstance(engine, SparseEngine) else None
+            return SinglePaces(self.system, self.method, pacing, step).begin(x, t, stop, length)
+
+        return self._attempt(begun)
+
+    def instead(self, error: UnsupportedPrimitive, pacing: Pacing, paces: OnePace) -> SinglePaces:
+        """What goes on with a run with a pace, where the compiled engine meets what it cannot unroll."""
+        self._fall_back(error)
+        return SinglePaces(self.system, self.method, pacing).continued(paces)
 
     def _choose(self, operations: Callable[[CompiledEngine], int]) -> None:
         """Choose an engine when the run begins; ``operations`` counts those of a step of the compiled one."""
@@ -187,41 +160,6 @@ class Chosen:
             raise error
         warn_of_fallback(error)
         self._engine = ArrayEngine(self.system, self.method)
-
-
-class _Compiled:
-    """A compiled run with a pace, that the array engine takes over where it meets what cannot be unrolled."""
-
-    def __init__(self, chosen: Chosen, engine: CompiledEngine, pacing: Pacing, x, t: float, stop: float, length: float):
-        self._chosen, self._pacing, self._start = chosen, pacing, (x, t, stop, length)
-        try:
-            stepper, whole = engine.paced(pacing)
-            x = np.asarray(x, dtype=np.float64)[None]
-            self._paces: OnePace = LanePaces(stepper, whole, whole, x, t, stop, length)
-        except UnsupportedPrimitive as error:
-            self._take_over(error)
-
-    def _take_over(self, error: UnsupportedPrimitive) -> None:
-        self._chosen._fall_back(error)
-        self._paces = self._chosen._single(self._pacing).begin(*self._start)
-
-    def state(self) -> State:
-        return self._paces.state()
-
-    def attempts(self, most: int) -> dict[str, np.ndarray]:
-        try:
-            return self._paces.attempts(most)
-        except UnsupportedPrimitive as error:
-            before = self._paces
-            self._take_over(error)
-            assert isinstance(self._paces, SinglePaces)
-            return self._paces.continued(before).attempts(most)
-
-    def read(self, name: str, chosen: Any = slice(None)):
-        return self._paces.read(name, chosen)
-
-    def write(self, name: str, chosen, values) -> None:
-        self._paces.write(name, chosen, values)
 
 
 def is_small(system: System) -> bool:

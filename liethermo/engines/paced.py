@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from . import searching
 from .array import OnDemand
 from .codes import Code
 from .compiled.form import Form
+from .compiled.paced import LanePaces
 from .growth import FEW
 from .pacing import (
     ARRIVED,
@@ -39,41 +40,6 @@ from .rules import EPS, RULES
 from .stepping import State
 
 
-class Paces(Protocol):
-    """Trajectories with paces of their own."""
-
-    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
-        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
-        ...
-
-    def write(self, name: str, chosen: np.ndarray, values) -> None: ...
-
-
-class ManyPaces(Paces, Protocol):
-    """Trajectories that are followed together; each is what it would be alone."""
-
-    number: int
-
-    def follow(self, most: int) -> None:
-        """So many attempts of each, or as many as it takes until it pauses."""
-        ...
-
-
-class OnePace(Paces, Protocol):
-    """One trajectory, whose attempts can be looked at."""
-
-    def state(self) -> State:
-        """As it stands."""
-        ...
-
-    def attempts(self, most: int) -> dict[str, np.ndarray]:
-        """Make so many attempts, or fewer.
-
-        Returns, attempts first, what :data:`.pacing.TOLD` names of each.
-        """
-        ...
-
-
 class _ArrayPaces:
     """What the array engine's have in common; fields are read and written with trajectories first."""
 
@@ -81,6 +47,7 @@ class _ArrayPaces:
     pace: Pace
 
     def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
+        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
         return self._field(name)[chosen]
 
     def write(self, name: str, chosen: np.ndarray, values) -> None:
@@ -116,17 +83,21 @@ class SinglePaces(_ArrayPaces):
         self.pace = begin(self.system, self.method, self.pacing, jnp.asarray(x), *times)
         return self
 
-    def continued(self, others: Paces) -> SinglePaces:
+    def continued(self, others: OnePace) -> SinglePaces:
         """From where another engine has come to."""
+        x, t, stop = (others.read(name)[0] for name in ("x", "t", "stop"))
+        self.begin(x, t, stop, stop - t)
         for name in (*State._fields, *Pace._fields[1:]):
             whole = self._field(name)
             self._put(name, np.asarray(others.read(name)).reshape(whole.shape).astype(whole.dtype))
         return self
 
     def state(self) -> State:
+        """As it stands."""
         return State(*(self.read(name)[0] for name in State._fields))
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
+        """Make so many attempts, or fewer: attempts first, what :data:`.pacing.TOLD` names of each."""
         del most  # one, which nothing else follows
         if self._step is None:
             given, one = (self.system, self.method, self.pacing), jnp.asarray(1)
@@ -146,8 +117,19 @@ class VmapPaces(_ArrayPaces):
         self.pace = _begin_all(form, parameters, axes, method, pacing, jnp.asarray(x), *times)
 
     def follow(self, most: int) -> None:
+        """So many attempts of each, or as many as it takes until it pauses."""
         given, count = (self.form, self.parameters, self.axes, self.method, self.pacing), jnp.asarray(most)
         self.pace = self._on_demand.follow(lambda p, newton: _follow_all(*given, p, count, newton), self.pace)
+
+
+OnePace: TypeAlias = SinglePaces | LanePaces
+"""One trajectory, whose attempts can be looked at."""
+
+ManyPaces: TypeAlias = VmapPaces | LanePaces
+"""Trajectories that are followed together; each is what it would be alone."""
+
+Paces: TypeAlias = OnePace | ManyPaces
+"""Trajectories with paces of their own."""
 
 
 @program

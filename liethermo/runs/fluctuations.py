@@ -151,19 +151,8 @@ def _residuals(model: tuple[System, Energy | None], x):
 
 
 @dataclass(frozen=True)
-class Path:
-    """The noise of one trajectory: see :class:`liethermo.engines.choice.Noise`."""
-
-    noise: Fluctuations
-    increments: int
-
-    def rows(self, first: int, steps: int, h) -> np.ndarray:
-        return self.noise.rows(self.increments, np.zeros(1, dtype=int), first, steps, float(h))[0]
-
-
-@dataclass(frozen=True)
 class Paths:
-    """That of the trajectories of an ensemble with the given numbers, shape (B,)."""
+    """The noise of trajectories with the given numbers, shape (B,)."""
 
     noise: Fluctuations
     increments: int

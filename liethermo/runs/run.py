@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from ..tracing.interpret import at_points
 from .adaptive import Adaptive, pacing_of
 from .ending import STOPPED, given_up, stats_of, status_of, stopped_by
 from .events import Event
-from .fluctuations import Fluctuations, Path
+from .fluctuations import Fluctuations, Paths
 from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, Steps, follow
 from .timetable import Course
@@ -63,7 +64,10 @@ class Run:
         self.path = [(self.times[0], self.states[0])] if dense else None  # all states
         self.taken: list[np.ndarray] = []  # sizes of steps that are looked at, and whether states after them are kept
         self.noise = noise
-        path = None if noise is None or not noise_dimension(method) else Path(noise, noise_dimension(method))
+        path: Callable | None = None
+        if noise is not None and (increments := noise_dimension(method)):
+            only = Paths(noise, increments, np.zeros(1, dtype=int))
+            path = lambda first, steps, h: only.rows(slice(None), first, steps, h)[0]  # noqa: E731
         self.engine = Chosen(system, method, engine, course.steps, path)
 
     @property

@@ -17,6 +17,7 @@ from ..engines.codes import Code
 from ..engines.paced import Guide, OnePace
 from ..engines.pacing import FINISHED, TOLD, Pacing
 from ..engines.stepping import State
+from ..tracing.scalarize import UnsupportedPrimitive
 from .ending import STOPPED, stopped_by
 from .watch import Watch
 
@@ -123,7 +124,11 @@ def _follow(
             outcome.limit = "memory"
             return
         before = outcome.state
-        rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
+        try:
+            rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
+        except UnsupportedPrimitive as error:
+            guide.paces = paces = engine.instead(error, pacing, paces)
+            continue
         outcome.rejected = int(scalar("rejected"))
         after: Any = paces.state()
         outcome.state = after._replace(status=np.int64(0))

@@ -46,7 +46,7 @@ SOLVED = ("converged", "defined", "residual", "newton", "noise", "k")
 
 
 class CompiledEngine:
-    """The compiled engine for one system and method: an :class:`..choice.Engine`, with the results of the array engine.
+    """The compiled engine for one system and method: its results are those of the array engine.
 
     Raises
     ------
@@ -87,7 +87,6 @@ class CompiledEngine:
         return self._run(state, h, 1, 1, noise)[0]
 
     def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
         blocks = self._stepper.begin(self._parameters, x)
         self._stepper.run(self._parameters, blocks, h, 1, 1)
         found = self._stepper.fields(blocks, ("x", "status"))

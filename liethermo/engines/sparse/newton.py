@@ -34,8 +34,6 @@ formed whatever its size, and a few stiff components of many are not to be lost 
 class SparseEngine:
     """The engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
 
-    An :class:`..choice.Engine`.
-
     Raises
     ------
     ValueError
@@ -75,13 +73,11 @@ class SparseEngine:
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
 
     def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken."""
         states = [self.step(self.begin(jnp.asarray(start)), size) for start, size in zip(x, h, strict=True)]
         solved = np.array([int(s.status) == Code.COMPLETED for s in states])
         return np.where(solved[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
 
     def step(self, state: State, h, noise=None) -> State:
-        """One step; where it fails the state is left as it was, with a status."""
         del noise
         h = jnp.asarray(h, dtype=jnp.float64)
         solved = _fixed_point(self.system, self.method, state, h)
