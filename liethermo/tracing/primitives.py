@@ -158,9 +158,10 @@ def _cumulative(combine: Callable[..., Scalar]) -> Rule:
     return rule
 
 
-UNROLLED_PRODUCTS, OF_HELD = 900, 100
+UNROLLED_PRODUCTS, OF_HELD, WITHOUT_SUMS = 900, 100, 9_000
 """Products of real numbers in a product of matrices that is unrolled, at most: more are a loop. Where one of them lies
-in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier."""
+in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier. A product
+of a column and a row sums nothing: unrolled, it costs only those of its entries that are used."""
 
 
 def _products(rows: np.ndarray, columns: np.ndarray) -> int:
@@ -179,6 +180,8 @@ def _is_loop(b, rows: np.ndarray, columns: np.ndarray) -> bool:
     count = _products(rows, columns)
     if b.real is not b:  # of complex numbers
         return 4 * count > UNROLLED_PRODUCTS
+    if rows.shape[-1] == 1:
+        return count > WITHOUT_SUMS
     if count > UNROLLED_PRODUCTS or count <= OF_HELD:
         return count > UNROLLED_PRODUCTS
     return any(min(x.shape) > 1 and algebra.held(b, x) is not None for x in (rows, columns))
