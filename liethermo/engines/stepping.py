@@ -12,7 +12,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import orderless, pulled
 from ..integrators.explicit import LEVELS
 from ..systems import System
-from ..tracing.programs import hasty_program, program
+from ..tracing.programs import hasty_program
 from .codes import Code
 from .rules import EPS, RULES, Rules
 from .stages import Equations, Solved, explicit, fixed_point, newton_steps, noise_of, solve_stages
@@ -193,16 +193,6 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
     if x.size > rules.large:  # a choice entry by entry would read both
         return jax.lax.cond(good, lambda: new_state, lambda: failed)
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)
-
-
-def error_of_step(system: System, method: OneStepMethod, x, compensation, h, k):
-    """The method's estimate of its local error, a number; for both engines."""
-    return _error(system, method, jnp.asarray(x), jnp.asarray(compensation), jnp.asarray(h), jnp.asarray(k))
-
-
-@program
-def _error(system, method, x, compensation, h, k):
-    return method.error(system, x, compensation, h, k)
 
 
 def finish(system: System, method: OneStepMethod, x, compensation, h, k):

@@ -385,9 +385,6 @@ class Builder:
         """Its complex conjugate: itself."""
         return a
 
-    def real_part(self, a):
-        return a
-
     def max(self, a, b):
         return self.op("max", a, b)
 

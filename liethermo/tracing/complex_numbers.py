@@ -66,9 +66,6 @@ class ComplexBuilder:
         a = pair(a)
         return Pair(a.re, self.real.neg(a.im))
 
-    def real_part(self, a):
-        return Pair(pair(a).re, 0.0)
-
     def div(self, a, b):
         """With the divisor scaled, so that its square neither overflows nor vanishes."""
         a, b, r = pair(a), pair(b), self.real

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .builder import OF_TESTS, TESTS, Block, Instruction, Scalar, meaning
+from .builder import Block, Instruction, Scalar, meaning
 from .calls import Product
 
 
@@ -136,49 +136,6 @@ class Program:
             instructions.append(instruction)
         return replace(self, instructions=tuple(instructions))
 
-    def split(self, late: Sequence[int]) -> tuple[Program, Program]:
-        """What can be computed without some of the inputs, and the rest.
-
-        The second program has one more input array, at the end: the output of the first. Arrays hold numbers, so truth
-        values and integers are handed over as such.
-
-        Parameters
-        ----------
-        late : sequence of int
-            Places of those inputs.
-        """
-        waiting: set[Scalar] = {name for i in late for name in self.inputs[i]}
-        early, rest = [], []
-        for instruction in self.instructions:
-            if waiting.isdisjoint(instruction.args):
-                early.append(instruction)
-            else:
-                rest.append(instruction)
-                waiting.add(instruction.target)
-        wanted = {a for instruction in rest for a in instruction.args} | {
-            a for entries in self.outputs for a in entries
-        }
-        tables = [i for i in early if i.target in wanted and i.op in ("table", "column")]
-        for target, op, args in tables:  # no number: its entries are handed over
-            entries = args
-            if op == "column":
-                names = [f"{target}_{i}" for i in range(int(args[2]))]
-                early += [Instruction(a, "item", (args[0], int(args[1]) + i)) for i, a in enumerate(names)]
-                entries = tuple(names)
-            wanted |= set(entries)
-            rest.insert(0, Instruction(target, "table", entries))
-        unlike = {i.target for i in tables}
-        handed = [i.target for i in early if i.target in wanted and i.target not in unlike]
-        kinds = kinds_of(early)
-        others = {a: f"{a}_as_number" for a in handed if kinds[a] != "f"}
-        early += [Instruction(number, "float", (a,)) for a, number in others.items()]
-        back: dict[str, tuple[str, tuple]] = {"b": ("ne", (0.0,)), "i": ("truncate", ())}
-        rest = [Instruction(a, back[kinds[a]][0], (n, *back[kinds[a]][1])) for a, n in others.items()] + rest
-        handed = [others.get(a, a) for a in handed]
-        instructions, renamed = live(early, handed)
-        first = Program(self.inputs, instructions, (tuple(renamed[a] for a in handed),), ((len(handed),),))
-        return first, Program((*self.inputs, tuple(handed)), tuple(rest), self.outputs, self.shapes)
-
 
 @dataclass(frozen=True, eq=False)
 class While(Block):
@@ -274,39 +231,6 @@ class Routine(Block):
 
 
 # -- what follows from instructions -----------------------------------------------------------------------------------
-
-
-def kinds_of(instructions: Sequence[Instruction]) -> dict[Scalar, str]:
-    """Whether each target is a number, an integer or true or false, ``"f"``, ``"i"`` or ``"b"``; others are numbers."""
-    blocks: dict[Scalar, Block] = {}
-    kinds: dict[Scalar, str] = {}
-
-    def kind(a: Scalar) -> str:
-        if isinstance(a, str):
-            return kinds.get(a, "f")
-        return "b" if isinstance(a, bool) else "i" if isinstance(a, int) else "f"
-
-    for target, op, args in instructions:
-        if isinstance(op, Block):
-            blocks[target] = op
-        elif op in ("item", "column"):
-            kinds[target] = blocks[args[0]].kinds[int(args[1])]
-        elif op == "lookup":
-            kinds[target] = kinds.get(args[1], "f")
-        elif op in TESTS or op == "branch":
-            kinds[target] = "b"
-        elif op in ("int", "truncate", "quotient", "wrap"):
-            kinds[target] = "i"
-        elif op in OF_TESTS or op in KEEPING:
-            found = {kind(a) for a in (args[1:] if op in ("select", "pick") else args)}
-            kinds[target] = "f" if "f" in found else "i" if "i" in found else "b"
-        else:
-            kinds[target] = "f"
-    return kinds
-
-
-KEEPING = frozenset("add sub mul neg max min abs sign rem select pick table".split())
-"""Operations whose results are of the kind of their arguments."""
 
 
 def live(

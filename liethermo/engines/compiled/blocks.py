@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -236,10 +235,7 @@ def _routine(writer: Any, routine: Routine, args: Sequence[Any]) -> Results:
 
 def _written(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
     kinds = [writer.number.as_pointer()] * 2 + [a.start.type for a in tables.values()]
-    function = ir.Function(writer.builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
-    function.linkage = "internal"
-    function.attributes.add("noinline")
-    inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
+    function, inside = writer.function(name, kinds)
     build, (given, found, *starts) = inside.builder, function.args
     own = {i: a.elsewhere(inside, start) for (i, a), start in zip(tables.items(), starts, strict=True)}
     order = {j: i for i, j in enumerate(j for j in range(len(routine.program.inputs[0])) if j not in tables)}
@@ -270,11 +266,7 @@ def _product(writer: Any, block: Product, args: Sequence[Table]) -> Results:
 
 def _product_function(writer: Any, block: Product, tables: Sequence[Table], name: str) -> ir.Function:
     m, k, n = block.sizes
-    signature = ir.FunctionType(ir.VoidType(), [*(a.start.type for a in tables), writer.number.as_pointer()])
-    function = ir.Function(writer.builder.module, signature, name)
-    function.linkage = "internal"
-    function.attributes.add("noinline")
-    inside = writer.at(ir.IRBuilder(function.append_basic_block("entry")))
+    function, inside = writer.function(name, [*(a.start.type for a in tables), writer.number.as_pointer()])
     build, number = inside.builder, inside.whole_number
     *starts, out = function.args
     given = [a.elsewhere(inside, start) for a, start in zip(tables, starts, strict=True)]
@@ -314,12 +306,7 @@ def _call(writer: Any, call: Call, args: Sequence[ir.Value]) -> Results:
     given = Table(writer, writer.number, [writer.cast(a, "f") for a in args])
     found = Table(writer, writer.number, length=count)
     pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (given, found)]
-    function = kernel(build.module, call, writer.lanes)
-    with writer.counted(writer.whole_number(writer.lanes)) if writer.lanes > 1 else _once(writer) as lane:
+    function = kernel(writer, call)
+    with writer.counted(writer.whole_number(writer.lanes)) as lane:
         build.call(function, [build.gep(pointer, [lane]) for pointer in pointers])
     return Results([], [found], count)
-
-
-@contextlib.contextmanager
-def _once(writer: Any) -> Iterator[ir.Value]:
-    yield writer.whole_number(0)

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
@@ -54,26 +55,28 @@ def bind() -> None:
         llvm.add_symbol(PREFIX + own, pointer(capsule, name(capsule)))
 
 
-def kernel(module: ir.Module, call: Call, stride: int) -> ir.Function:
-    """The function ``f(given, found)`` of a call, of arrays whose entries are ``stride`` numbers apart."""
+def kernel(writer: Any, call: Call) -> ir.Function:
+    """The function ``f(given, found)`` of a call for one lane, of arrays with a number for each.
+
+    Parameters
+    ----------
+    writer : Writer
+    """
     name = "_".join(["call", call.name, "z" if call.is_complex else "d", *map(str, call.sizes)])
-    if name in module.globals:
-        return module.globals[name]
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS]), name)
-    function.linkage = "internal"
-    function.attributes.add("noinline")
-    _Kernel(function, call, stride).write()
+    if name in writer.builder.module.globals:
+        return writer.builder.module.globals[name]
+    function, inside = writer.function(name, [NUMBERS, NUMBERS])
+    _Kernel(inside, function.args, call).write()
     return function
 
 
 class _Kernel:
     """Writes a kernel. Matrices lie column by column inside, complex numbers as their two parts."""
 
-    def __init__(self, function: ir.Function, call: Call, stride: int):
-        self.function, self.call, self.stride = function, call, stride
-        self.build = ir.IRBuilder(function.append_basic_block("entry"))
+    def __init__(self, writer: Any, arguments: Sequence[ir.Value], call: Call):
+        self.writer, self.call, self.build = writer, call, writer.builder
         self.parts = 2 if call.is_complex else 1
-        self.given, self.found = function.args
+        self.given, self.found = arguments
 
     def write(self) -> None:
         build, shapes = self.build, self.call.arguments
@@ -82,8 +85,7 @@ class _Kernel:
         build.store(ir.Constant(ir.IntType(1), 1), finite)
         for i in self._range(total):
             value = build.load(self._at(self.given, i))
-            size = build.call(self._intrinsic("llvm.fabs.f64"), [value])
-            sound = build.fcmp_ordered("<", size, ir.Constant(NUMBER, math.inf))
+            sound = build.fcmp_ordered("==", build.fsub(value, value), ir.Constant(NUMBER, 0.0))  # not of infinity
             build.store(build.and_(build.load(finite), sound), finite)
         with build.if_else(build.load(finite)) as (sound, not_sound):
             with sound:
@@ -172,7 +174,7 @@ class _Kernel:
     # -- arrays -------------------------------------------------------------------------------------------------------
 
     def _at(self, base: ir.Value, i: ir.Value) -> ir.Value:
-        return self.build.gep(base, [self.build.mul(i, ir.Constant(WHOLE, self.stride))])
+        return self.build.gep(base, [self.build.mul(i, ir.Constant(WHOLE, self.writer.lanes))])
 
     def _out(self, which: int, i: ir.Value) -> ir.Value:
         """Entry i of a result."""
@@ -249,26 +251,10 @@ class _Kernel:
             with failed:
                 self._fail()
 
-    def _intrinsic(self, name: str, count: int = 1) -> ir.Function:
-        module = self.build.module
-        if name in module.globals:
-            return module.globals[name]
-        return ir.Function(module, ir.FunctionType(NUMBER, [NUMBER] * count), name)
-
     def _range(self, count: int):
         """A loop: the body of the ``for`` is written once, with its counter."""
-        build = self.build
-        counter = self._alloca(WHOLE, 1)
-        build.store(ir.Constant(WHOLE, 0), counter)
-        head, body, after = (build.append_basic_block(name) for name in ("head", "body", "after"))
-        build.branch(head)
-        build.position_at_end(head)
-        build.cbranch(build.icmp_signed("<", build.load(counter), ir.Constant(WHOLE, count)), body, after)
-        build.position_at_end(body)
-        yield build.load(counter)
-        build.store(build.add(build.load(counter), ir.Constant(WHOLE, 1)), counter)
-        build.branch(head)
-        build.position_at_end(after)
+        with self.writer.counted(ir.Constant(WHOLE, count)) as i:
+            yield i
 
 
 def declared(module: ir.Module, name: str, result: ir.Type, kinds: Sequence[ir.Type]) -> ir.Function:

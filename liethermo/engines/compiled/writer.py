@@ -58,9 +58,12 @@ class Writer:
         self.kinds = {"f": self.number, "b": self.test, "i": self.whole}
         self.active: ir.Value | None = None
 
-    def at(self, builder: ir.IRBuilder) -> Writer:
-        """A writer for as many lanes, where another builder stands."""
-        return Writer(builder, self.lanes)
+    def function(self, name: str, kinds: Sequence[ir.Type]) -> tuple[ir.Function, Writer]:
+        """A function of the module that returns nothing, and what writes it, for as many lanes."""
+        function = ir.Function(self.builder.module, ir.FunctionType(ir.VoidType(), list(kinds)), name)
+        function.linkage = "internal"
+        function.attributes.add("noinline")
+        return function, Writer(ir.IRBuilder(function.append_basic_block("entry")), self.lanes)
 
     def write(self, program: Program, read: Read, memory: Memory | None = None) -> list[list[ir.Value]]:
         """The values of the outputs, array by array.

@@ -14,7 +14,6 @@ from liethermo.engines import array
 from liethermo.engines.compiled import stepper as compiled
 from liethermo.engines.growth import growing
 from liethermo.engines.pacing import after_bad, after_good
-from liethermo.engines.stepping import error_of_step
 from liethermo.runs import stepwise
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 
@@ -78,7 +77,7 @@ def test_the_estimate_of_the_local_error(stages, h):
     ratios = []
     for x in lt.integrate(SYSTEM, START, (0.0, 20.0), 0.5, engine="array").x:
         new, right = (f.step(f.begin(x), h) for f in engines)
-        estimate = error_of_step(SYSTEM, method, x, np.zeros(3), h, new.k)
+        estimate = method.error(SYSTEM, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate / np.abs(new.x - right.x).max()))
     mean = np.exp(np.mean(np.log(ratios)))
     assert 0.5 < mean < 2.0, ratios
@@ -95,7 +94,7 @@ def test_the_estimate_scales_with_the_motion():
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
         new, right = (e.step(e.begin(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
-        estimate = error_of_step(free, method, x, np.zeros(3), h, new.k)
+        estimate = method.error(free, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios
 

@@ -755,41 +755,6 @@ def test_refusal_names_the_primitive_and_the_line(f, primitive, reason):
     assert error.where in str(error)
 
 
-def test_a_split_program_hands_over_numbers():
-    """Truth values too: what is in an array between the parts is a double."""
-
-    def f(fixed, a):
-        positive, first = fixed > 0.0, fixed[0] == 0.3
-        return jnp.where(positive & (a > fixed), a, -a) + jnp.exp(fixed), first | (a[0] > 1.0)
-
-    fixed, a = np.array([0.3, -0.8, 1.9]), np.array([1.1, -1.1, 0.4])
-    whole = scalarize(jax.make_jaxpr(f)(fixed, a))
-    first, rest = whole.split([1])
-    (handed,) = first.evaluate(fixed, a)
-    assert handed.dtype == np.float64
-    assert "exp" in first.operations
-    assert "exp" not in rest.operations
-    for found, expected in zip(rest.evaluate(fixed, a, handed), f(fixed, a), strict=True):
-        assert np.array_equal(found, expected)
-
-
-def test_a_split_program_hands_over_what_loops_have_made():
-    """Their rows too, and integers."""
-
-    def f(fixed, a):
-        _, (rows, places) = lax.scan(lambda c, t: (jnp.sin(c) / 3 + t, (c[0] * t, jnp.argmax(c))), fixed, c300)
-        return lax.scan(lambda c, row: (0.3 * jnp.sin(c * a) + jnp.cos(row * a) / 2, c), a, rows)[0] + places[7] * a, a[
-            places[3]
-        ]
-
-    fixed, a = np.array([0.3, -0.8, 1.9]), np.array([1.1, -1.1, 0.4])
-    first, rest = scalarize(jax.make_jaxpr(f)(fixed, a)).split([1])
-    assert first.operations["scan"] == rest.operations["scan"] == 1
-    (handed,) = first.evaluate(fixed, a)
-    for found, expected in zip(rest.evaluate(fixed, a, handed), f(fixed, a), strict=True):
-        assert np.abs(found - expected).max() < 4e-16 * np.abs(expected).max() + 1e-300
-
-
 def test_too_large_a_program_is_refused():
     with pytest.raises(UnsupportedPrimitive, match=r"'sin' within the size limit.*exceeds 500 scalar") as caught:
         program_of(lambda a: jnp.sin(jnp.outer(a, a)), np.arange(1.0, 28.0), limit=500)
