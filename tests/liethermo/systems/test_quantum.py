@@ -12,6 +12,7 @@ import scipy.linalg
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.rules import RULES
+from liethermo.functions.gradients import EPS
 
 LOWER = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=complex)
 X, Y, Z = (np.array(m, dtype=complex) for m in ([[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]))
@@ -245,7 +246,7 @@ def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
     size = q.structure.size
     pure = np.array([0.6, 0.8j, 0.0])[:size]
     states = [
-        q.state(pure, mixed=1e-3),
+        q.state(0.999 * np.outer(pure, pure.conj()) + 0.001 * random_density(size, 9)),  # no two eigenvalues are equal
         *(q.state(0.7 * random_density(size, i) + 0.3 * np.eye(size) / size) for i in range(5)),
     ]
     many = lt.ensemble(q, np.stack(states), (0.0, 3.0), 0.05, STEPS[by], outputs="trajectory")
@@ -260,8 +261,9 @@ def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
         assert q.energy_law is None or np.abs(E - E[0]).max() <= 1e-13
         if q.entropy_law == "nondecreasing":
             assert np.diff(S).min(initial=0.0) >= -2e-15
-        elif "entropy" not in many.laws.inexact:  # next to a pure state its gradient is steep
-            assert np.abs(np.diff(S)).max(initial=0.0) <= (2e-15 if i else 2 * RULES.corrected)
+        elif "entropy" not in many.laws.inexact:  # rounding of the state, times the gradient: steep next to a pure one
+            steep = np.linalg.norm(q.entropy.gradient(many.x[i, 0])) * np.linalg.norm(many.x[i, 0])
+            assert np.abs(np.diff(S)).max(initial=0.0) <= max(2e-15, 2.0 * EPS * steep)
 
 
 def steepest(rho, H, rate, others=()):
@@ -463,15 +465,25 @@ GAPS = [0.0, 1e-12, 1e-8, 1e-4]
     ids=str,
 )
 def test_an_isolated_system_keeps_its_spectrum_where_eigenvalues_meet(method, size):
-    """There the gradients of trace, purity and entropy depend on each other, and the entropy touches its level."""
+    """There the gradients of trace, purity and entropy depend on each other, and the entropy touches its level.
+
+    Gauss steps do not use them. Explicit ones do, and may be refused.
+    """
     q = levels(size, None)
     states = np.stack([q.state(meeting(size, gap)) for gap in GAPS])
     many = lt.ensemble(q, states, (0.0, 2.0), 0.02, method, outputs="trajectory")
-    assert many.ok.all(), [many.message(i) for i in np.flatnonzero(~many.ok)]
     implicit = isinstance(method, lt.MetriplecticGauss)
-    for x, E, S in zip(many.x, many.energy, many.entropy, strict=True):
+    assert many.ok[-1]
+    assert many.ok.all() or not implicit, [many.message(i) for i in np.flatnonzero(~many.ok)]
+    for i, kept in enumerate(np.isfinite(many.x).all(axis=2)):
+        assert many.ok[i] or "step" in many.message(i)
+        x, E, S = many.x[i, kept], many.energy[i, kept], many.entropy[i, kept]
         p = np.linalg.eigvalsh(q.density(x))
-        assert np.ptp(S) <= 2e-14  # measured: at most 2.4e-15 by Gauss
+        if implicit:
+            assert np.ptp(S) <= 4e-15  # measured: at most 2.4e-15
+        else:  # what the end of a step may miss of the levels, times the gradient
+            missed = 2.0 * RULES.corrected * np.linalg.norm(q.entropy.gradient(x[0]))
+            assert np.abs(np.diff(S)).max(initial=0.0) <= missed
         assert np.ptp(E) <= 4e-15
         assert max(np.ptp(p.sum(axis=1)), np.ptp((p**2).sum(axis=1))) <= 5e-15
         assert np.ptp(p, axis=0).max() <= (4e-15 if implicit else 1e-7)  # the root of what hides in the entropy
@@ -482,8 +494,12 @@ def test_adaptive_steps_where_eigenvalues_meet():
     for method in (lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(12)):
         q = levels(4, None)
         for gap in GAPS:
-            run = lt.integrate(q, q.state(meeting(4, gap)), (0.0, 2.0), lt.Adaptive(1e-9), method)
-            assert run.audit().passed, (str(method), gap)
+            x0, adaptive = q.state(meeting(4, gap)), lt.Adaptive(1e-9)
+            run = lt.integrate(q, x0, (0.0, 2.0), adaptive, method, on_failure="return")
+            assert run.status.ok or (gap < 1e-4 and not isinstance(method, lt.MetriplecticGauss))
+            assert run.audit().passed or not run.status.ok
+            if isinstance(method, lt.MetriplecticGauss):
+                assert np.ptp(run.entropy) <= 4e-15
 
 
 def test_midpoint_steps_keep_trace_purity_and_energy_where_eigenvalues_meet():
