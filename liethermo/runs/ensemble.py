@@ -27,7 +27,7 @@ from .preparation import as_family, as_run, begun, check_choice, decided, laws_o
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
-from .timetable import Course, stops_of
+from .timetable import course_of
 
 __all__ = ["THREADS", "Ensemble", "ensemble"]
 
@@ -124,11 +124,7 @@ def ensemble(
         )
     if own_ends and noise is not None:
         raise InputError("steps with noise are of one size, and nothing is known of a path between them: give a step")
-    h = t_span[1] - t_span[0] if isinstance(step, Adaptive) and len(t_span) == 2 else step
-    course = Course(t_span, h, save_every if outputs == "trajectory" and save_at is None else None)
-    stops = stops_of(save_at, course.start, course.end)
-    if save_at is not None:
-        course = Course(t_span, h, None, stops)
+    course = course_of(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
 
     family = Family.of(system, parameters)
     if np.ndim(x0s) > 2 and getattr(system, "space", None) is None and not getattr(system, "sites", ()):
@@ -159,7 +155,7 @@ def ensemble(
 
     def take(engine: str, tally: Tally) -> None:
         if pacing is not None:
-            many = Many(family, method, pacing, record, stops, tally)
+            many = Many(family, method, pacing, record, tally)
             (many.run_compiled if engine == "compiled" else many.run_array)()
         else:
             (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -66,14 +67,17 @@ class Event:
         self.falling = isinstance(until, Relaxed)
         self.name = "the event function"
         if isinstance(until, Relaxed):
-            rate = _watched_rate(system)
-            if rate is None:
+            if system.entropy_law == "nondecreasing":  # what vanishes as a system relaxes, by its laws
+                rate, name = "entropy_production", "entropy production"
+            elif system.energy_law == "nonincreasing":
+                rate, name = "energy_fall", "fall of the energy"
+            else:
                 raise InputError(
                     "Relaxed(tol) watches the entropy production or the fall of the energy, and this system produces "
                     "no entropy and keeps its energy, or promises nothing: give a function of the state as until"
                 )
-            self.name = f"{rate.name} below {until.tol:g}"
-            self.function: Any = rate(jnp.asarray(until.tol))
+            self.name = f"{name} below {until.tol:g}"
+            self.function: Any = Excess(jnp.asarray(until.tol), rate)
         elif callable(until):
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
@@ -86,23 +90,13 @@ class Event:
 
 
 class Excess(Module):
-    """The entropy production above one."""
+    """A rate of a system above one."""
 
     tol: jax.Array
-    name: ClassVar[str] = "entropy production"
+    rate: str = eqx.field(static=True)
 
     def __call__(self, system: System, x):
-        return system.entropy_production(x) - self.tol
-
-
-class ExcessFall(Module):
-    """The rate at which the dissipation lowers the energy, above one."""
-
-    tol: jax.Array
-    name: ClassVar[str] = "fall of the energy"
-
-    def __call__(self, system: System, x):
-        return system.energy_fall(x) - self.tol
+        return getattr(system, self.rate)(x) - self.tol
 
 
 class OfPoints(Module):
@@ -112,10 +106,3 @@ class OfPoints(Module):
 
     def __call__(self, system: System, x):
         return self.function(system.seen(x))
-
-
-def _watched_rate(system: System) -> type[Excess] | type[ExcessFall] | None:
-    """What vanishes as a system relaxes, by its laws."""
-    if system.entropy_law == "nondecreasing":
-        return Excess
-    return ExcessFall if system.energy_law == "nonincreasing" else None

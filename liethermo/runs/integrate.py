@@ -19,7 +19,7 @@ from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from .preparation import as_run, check_choice, decided, prepared, started
 from .progress import Progress
 from .run import Run
-from .timetable import Course, stops_of
+from .timetable import course_of
 from .watch import Watch
 
 UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
@@ -147,10 +147,7 @@ def integrate(
             "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
             "are for runs without"
         )
-    h = t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step
-    course = Course(t_span, h, save_every)
-    if save_at is not None:
-        course = Course(t_span, h, None, stops_of(save_at, course.start, course.end))
+    course = course_of(t_span, step, save_every, save_at)
     x = started(system, method, x0, course.start, attitude)
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:

@@ -33,15 +33,13 @@ class Many:
     method : OneStepMethod
     pacing : Pacing
     record : Record
-    stops : array
-        Times at which steps have to end, increasing; the last is the end of the span.
     tally : Tally
     """
 
-    def __init__(self, family: Family, method: OneStepMethod, pacing: Pacing, record: Record, stops, tally: Tally):
+    def __init__(self, family: Family, method: OneStepMethod, pacing: Pacing, record: Record, tally: Tally):
         self.family, self.method, self.pacing, self.record, self.tally = family, method, pacing, record, tally
         self.interrupted = False
-        self.stops = stops[stops > record.course.start]
+        self.stops = record.course.stops
 
     @property
     def _times(self) -> tuple[float, float, float]:

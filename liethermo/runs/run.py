@@ -110,7 +110,7 @@ class Run:
         """Look at every step: adaptive ones, and those with events."""
         start, end, every = self.course.start, self.course.end, self.course.every or 1
         at_stops, watch = self.course.every is None, until if isinstance(until, Watch) else None
-        stops = np.array([part.end for part in self.course.parts])
+        stops = self.course.stops
         event = None if until is None or watch else Event(until, self.system)
         self.step, last = step, None
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..engines.array import KEPT_STATES
 from ..errors import InputError
+from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
 """Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
@@ -91,6 +92,11 @@ class Course:
             if part.last:
                 yield part.last, 1, 1, True
 
+    @property
+    def stops(self) -> np.ndarray:
+        """The times at which steps have to end, increasing; the last is the end of the span."""
+        return np.array([part.end for part in self.parts])
+
     def size(self, step: int) -> float:
         """The size of the step after so many; of the last where there are no more."""
         for part in self.parts:
@@ -133,10 +139,16 @@ class Course:
         return np.where(last, ends, np.minimum(starts + (steps - self._before[place]) * self.h, ends))
 
 
-def stops_of(save_at, start: float, end: float) -> np.ndarray:
-    """The times at which steps have to end, the end of the span among them."""
+def course_of(span, step: float | Adaptive, every: int | None, save_at=None) -> Course:
+    """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
+    course = Course(span, span[1] - span[0] if isinstance(step, Adaptive) and len(span) == 2 else step, every)
     if save_at is None:
-        return np.array([end])
+        return course
+    return Course(span, course.h, None, _stops(save_at, course.start, course.end))
+
+
+def _stops(save_at, start: float, end: float) -> np.ndarray:
+    """The times at which steps have to end, the end of the span among them."""
     times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
         raise InputError(f"save_at is a list of times, not {save_at!r}")

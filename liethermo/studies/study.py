@@ -22,7 +22,7 @@ from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
 from ..runs.fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from ..runs.preparation import check_choice
-from ..runs.timetable import Course
+from ..runs.timetable import course_of
 from ..systems import System
 from . import files, identity
 from .axes import Axes, Zipped
@@ -152,8 +152,7 @@ class Study:
             raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
         times = sorted({t for m in self._measures.values() if isinstance(m, AtTimes) for t in m.at.times})
         path = any(measure.path for measure in self._measures.values())
-        adaptive = isinstance(step, Adaptive)
-        table = Course(t_span, t_span[1] - t_span[0] if adaptive and len(t_span) == 2 else step, 1)
+        table = course_of(t_span, step, 1)
         if times and not (table.start <= times[0] and times[-1] <= table.end):
             raise InputError(
                 f"the times of measures lie within t_span = {tuple(t_span)}, and {times[0]:g} to {times[-1]:g} do not"

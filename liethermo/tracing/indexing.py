@@ -13,7 +13,7 @@ from .builder import LimitExceededError, Scalar, array, elementwise
 Place = tuple[int, ...]
 
 
-def _windows(b, shape: Place, starts: Sequence[Scalar], sizes: Place) -> tuple[Scalar, list[tuple[slice, ...]]]:
+def _windows(b, shape: Place, starts: Sequence[Scalar], sizes: Place) -> tuple[Scalar, list[tuple]]:
     """The number, at run time, of a window that begins at scalars, moved inside where it sticks out; and all windows
     that it may be."""
     number: Scalar = 0
@@ -26,7 +26,8 @@ def _windows(b, shape: Place, starts: Sequence[Scalar], sizes: Place) -> tuple[S
             first = min(max(int(s), 0), n - m)
             ranges.append(range(first, first + 1))
     places = itertools.product(*ranges)
-    return number, [tuple(slice(i, i + m) for i, m in zip(place, sizes, strict=True)) for place in places]
+    # with an ellipsis, so that what is there is an array even of no axes
+    return number, [(*(slice(i, i + m) for i, m in zip(place, sizes, strict=True)), ...) for place in places]
 
 
 def _inside(b, shape: Place, starts: Sequence[Scalar], sizes: Place) -> Scalar:

@@ -382,6 +382,10 @@ CASES = {
         x,
     ),
     "dynamic_slice": (lambda a: [lax.dynamic_slice(a, (i, jnp.int64(1)), (1, 2)) for i in (-1, 0, 5)], x),
+    "places in an array of no axes": (
+        lambda a: (lax.dynamic_slice(a[0, 0], (), ()), a[0, 0].at[...].set(2 * a[0, 1]), a[0, 0].at[...].add(a[0, 1])),
+        x,
+    ),
     "dynamic_update_slice": (lambda a, b: [lax.dynamic_update_slice(a, b[:1, :2], (i, 2)) for i in (0, 5)], x, y),
     "gather": (
         both(
