@@ -18,7 +18,7 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
 from .compiled.paced import LanePaces
 from .compiled.stepper import CompiledEngine
-from .paced import OnePace, SinglePaces
+from .paced import ArrayPaces, Paces, continued, single
 from .pacing import Pacing
 from .sparse.newton import SparseEngine
 from .stepping import State
@@ -93,23 +93,23 @@ class Chosen:
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise(int(state.step), steps, h)
 
-    def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> OnePace:
+    def paces(self, pacing: Pacing, x, t: float, stop: float, length: float) -> Paces:
         """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
         self._choose(lambda compiled: compiled.paced(pacing)[0].operations)
 
-        def begun(engine: Engine, _) -> OnePace:
+        def begun(engine: Engine, _) -> Paces:
             if isinstance(engine, CompiledEngine):
                 stepper, whole = engine.paced(pacing)
                 return LanePaces(stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length)
             step = engine.step if isinstance(engine, SparseEngine) else None
-            return SinglePaces(self.system, self.method, pacing, step).begin(x, t, stop, length)
+            return single(self.system, self.method, pacing, x, t, stop, length, step)
 
         return self._attempt(begun)
 
-    def instead(self, error: UnsupportedPrimitive, pacing: Pacing, paces: OnePace) -> SinglePaces:
+    def instead(self, error: UnsupportedPrimitive, pacing: Pacing, paces: Paces) -> ArrayPaces:
         """What goes on with a run with a pace, where the compiled engine meets what it cannot unroll."""
         self._fall_back(error)
-        return SinglePaces(self.system, self.method, pacing).continued(paces)
+        return continued(self.system, self.method, pacing, paces)
 
     def _choose(self, operations: Callable[[CompiledEngine], int]) -> None:
         """Choose an engine when the run begins; ``operations`` counts those of a step of the compiled one."""

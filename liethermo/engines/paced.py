@@ -40,96 +40,87 @@ from .rules import EPS, RULES
 from .stepping import State
 
 
-class _ArrayPaces:
-    """What the array engine's have in common; fields are read and written with trajectories first."""
+class ArrayPaces:
+    """Trajectories with paces of their own in the array engine; they are read and written with trajectories first.
 
-    number: int
-    pace: Pace
+    Parameters
+    ----------
+    method : OneStepMethod
+    pace : Pace
+        Of one trajectory, or of several in front.
+    follow : function from a pace, a count of attempts, and whether there is Newton's method, to a pace
+        See :func:`.pacing.follow`.
+    alone : bool
+        Whether there is one.
+    """
+
+    def __init__(self, method: OneStepMethod, pace: Pace, follow: Callable, alone: bool = False):
+        self.pace, self._follow, self._alone = pace, follow, alone
+        self.on_demand = OnDemand(method)
 
     def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
         """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
-        return self._field(name)[chosen]
+        value = np.asarray(getattr(self.pace.state if name in State._fields else self.pace, name))
+        return (value[None] if self._alone else value)[chosen]
 
-    def write(self, name: str, chosen: np.ndarray, values) -> None:
-        whole = self._field(name).copy()
+    def write(self, name: str, chosen: np.ndarray | slice, values) -> None:
+        whole = self.read(name).copy()
         whole[chosen] = values
-        self._put(name, whole)
-
-    def _field(self, name: str) -> np.ndarray:
-        state = self.pace.state
-        value = np.asarray(getattr(state if name in State._fields else self.pace, name))
-        return value.reshape(self.number, *value.shape[self._in_front :])
-
-    def _put(self, name: str, whole: np.ndarray) -> None:
-        value = jnp.asarray(whole if self._in_front else whole[0])
+        changed = {name: jnp.asarray(whole[0] if self._alone else whole)}
         of_state = name in State._fields
-        changes: dict[str, Any] = {"state": self.pace.state._replace(**{name: value})} if of_state else {name: value}
-        self.pace = self.pace._replace(**changes)
-
-    _in_front = 1
-
-
-class SinglePaces(_ArrayPaces):
-    """One trajectory, by programs of its own; ``step`` takes a step of an engine whose steps are no program."""
-
-    _in_front = 0
-
-    def __init__(self, system: System, method: OneStepMethod, pacing: Pacing, step: Callable | None = None):
-        self.system, self.method, self.pacing, self._step, self.number = system, method, pacing, step, 1
-        self._on_demand = OnDemand(method)
-
-    def begin(self, x, t: float, stop: float, length: float) -> SinglePaces:
-        times = (jnp.asarray(float(time)) for time in (t, stop, length))
-        self.pace = begin(self.system, self.method, self.pacing, jnp.asarray(x), *times)
-        return self
-
-    def continued(self, others: OnePace) -> SinglePaces:
-        """From where another engine has come to."""
-        x, t, stop = (others.read(name)[0] for name in ("x", "t", "stop"))
-        self.begin(x, t, stop, stop - t)
-        for name in (*State._fields, *Pace._fields[1:]):
-            whole = self._field(name)
-            self._put(name, np.asarray(others.read(name)).reshape(whole.shape).astype(whole.dtype))
-        return self
-
-    def state(self) -> State:
-        """As it stands."""
-        return State(*(self.read(name)[0] for name in State._fields))
-
-    def attempts(self, most: int) -> dict[str, np.ndarray]:
-        """Make so many attempts, or fewer: attempts first, what :data:`.pacing.TOLD` names of each."""
-        del most  # one, which nothing else follows
-        if self._step is None:
-            given, one = (self.system, self.method, self.pacing), jnp.asarray(1)
-            self.pace = self._on_demand.follow(lambda p, newton: follow(*given, p, one, RULES, newton), self.pace)
-        else:
-            self.pace = follow_by(self._step, self.system, self.method, self.pacing, self.pace, 1)
-        return {name: self.read(name) for name in TOLD}
-
-
-class VmapPaces(_ArrayPaces):
-    """All trajectories of a batch in one program."""
-
-    def __init__(self, form: Form, parameters, axes, method: OneStepMethod, pacing: Pacing, x, t, stop, length):
-        self.form, self.parameters, self.axes, self.method, self.pacing = form, parameters, axes, method, pacing
-        self.number, self._on_demand = len(x), OnDemand(method)
-        times = (jnp.asarray(float(time)) for time in (t, stop, length))
-        self.pace = _begin_all(form, parameters, axes, method, pacing, jnp.asarray(x), *times)
+        self.pace = self.pace._replace(**{"state": self.pace.state._replace(**changed)} if of_state else changed)
 
     def follow(self, most: int) -> None:
         """So many attempts of each, or as many as it takes until it pauses."""
-        given, count = (self.form, self.parameters, self.axes, self.method, self.pacing), jnp.asarray(most)
-        self.pace = self._on_demand.follow(lambda p, newton: _follow_all(*given, p, count, newton), self.pace)
+        self.pace = self.on_demand.follow(lambda pace, newton: self._follow(pace, most, newton), self.pace)
+
+    def state(self) -> State:
+        """That of the only trajectory as it stands."""
+        return State(*(self.read(name)[0] for name in State._fields))
+
+    def attempts(self, most: int) -> dict[str, np.ndarray]:
+        """Make so many attempts of the only trajectory, or fewer.
+
+        Attempts first, what :data:`.pacing.TOLD` names of each.
+        """
+        del most  # one, which nothing else follows
+        self.follow(1)
+        return {name: self.read(name) for name in TOLD}
 
 
-OnePace: TypeAlias = SinglePaces | LanePaces
-"""One trajectory, whose attempts can be looked at."""
+Paces: TypeAlias = ArrayPaces | LanePaces
+"""Trajectories that are followed together, each as it would be alone; or one, whose attempts can be looked at."""
 
-ManyPaces: TypeAlias = VmapPaces | LanePaces
-"""Trajectories that are followed together; each is what it would be alone."""
 
-Paces: TypeAlias = OnePace | ManyPaces
-"""Trajectories with paces of their own."""
+def single(
+    system: System, method: OneStepMethod, pacing: Pacing, x, t, stop, length, step: Callable | None = None
+) -> ArrayPaces:
+    """One trajectory, by programs of its own; ``step`` takes a step of an engine whose steps are no program."""
+    pace = begin(system, method, pacing, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop, length))))
+
+    def followed(pace: Pace, most: int, newton: bool) -> Pace:
+        if step is not None:
+            return follow_by(step, system, method, pacing, pace, most)
+        return follow(system, method, pacing, pace, jnp.asarray(most), RULES, newton)
+
+    found = ArrayPaces(method, pace, followed, True)
+    found.on_demand.newton |= step is not None  # which has its own
+    return found
+
+
+def continued(system: System, method: OneStepMethod, pacing: Pacing, others: Paces) -> ArrayPaces:
+    """The only trajectory of others from where another engine has come to."""
+    found = single(system, method, pacing, *(others.read(name)[0] for name in ("x", "t", "stop", "stop")))
+    for name in (*State._fields, *Pace._fields[1:]):
+        found.write(name, slice(None), others.read(name).reshape(found.read(name).shape))
+    return found
+
+
+def many(form: Form, parameters, axes, method: OneStepMethod, pacing: Pacing, x, t, stop, length) -> ArrayPaces:
+    """All trajectories of a batch in one program."""
+    given = form, parameters, axes, method, pacing
+    pace = _begin_all(*given, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop, length))))
+    return ArrayPaces(method, pace, lambda pace, most, newton: _follow_all(*given, pace, jnp.asarray(most), newton))
 
 
 @program

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..engines.codes import Code
 from ..engines.compiled.paced import LanePaces
-from ..engines.paced import Guide, ManyPaces, VmapPaces
+from ..engines.paced import Guide, Paces, many
 from ..engines.pacing import ARRIVED, FINISHED, LOOKING, Pacing
 from ..engines.stepping import TELLING
 from ..integrators import OneStepMethod
@@ -64,10 +64,10 @@ class Many:
             places = in_whole_vectors(start, min(start + ARRAY_BATCH, size), self.record.x0.shape[1])
             parameters, axes = self.family.batched(places)
             given = self.family.form, parameters, axes, self.method, self.pacing
-            paces = VmapPaces(*given, self.record.x0[places], *self._times)
+            paces = many(*given, self.record.x0[places], *self._times)
             self._follow(paces, places, None, lambda: self.interrupted)
 
-    def _follow(self, paces: ManyPaces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
+    def _follow(self, paces: Paces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
         """Trajectories with these places, to the ends of all."""
         record = self.record
         guide = Guide(paces, self.pacing, self.method, self.stops, lambda i: self.family.member(int(places[i])))

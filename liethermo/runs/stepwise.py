@@ -14,7 +14,7 @@ import numpy as np
 
 from ..engines.choice import Chosen
 from ..engines.codes import Code
-from ..engines.paced import Guide, OnePace
+from ..engines.paced import Guide, Paces
 from ..engines.pacing import FINISHED, TOLD, Pacing
 from ..engines.stepping import State
 from ..tracing.scalarize import UnsupportedPrimitive
@@ -72,7 +72,7 @@ Keep = Callable[[Steps], None]
 
 def follow(
     engine: Chosen,
-    paces: OnePace,
+    paces: Paces,
     pacing: Pacing,
     stops: np.ndarray,
     keep: Keep,
@@ -104,7 +104,7 @@ def follow(
 
 
 def _follow(
-    engine, paces: OnePace, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None, together: int
+    engine, paces: Paces, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None, together: int
 ) -> None:
     guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
     outcome.jumps = guide.jumps

@@ -10,7 +10,7 @@ from .stepper import Stepper
 
 
 class LanePaces:
-    """Trajectories in lanes, each with a pace of its own: :class:`..paced.VmapPaces`, or :class:`..paced.SinglePaces`.
+    """Trajectories in lanes, each with a pace of its own, in place of :class:`..paced.ArrayPaces`.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class LanePaces:
         return self.stepper.state_in(self.blocks.copy())
 
     def attempts(self, most: int) -> dict[str, np.ndarray]:
-        """Make so many attempts of the only trajectory, or fewer: see :meth:`..paced.SinglePaces.attempts`."""
+        """Make so many attempts of the only trajectory, or fewer: see :meth:`..paced.ArrayPaces.attempts`."""
         before, out = self.read("tried")[0], np.empty((1, most, self.stepper.width))
         try:
             self.stepper.run(self.first, self.blocks, 0.0, most, 1, out=out)
