@@ -83,15 +83,17 @@ def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **r
     def one(k, *given):
         leaves, dots = list(given[: -len(moving)]), given[-len(moving) :]
 
-        def of_moving(*values):
+        def of_moving(k, *values):
             whole = list(leaves)
             for i, value in zip(moving, values, strict=True):
                 whole[i] = value
             return misfit(jax.tree_util.tree_unflatten(structure, whole), k)
 
-        moved = jax.jvp(of_moving, tuple(leaves[i] for i in moving), tuple(dots))[1]
-        matrix = jax.jacfwd(lambda k: misfit(jax.tree_util.tree_unflatten(structure, leaves), k))(k)
-        step = solve(matrix.reshape(k.size, k.size), moved.reshape(-1, 1))
+        still = [jnp.zeros_like(dot) for dot in dots]
+        _, change = jax.linearize(of_moving, k, *(leaves[i] for i in moving))
+        moved = change(jnp.zeros_like(k), *dots)
+        columns = jax.vmap(lambda d: change(d.reshape(k.shape), *still).ravel())(jnp.eye(k.size))
+        step = solve(columns.T, moved.reshape(-1, 1))
         return -step.reshape(k.shape)
 
     levels = [(0, *level[:-1], *(level[i] for i in moving)) for level in axes]

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import constant, is_traced
 from manifolds._precision import by_own_settings
 
 from ..engines import implicit
-from ..engines.stages import Equations, explicit, newton_steps, noise_of, scale_of, solve_stages
+from ..engines.stages import (
+    Equations,
+    Solved,
+    explicit,
+    fixed_point,
+    newton_steps,
+    noise_of,
+    scale_of,
+    solve_stages,
+)
 from ..engines.stepping import finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
@@ -80,18 +92,61 @@ def flow(
     system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
     x = jnp.asarray(started(system, method, x, table.start, attitude))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
-    sizes = np.array([h for h, *_ in calls])
-    path = _path(system, method, x, sizes, tuple((saves, every) for _, saves, every, _ in calls))
+    sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
+    # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.
+    known = not method.explicit and is_traced((system, method, x))
+    given = constant((system, method, x)) if known else (system, method, x)
+    newton = method.explicit or is_traced(given)
+    path, steps = _path(*given, sizes, counts, newton, known)
+    if not newton and not np.isfinite(path[-1]).all():  # Newton's method is compiled where a step needs it
+        path, steps = _path(*given, sizes, counts, True, known)
+    if known:
+        path = _known_path(system, method, x, sizes, steps)
     path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
     return path[-1] if save_every is None else path
 
 
 @program
-def _path(system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[int, int], ...]) -> jax.Array:
-    """The states kept, the first among them: a program of its own, in which all numbers are arguments."""
-    carry, states = first_carry(system, method, x), [x[None]]
+def _path(
+    system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[int, int], ...], newton: bool, known: bool
+) -> tuple[jax.Array, list]:
+    """The states kept, the first among them: a program of its own, in which all numbers are arguments.
+
+    With ``known`` also, for each call, compensations at the begin of each step and the slopes that solve its equations.
+    """
+    carry, states, steps = first_carry(system, method, x), [x[None]], []
     for i, (saves, every) in enumerate(counts):
-        carry, kept = _steps(system, method, carry, sizes[i], saves, every)
+
+        def step(carry, _, h=sizes[i]):
+            after = one_step(system, method, carry, h, iterated if newton else quickly)
+            return after, (carry[1], after[2]) if known else None
+
+        def save(carry, _, step=step, every=every):
+            carry, solved = jax.lax.scan(step, carry, length=every)
+            return carry, (carry[0], solved)
+
+        carry, (kept, solved) = jax.lax.scan(save, carry, length=saves)
+        states.append(kept)
+        steps.append(solved)
+    return jnp.concatenate(states), steps
+
+
+@program
+def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list) -> jax.Array:
+    """The states of a path whose steps are solved: as functions of the first and of the parameters."""
+    states = [x[None]]
+    for i, solved in enumerate(steps):
+
+        def step(x, known, h=sizes[i]):
+            compensation, k = known
+            k = _stages(system, method, x, compensation, h, k, lambda own: own.guess)
+            return method.move(system, x, compensation, h, k)[0], None
+
+        def save(x, known, step=step):
+            x, _ = jax.lax.scan(step, x, known)
+            return x, x
+
+        x, kept = jax.lax.scan(save, x, solved)
         states.append(kept)
     return jnp.concatenate(states)
 
@@ -102,14 +157,29 @@ def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ..
     return x, jnp.zeros_like(x), k, k
 
 
-def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h) -> tuple[jax.Array, ...]:
+def iterated(own: Equations) -> jax.Array:
+    """The slopes that solve the equations of a step; NaN where they are not found."""
+    return _found(solve_stages(own))
+
+
+def quickly(own: Equations) -> jax.Array:
+    """The same without Newton's method."""
+    return _found(fixed_point(own))
+
+
+def _found(solved: Solved) -> jax.Array:
+    return jnp.where(solved.converged, solved.k, jnp.nan)
+
+
+def one_step(
+    system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, solve: Callable = iterated
+) -> tuple[jax.Array, ...]:
     """A step that JAX differentiates, from what :func:`first_carry` says; NaN where it could not be solved."""
     x, compensation, k, before = carry
     if method.explicit:
-        solved = explicit(system, method, x, compensation, h, k)
-        new = jnp.where(solved.converged, solved.k, jnp.nan)
+        new = _found(explicit(system, method, x, compensation, h, k))
     else:
-        new = _stages(system, method, x, compensation, h, method.predict(k, before))
+        new = _stages(system, method, x, compensation, h, method.predict(k, before), solve)
     after, after_compensation, energy, *_ = finish(system, method, x, compensation, h, new)
     if holds_energy(system, method):
         after_compensation = shifted(
@@ -121,32 +191,24 @@ def one_step(system: System, method: OneStepMethod, carry: tuple[jax.Array, ...]
     return after, after_compensation, new, k
 
 
-def _steps(system: System, method: OneStepMethod, carry, h, saves: int, every: int):
-    def one_save(carry, _):
-        carry, _ = jax.lax.scan(lambda c, _: (one_step(system, method, c, h), None), carry, length=every)
-        return carry, carry[0]
-
-    return jax.lax.scan(one_save, carry, length=saves)
-
-
-def _stages(system: System, method: OneStepMethod, x, compensation, h, guess) -> jax.Array:
-    """The solution of the stage equations, differentiated as the implicit function that it is."""
+def _stages(system: System, method: OneStepMethod, x, compensation, h, guess, solve: Callable) -> jax.Array:
+    """The solution of the stage equations by ``solve``, differentiated as the implicit function that it is."""
     dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
     def slopes(dynamic, k):
         system, method, x, compensation, h = eqx.combine(dynamic, static)
         return method.slopes(system, x, compensation, h, k)
 
-    def solve(dynamic, guess):
+    def solution(dynamic, guess):
         system, method, x, compensation, h = eqx.combine(dynamic, static)
-        own = Equations(
-            slopes=lambda k: slopes(dynamic, k),
-            guess=guess,
-            scale=lambda k: scale_of(system.solved_for(x)[1], h, k),
-            inverted=newton_steps(system, method, x, compensation, h),
-            noise=lambda: noise_of(system, x),
+        return solve(
+            Equations(
+                slopes=lambda k: slopes(dynamic, k),
+                guess=guess,
+                scale=lambda k: scale_of(system.solved_for(x)[1], h, k),
+                inverted=newton_steps(system, method, x, compensation, h),
+                noise=lambda: noise_of(system, x),
+            )
         )
-        solved = solve_stages(own)
-        return jnp.where(solved.converged, solved.k, jnp.nan)
 
-    return implicit.solution(solve, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
+    return implicit.solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)

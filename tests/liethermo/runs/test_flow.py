@@ -12,6 +12,7 @@ import scipy.optimize
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import implicit
+from liethermo.runs import flow as flow_module
 
 X0 = jnp.array([0.3, 1.0, 0.2])
 PARAMETERS = jnp.array([10.0, 5.0, 1.0, 1.0])
@@ -80,6 +81,26 @@ def test_a_batch():
     ends = jax.jit(jax.vmap(lambda x: lt.flow(body(PARAMETERS), x, (0.0, 2.0), 0.1)))(states)
     alone = lt.ensemble(body(PARAMETERS), states, (0.0, 2.0), 0.1).x
     assert np.abs(ends - alone).max() < 1e-13
+
+
+def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
+    """It is two thirds of a program, and none of one for a derivative: that is of slopes which are known."""
+
+    class Needed(Exception):
+        pass
+
+    def refused(own):
+        raise Needed
+
+    monkeypatch.setattr(flow_module, "iterated", refused)
+
+    def end(x, h=0.125):
+        return jnp.sum(lt.flow(nonlinear(PARAMETERS), x, (0.0, 4 * h), h) ** 3)
+
+    assert np.isfinite(end(X0))
+    assert np.isfinite(jax.grad(end)(X0)).all()
+    with pytest.raises(Needed):
+        end(X0, 40.0)
 
 
 def test_a_step_that_cannot_be_solved_gives_nan():
