@@ -22,6 +22,9 @@ class Rules:
 
     Attributes
     ----------
+    many : int
+        Components of a state above which they are many: for its size, and for the order that they are stored in. Of 64
+        spins with noise one always shrinks so late that Newton's method was tried, for all of them.
     large : int
         Components of a state above which a system is large. Newton's equations are then solved by products with the
         Jacobian matrix, which is not formed.
@@ -62,6 +65,7 @@ class Rules:
         :data:`..functions.gradients.NOISY`.
     """
 
+    many: int = 100
     large: int = 1_000
     fixed_point: int = 60
     newton: int = 60
@@ -82,7 +86,7 @@ class Rules:
 
     def size(self, components: int) -> Callable[[jax.Array], jax.Array]:
         """What the size of a vector, shape (n,) or (stages, n), is for so many components of a state."""
-        return _root_mean_square if components > self.large else _largest
+        return _root_mean_square if components > self.many else _largest
 
 
 def _largest(v) -> jax.Array:

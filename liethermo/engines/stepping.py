@@ -93,8 +93,8 @@ begin = hasty_program(first_state)
 def in_order(
     system: System, method: OneStepMethod, state: State, rules: Rules = RULES
 ) -> tuple[System, OneStepMethod, State, Callable[[State], State]]:
-    """The three with large states in the order of components in which steps are fastest, and what takes states back."""
-    found = system.arranged() if orderless(method) and state.x.size > rules.large else None
+    """The three with many components in the order in which steps are fastest, and what takes states back."""
+    found = system.arranged() if orderless(method) and state.x.size > rules.many else None
     if found is None:
         return system, method, state, lambda state: state
 

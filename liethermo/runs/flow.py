@@ -45,10 +45,11 @@ def flow(
 
     The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations.
     The stage equations ``k = slopes(x, k)`` define k, and their linearisation defines its derivative (implicit function
-    theorem). This derivative is exact for the discrete flow. The function works under ``jax.grad``, ``jax.jacfwd``,
-    ``jax.vmap`` and ``jax.jit``, and it has derivatives of every order. Parameters are the arrays among the leaves of
-    the system, the arguments from which a function builds it, and numbers in closures. Without a transformation the
-    function runs a compiled program, which is reused for other numbers.
+    theorem). This derivative is exact for the discrete flow, and keeps the slopes of all its steps in memory. The
+    function works under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``, and it has derivatives of every
+    order. Parameters are the arrays among the leaves of the system, the arguments from which a function builds it, and
+    numbers in closures. Without a transformation the function runs a compiled program, which is reused for other
+    numbers.
 
     Parameters
     ----------

@@ -26,6 +26,11 @@ MATRIX_DIM = 200
 at."""
 
 
+JACOBI_DIM = 40
+"""Components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers; of larger \
+systems for three functions."""
+
+
 class CheckRow(Row):
     """One axiom: its worst relative residual over the points. ``passed`` is None for a report without a verdict."""
 
@@ -237,7 +242,9 @@ def _matrix_residuals(system: Any, around: Any, x, dH, dS):
     found = {
         "skew": relative(size(tensor + tensor.T), size(tensor)),
     }
-    if system.smooth:
+    if system.smooth and around is None and x.size > JACOBI_DIM:
+        found["jacobi"] = _jacobi_of_three(system.poisson, x)
+    elif system.smooth:
         variation = size(jax.jacfwd((around or system).poisson.tensor)(x))
         if around is not None:  # in normal coordinates it may be rounding alone: as seen over a unit of length, then
             variation = variation + size(tensor)
@@ -257,3 +264,15 @@ def _matrix_residuals(system: Any, around: Any, x, dH, dS):
                 residual = relative(size(own @ dL), size(own) * size(dL))
                 found["preserved"] = jnp.maximum(found.get("preserved", 0.0), residual)
     return found, size(tensor) * size(dH)
+
+
+def _jacobi_of_three(poisson: Any, x) -> jax.Array:
+    """``{f, {g, h}}`` and its cyclic permutations for three random linear functions: their sum, beside the largest."""
+    of_three = np.random.default_rng(0).standard_normal((3, x.size))
+
+    def term(f, g, h):
+        return jax.jvp(lambda y: jnp.dot(g, poisson.sharp(y, h)), (x,), (poisson.sharp(x, f),))[1]
+
+    terms = jnp.stack([term(*np.roll(of_three, i, axis=0)) for i in range(3)])
+    largest = jnp.max(jnp.abs(terms))
+    return jnp.abs(jnp.sum(terms)) / jnp.where(largest > 0.0, largest, 1.0)

@@ -28,8 +28,8 @@ PARTS = 512
 _parts: Latest[Callable] = Latest(PARTS)
 
 
-HASTY = {"xla_backend_optimization_level": 0}
-"""How a program is compiled that is run once: to optimise it takes longer than it would save."""
+HASTY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+"""How a program is compiled that is run once: to optimise it, or to join its loops, takes longer than it would save."""
 
 
 def program(function: Function) -> Function:

@@ -13,6 +13,7 @@ from liethermo.engines.choice import Chosen
 from liethermo.integrators.fluctuating import driven_by, noise_dimension
 from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry
+from liethermo.tracing import programs
 from tests.cases import BuiltOnUse
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
@@ -125,6 +126,30 @@ def test_little_noise_is_nearly_the_run_without():
 
 
 @pytest.mark.slow
+def test_a_lattice_needs_few_programs(monkeypatch):
+    """One takes the steps, one begins a run, and the axioms have one: no size adds any, nor does another run."""
+    traced = []
+    monkeypatch.setattr(programs._Whole, "__call__", _counted(programs._Whole.__call__, traced))
+    sites = (3, 5, 4)
+    magnet = lt.models.spin_lattice(sites, rate=1.0, baths=lt.HeatBaths(np.inf, 1.0))
+    up = magnet.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
+    for seed, steps in ((1, 1), (2, 30)):
+        run = lt.integrate(
+            magnet, up, (0.0, 0.025 * steps), 0.025, noise=lt.Fluctuations(seed=seed), save_every=steps, engine="array"
+        )
+        assert run.stats.newton_iterations == 0
+    programs_of_runs = [name for name in traced if name in ("advance", "first_state", "_compiled")]
+    assert sorted(programs_of_runs) == ["_compiled", "advance", "first_state"]
+
+
+def _counted(call, names: list):
+    def counted(self, dynamic):
+        names.append(self.__name__)
+        return call(self, dynamic)
+
+    return counted
+
+
 def test_newton_where_the_fixed_point_is_too_far():
     """Noise so large that fixed-point iteration fails; both engines solve the same equation."""
     noise = lt.Fluctuations(6.0, 0)

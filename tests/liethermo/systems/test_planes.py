@@ -142,7 +142,7 @@ def ring(**changes):
 def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
     system = ring()
     x0 = system.state(unit(LARGE))
-    assert x0.size > RULES.large
+    assert x0.size > RULES.many
     run = (system, x0, (0.0, 0.2), 0.05, method)
     found = lt.integrate(*run)
     assert found.audit().passed
@@ -194,8 +194,8 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
 def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
     system, method = SYSTEMS["one bath"], lt.MetriplecticMidpoint("coordinate_increment")
     first = begin(system, method, state(system))
-    assert in_order(system, method, first, replace(RULES, large=1))[0] is system
-    assert in_order(system, lt.MetriplecticMidpoint(), first, replace(RULES, large=1))[0] is not system
+    assert in_order(system, method, first, replace(RULES, many=1))[0] is system
+    assert in_order(system, lt.MetriplecticMidpoint(), first, replace(RULES, many=1))[0] is not system
 
 
 @pytest.mark.slow

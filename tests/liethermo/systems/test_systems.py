@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import registered_methods
+from liethermo.systems.check import JACOBI_DIM
 from tests.cases import energy_of, state_of
 
 SPHERE = lt.Quadratic(np.ones(3))
@@ -202,6 +203,20 @@ def test_a_poisson_tensor_that_is_none():
         lt.MetriplecticSystem(
             lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), lambda x: x @ x, dim=3
         )
+
+
+@pytest.mark.parametrize("fits", [True, False], ids=["Poisson", "not"])
+def test_jacobi_of_many_components(fits):
+    """Of three functions: arrays of n^3 numbers are not formed."""
+    n = JACOBI_DIM + 5
+
+    def tensor(x):
+        a, b, c = x[:3] if fits else (x[1], 0.0, 1.0)
+        return jnp.zeros((n, n)).at[:3, :3].set(jnp.array([[0.0, a, b], [-a, 0.0, c], [-b, -c, 0.0]]))
+
+    built = lt.MetriplecticSystem(tensor, lambda x: x @ x, dim=n, validate=False)
+    (row,) = (row for row in built.check().rows if row.axiom == "Jacobi")
+    assert row.passed == fits
 
 
 def test_a_momentum_map_that_is_not_conserved():
