@@ -98,9 +98,9 @@ def flow(
     known = not method.explicit and is_traced((system, method, x))
     given = constant((system, method, x)) if known else (system, method, x)
     newton = method.explicit or is_traced(given)
-    path, steps = _path(*given, sizes, counts, newton, known)
+    path, steps = _path(given, sizes, counts, newton, known)
     if not newton and not np.isfinite(path[-1]).all():  # Newton's method is compiled where a step needs it
-        path, steps = _path(*given, sizes, counts, True, known)
+        path, steps = _path(given, sizes, counts, True, known)
     if known:
         path = _known_path(system, method, x, sizes, steps)
     path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
@@ -109,12 +109,17 @@ def flow(
 
 @program
 def _path(
-    system: System, method: OneStepMethod, x, sizes, counts: tuple[tuple[int, int], ...], newton: bool, known: bool
+    given: tuple[System, OneStepMethod, jax.Array],
+    sizes,
+    counts: tuple[tuple[int, int], ...],
+    newton: bool,
+    known: bool,
 ) -> tuple[jax.Array, list]:
     """The states kept, the first among them: a program of its own, in which all numbers are arguments.
 
     With ``known`` also, for each call, compensations at the begin of each step and the slopes that solve its equations.
     """
+    system, method, x = given
     carry, states, steps = first_carry(system, method, x), [x[None]], []
     for i, (saves, every) in enumerate(counts):
 
