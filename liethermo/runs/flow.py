@@ -27,7 +27,7 @@ from ..engines.stepping import finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
-from .preparation import of_steps, started
+from .preparation import begun, of_steps, started
 from .timetable import Course
 
 
@@ -91,7 +91,9 @@ def flow(
     x, table = system.state(x0), Course(t_span, step, save_every)
     n, shown = system.dim, system
     system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
-    x = jnp.asarray(started(system, method, x, table.start, attitude))
+    begin = x, table.start, attitude
+    # of what is traced nothing is known that a start could be refused for
+    x = jnp.asarray(begun(system, *begin) if is_traced(system, x) else started(system, method, *begin))
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
     # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.

@@ -97,7 +97,7 @@ def started(system: System, method, x0, t: float, attitude=None) -> jax.Array | 
         If there is an attitude and no group, or no run can start there.
     """
     x = begun(system, x0, t, attitude)
-    if not is_traced(system, x) and (reason := no_start(system, method, x)):
+    if reason := no_start(system, method, x):
         raise InputError(reason)
     return x
 
