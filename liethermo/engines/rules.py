@@ -23,8 +23,8 @@ class Rules:
     Attributes
     ----------
     many : int
-        Components of a state above which they are many: for its size, and for the order that they are stored in. Of 64
-        spins with noise one always shrinks so late that Newton's method was tried, for all of them.
+        Components of a state above which they are many: for its size, and for the order that they are stored in. Among
+        64 spins with noise one always shrinks so late that Newton's method was tried, for all of them.
     large : int
         Components of a state above which a system is large. Newton's equations are then solved by products with the
         Jacobian matrix, which is not formed.
