@@ -16,11 +16,6 @@ def is_traced(*values) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
 
 
-def constant(tree):
-    """A pytree of which nothing is differentiated."""
-    return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
-
-
 def real_components(x, dim: int, what: str) -> jax.Array:
     """``x`` as a real array of doubles with last axis ``dim``."""
     array = jnp.asarray(as_numeric(x, what))

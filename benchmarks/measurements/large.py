@@ -38,10 +38,9 @@ def run(quick: bool) -> Report:
     """Two tables, each row in a process of its own."""
     sizes, edges = ((1_000,), (4,)) if quick else (SIZES, EDGES)
     found = {n: process.call("large", "functions", str(n)) for n in sizes}
-    rows = [[n, *(found[n].get(name) for name in (PLAIN, BY_HAND, BY_PLANES, NAMED, C))] for n in sizes]
-    columns = {"Sites": "count"} | {
-        name[0].upper() + name[1:]: "seconds" for name in (PLAIN, BY_HAND, BY_PLANES, NAMED, C)
-    }
+    ways = (PLAIN, BY_HAND, BY_PLANES, NAMED, C)
+    rows = [[n, *(found[n].get(way) for way in ways)] for n in sizes]
+    columns = {"Sites": "count"} | {way[0].upper() + way[1:]: "seconds" for way in ways}
     functions = Table(
         f"A step of {STEP} of the midpoint scheme on a ring of spins with exchange and an easy axis; times of the "
         "processor, all threads together.",

@@ -139,7 +139,7 @@ def equations(
     """What a step from a state has to solve, with a guess from the slopes of the steps before."""
     own = system.solved_for(x)[1]
     measure = rules.size(own.size)
-    whole = measure(own) / h  # once a step
+    whole = measure(own) / jnp.abs(h)  # once a step
     return Equations(
         slopes=lambda k: method.slopes(system, x, compensation, h, k),
         guess=method.predict(k, before),

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arrays import constant, is_traced
+from manifolds._arrays import is_traced
 from manifolds._precision import by_own_settings
 
 from ..engines import implicit
-from ..engines.stages import (
-    Equations,
-    Solved,
-    explicit,
-    fixed_point,
-    newton_steps,
-    noise_of,
-    scale_of,
-    solve_stages,
-)
-from ..engines.stepping import finish, holds_energy, shifted, steering
+from ..engines.stages import Equations, Solved, explicit, fixed_point, solve_stages
+from ..engines.stepping import equations, finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import program
@@ -98,7 +90,7 @@ def flow(
     sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
     # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.
     known = not method.explicit and is_traced((system, method, x))
-    given = constant((system, method, x)) if known else (system, method, x)
+    given = _constant((system, method, x)) if known else (system, method, x)
     newton = method.explicit or is_traced(given)
     path, steps = _path(given, sizes, counts, newton, known)
     if not newton and not np.isfinite(path[-1]).all():  # Newton's method is compiled where a step needs it
@@ -107,6 +99,11 @@ def flow(
         path = _known_path(system, method, x, sizes, steps)
     path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
     return path[-1] if save_every is None else path
+
+
+def _constant(tree: Any) -> Any:
+    """A pytree of which nothing is differentiated."""
+    return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
 
 
 @program
@@ -126,7 +123,7 @@ def _path(
     for i, (saves, every) in enumerate(counts):
 
         def step(carry, _, h=sizes[i]):
-            after = one_step(system, method, carry, h, iterated if newton else quickly)
+            after = one_step(system, method, carry, h, iterated if newton else without_newton)
             return after, (carry[1], after[2]) if known else None
 
         def save(carry, _, step=step, every=every):
@@ -170,8 +167,8 @@ def iterated(own: Equations) -> jax.Array:
     return _found(solve_stages(own))
 
 
-def quickly(own: Equations) -> jax.Array:
-    """The same without Newton's method."""
+def without_newton(own: Equations) -> jax.Array:
+    """The same by fixed-point iteration alone."""
     return _found(fixed_point(own))
 
 
@@ -209,14 +206,6 @@ def _stages(system: System, method: OneStepMethod, x, compensation, h, guess, so
 
     def solution(dynamic, guess):
         system, method, x, compensation, h = eqx.combine(dynamic, static)
-        return solve(
-            Equations(
-                slopes=lambda k: slopes(dynamic, k),
-                guess=guess,
-                scale=lambda k: scale_of(system.solved_for(x)[1], h, k),
-                inverted=newton_steps(system, method, x, compensation, h),
-                noise=lambda: noise_of(system, x),
-            )
-        )
+        return solve(equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
 
     return implicit.solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
