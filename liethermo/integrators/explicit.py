@@ -159,20 +159,20 @@ class ExplicitMethod(TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """The vectors that the step hands on; of those before it the levels alone are needed."""
         laws = self._laws(system)
+        starts = [law.function.gradient(x + compensation) for law in laws]
         d, changes, error, between = self.uncorrected(system, laws, x, compensation, h)
         if system.has_generator:
             changes = self._own_changes(laws, x, compensation, d)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
-            changes = changes + self._steering(system, laws, x, compensation, k[LEVELS])
-        d, defect = corrected(system, laws, x, compensation, d, changes, self.corrections)
+            changes = changes + self._steering(system, laws, starts, x, compensation, k[LEVELS])
+        d, defect = corrected(system, laws, starts, x, compensation, d, changes, self.corrections)
         return jnp.stack([d / h, error, jnp.broadcast_to(defect / h, x.shape), k[LEVELS], *between])
 
-    def _steering(self, system: System, laws: list[Law], x, compensation, levels) -> jax.Array:
+    def _steering(self, system: System, laws: list[Law], gradients: list, x, compensation, levels) -> jax.Array:
         """What functions that are conserved are to change by, back to the levels that the run has begun on.
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
         """
-        gradients = [law.function.gradient(x) for law in laws]
 
         def back(law: Law, gradient, level) -> jax.Array:
             size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))

@@ -54,61 +54,69 @@ class Ended(NamedTuple):
 
 
 def corrected(
-    system: System, laws: list[Law], x, compensation, d, changes, corrections: int = CORRECTIONS
+    system: System, laws: list[Law], starts: list, x, compensation, d, changes, corrections: int = CORRECTIONS
 ) -> tuple[jax.Array, jax.Array]:
-    """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length."""
+    """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length.
+
+    ``starts`` are the gradients of the functions at x + compensation.
+    """
     change, surface = ALONG, system.surface
     functions, blocks = [law.function for law in laws], system.blocks
-    before = [f.gradient(x + compensation) if f.is_quadratic else None for f in functions]
 
     def landed(d) -> tuple[jax.Array, jax.Array]:
         return (d, jnp.zeros(())) if surface is None else surface.reached(x, compensation, d)
 
-    def gradients(d) -> list:
-        return [f.gradient(x + (compensation + d)) for f in functions]
-
     def misses(d, ends) -> jax.Array:
         """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
         along = [
-            change(f, x, d, compensation) if first is None else 0.5 * (first + last)
-            for f, first, last in zip(functions, before, ends, strict=True)
+            0.5 * (first + last) if f.is_quadratic else change(f, x, d, compensation)
+            for f, first, last in zip(functions, starts, ends, strict=True)
         ]
         return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
 
-    def measured(s: Ended) -> Ended:
-        """What is missed with the correction that was found before, and the next one; and the lengths of directions.
+    def moved(s: Ended) -> tuple[Ended, list]:
+        """With the correction that was found before, what is missed; and the gradients there."""
+        d, left = landed(s.d + s.correction)
+        ends = [f.gradient(x + (compensation + d)) for f in functions]
+        return s._replace(d=d, left=left, defect=misses(d, ends)), ends
+
+    def aimed(s: Ended, ends) -> Ended:
+        """The next correction, and the lengths of its directions.
 
         These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
         of their own, as entropies beside a momentum, those by which a function changes most in d.
         """
-        d, left = landed(s.d + s.correction)
-        ends = gradients(d)
-        defect, found = misses(d, ends), directions(system, x + (compensation + d), ends)
+        found = directions(system, x + (compensation + s.d), ends)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
         else:
-            moved = jnp.linalg.norm(d)
-            most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in found]
+            moved = jnp.linalg.norm(s.d)
+            most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(s.d[b]) for b in blocks) for v in found]
             lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
-        return Ended(d, left, defect, lengths, correction(system, found, defect))
-
-    def again(carry, _):
-        s, ended = carry
-        s = jax.lax.cond(ended, lambda: s, lambda: measured(s))
-        return (s, done(s)), None
+        return s._replace(lengths=lengths, correction=correction(system, found, s.defect))
 
     def done(s: Ended) -> jax.Array:
         small = jnp.abs(s.defect) <= EPS * s.lengths * jnp.linalg.norm(s.d)
         return (s.left == 0.0) & (small | (s.lengths <= VANISHED_LENGTH)).all()
 
+    def again(carry, _):
+        s, ended = carry
+        s = jax.lax.cond(ended, lambda: s, lambda: aimed(*moved(s)))
+        return (s, done(s)), None
+
     def hidden() -> jax.Array:
         """What rounding of the values may make of what is missed: nothing where there is a closed form."""
         return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
 
-    unknown = jnp.zeros(len(laws))
-    start = Ended(d, jnp.zeros(()), unknown, unknown, jnp.zeros_like(d)), jnp.asarray(False)
-    # a loop from the first on, so that programs hold the functions once; of a short step one correction is enough
-    (s, ended), _ = jax.lax.scan(again, start, length=1 + corrections)
+    none = jnp.zeros(len(laws))
+    s = aimed(*moved(Ended(d, jnp.zeros(()), none, none, jnp.zeros_like(d))))
+    s, ends = moved(s)  # of a short step one correction is enough
+    ended = done(s)
+
+    def further() -> tuple[Ended, jax.Array]:
+        return jax.lax.scan(again, (aimed(s, ends), ended), length=corrections - 1)[0]
+
+    s, ended = jax.lax.cond(ended, lambda: (s, ended), further)
     rounding = jax.lax.cond(ended, lambda: jnp.zeros_like(s.defect), hidden)
     vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
@@ -141,7 +149,8 @@ def ended(
         changes = [
             jnp.zeros(()) if law.sign == 0.0 else jnp.dot(ALONG(law.function, x, d, compensation), d) for law in laws
         ]
-        d, defect = corrected(system, laws, x, compensation, d, jnp.stack(changes))
+        starts = [law.function.gradient(x + compensation) for law in laws]
+        d, defect = corrected(system, laws, starts, x, compensation, d, jnp.stack(changes))
     else:
         d, defect = surface.reached(x, compensation, d)
     return jnp.where(defect <= UNREACHED * jnp.linalg.norm(x), d, jnp.nan)
