@@ -19,7 +19,7 @@ from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, in_charts
-from .levels import ALONG, CORRECTIONS, LAWS, Law, corrected, correction, directions
+from .levels import ALONG, CORRECTIONS, LAWS, Law, corrected, correction, directions, displacement
 from .preserved import check_preserved, preserved_functions, seen_on
 
 SLOPE, ERROR, DEFECT, LEVELS, OWN = range(5)
@@ -73,6 +73,11 @@ class ExplicitMethod(TransportingMethod):
     Vectors of constant length, such as many spins, are held one by one, in work and memory that grow with their number:
     each is brought back to its sphere along its radius, and the corrections above are made along the spheres.
 
+    Where nothing but Casimirs is held besides the energy and the structure can turn a state along its leaf, as in
+    quantum systems without dissipation, a covector is found beside the state, ``K' = turning(K, dH)``, at the order of
+    the method. The step ends where it carries the state [:meth:`manifolds.PoissonStructure.carried`], and corrections
+    are made along the leaf: the gradients of the Casimirs, which may depend on each other, are not needed.
+
     Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
     quadrature.
 
@@ -104,8 +109,16 @@ class ExplicitMethod(TransportingMethod):
         self.retraction, self.held = retraction, held
 
     @abstractmethod
-    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
-        """The step from x + compensation, which ends near the levels."""
+    def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
+        """The step from x + compensation, which ends near the levels.
+
+        Parameters
+        ----------
+        rates : function from a state, shape (n,), to arrays of shapes (n,) and (laws,)
+            The field, and at what rates the functions of the laws change.
+        spared : bool
+            Whether these are zero.
+        """
 
     @property
     def order(self) -> int:
@@ -150,7 +163,8 @@ class ExplicitMethod(TransportingMethod):
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
-        levels = jnp.stack([law.function.value(x) for law in self._laws(system)])[: _room(system)]
+        laws = self._laws(system, self._along_leaf(system))
+        levels = jnp.stack([law.function.value(x) for law in laws])[: _room(system)]
         levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
         return jnp.zeros((self.stages, x.shape[0])).at[SLOPE].set(system.vector_field(x)).at[LEVELS].set(levels)
 
@@ -158,17 +172,30 @@ class ExplicitMethod(TransportingMethod):
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """The vectors that the step hands on; of those before it the levels alone are needed."""
-        laws = self._laws(system)
+        leaf, n, spared = self._along_leaf(system), x.shape[0], system.has_generator or system.dissipation is None
+        laws = self._laws(system, leaf)
         starts = [law.function.gradient(x + compensation) for law in laws]
-        d, changes, error, between = self.uncorrected(system, laws, x, compensation, h)
+
+        def rates(z) -> tuple[jax.Array, jax.Array]:
+            """Those of the state and, along a leaf, of the covector that carries it."""
+            field, changes = self.rates(system, laws, z[:n])
+            turning = system.poisson.turning(z[n:], system.energy.gradient(z[:n])) if leaf else None
+            return field if turning is None else jnp.append(field, turning), changes
+
+        begin, rest = (jnp.append(v, jnp.zeros(n)) if leaf else v for v in (x, compensation))
+        d, changes, error, between = self.uncorrected(rates, spared, begin, rest, h)
+        if leaf:
+            d, error, between = d[n:], error[:n], between[:, :n]
         if system.has_generator:
             changes = self._own_changes(laws, x, compensation, d)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
-            changes = changes + self._steering(system, laws, starts, x, compensation, k[LEVELS])
-        d, defect = corrected(system, laws, starts, x, compensation, d, changes, self.corrections)
+            changes = changes + self._steering(system, laws, starts, x, compensation, k[LEVELS], leaf)
+        d, defect = corrected(system, laws, starts, x, compensation, d, changes, self.corrections, leaf)
         return jnp.stack([d / h, error, jnp.broadcast_to(defect / h, x.shape), k[LEVELS], *between])
 
-    def _steering(self, system: System, laws: list[Law], gradients: list, x, compensation, levels) -> jax.Array:
+    def _steering(
+        self, system: System, laws: list[Law], gradients: list, x, compensation, levels, leaf: bool
+    ) -> jax.Array:
         """What functions that are conserved are to change by, back to the levels that the run has begun on.
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
@@ -187,7 +214,8 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def allowed() -> jax.Array:
-            move = correction(system, directions(system, x, gradients), found)
+            along = directions(system, x, gradients, leaf)
+            move = displacement(system, x, correction(system, along, found), leaf)
             near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
             return jnp.where(jnp.stack(near).all(), found, 0.0)
 
@@ -231,14 +259,30 @@ class ExplicitMethod(TransportingMethod):
 
         return system.field(x, dH, dS, dL), jnp.stack([rate(law) for law in laws])
 
-    def _laws(self, system: System) -> list[Law]:
-        """The functions that a step ends on levels of; the one that changes last, where the others leave it room."""
+    def _along_leaf(self, system: System) -> bool:
+        """Whether a step goes along the symplectic leaf, on which all Casimirs are constant, so that none is corrected.
+
+        Where it can, and not all Casimirs are quadratic: the gradients of others depend on each other at many states.
+        """
+        if system.dissipation is not None:
+            return False
+        held = [C for name, C in system.casimirs().items() if name in self.held]
+        held += [] if system.entropy is None else [system.entropy]
+        v = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
+        return not all(C.is_quadratic for C in held) and jax.eval_shape(system.poisson.turning, v, v) is not None
+
+    def _laws(self, system: System, leaf: bool = False) -> list[Law]:
+        """The functions that a step ends on levels of; the one that changes last, where the others leave it room.
+
+        With ``leaf``, those that are not constant on a symplectic leaf.
+        """
         functions = system.functions()
         laws = [Law(system.energy, LAWS[system.energy_law])] if system.energy_law in LAWS else []
-        local = set() if system.surface is None else {system.surface.name}
-        laws += [Law(functions[name], 0.0) for name in self.held if name not in local]
+        others = set() if system.surface is None else {system.surface.name}
+        others |= set(system.casimirs()) if leaf else set()
+        laws += [Law(functions[name], 0.0) for name in self.held if name not in others]
         laws += [Law(C, 0.0) for C in self.functions]
-        if system.entropy_law in LAWS:
+        if system.entropy_law in LAWS and not leaf:
             assert system.entropy is not None
             laws.append(Law(system.entropy, LAWS[system.entropy_law]))
         return sorted(laws, key=lambda law: law.sign != 0.0)

@@ -224,10 +224,10 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             return system.poisson.sharp(u, dH)
         gradients = [known[name] for name in functions]
         if functions.keys() <= {ENTROPY, *self._casimirs(system)}:
-            off = _projector(system, u, gradients)
+            off = _projector(system, u, gradients, within=system.body_dim)
             return off(system.poisson.sharp(u, off(dH)))
-        off = _projector(system, u, [Gradients(dH, system.energy.gradient(u)), *gradients])
-        return off(system.poisson.sharp(u, dH))
+        energy = Gradients(dH, system.energy.gradient(u))
+        return _projector(system, u, [energy, *gradients], within=system.body_dim)(system.poisson.sharp(u, dH))
 
     def _force(
         self, part: Dissipation, own: tuple[tuple[str, str], ...], system: System, u, dH, dS, known
@@ -343,9 +343,17 @@ def _made_of(system: System) -> dict[str, Energy]:
     return system.casimirs()
 
 
-def _projector(system: System, u, gradients: list[Gradients]) -> Callable:
-    """The orthogonal projector off discrete gradients, raised: what is driven has a clock, which is not to be moved."""
-    pairs = [(system.raised(u, g.discrete), system.raised(u, g.plain)) for g in gradients]
+def _projector(system: System, u, gradients: list[Gradients], within: int | None = None) -> Callable:
+    """The orthogonal projector off discrete gradients, raised: what is driven has a clock, which is not to be moved.
+
+    ``within`` the first components alone: Pi moves no bath, and the rounding of what it moves is none of theirs.
+    """
+
+    def raised(alpha):
+        found = system.raised(u, alpha)
+        return found if within in (None, system.dim) else found.at[within:].set(0.0)
+
+    pairs = [(raised(g.discrete), raised(g.plain)) for g in gradients]
     return frame([d for d, _ in pairs], like=[p for _, p in pairs]).off
 
 

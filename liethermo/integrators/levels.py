@@ -54,16 +54,26 @@ class Ended(NamedTuple):
 
 
 def corrected(
-    system: System, laws: list[Law], starts: list, x, compensation, d, changes, corrections: int = CORRECTIONS
+    system: System,
+    laws: list[Law],
+    starts: list,
+    x,
+    compensation,
+    d,
+    changes,
+    corrections: int = CORRECTIONS,
+    leaf: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """The displacement nearest to d that changes the functions as it has to, and what it misses, as a length.
 
-    ``starts`` are the gradients of the functions at x + compensation.
+    ``starts`` are the gradients of the functions at x + compensation. With ``leaf`` the displacement is along the
+    symplectic leaf, and d is the covector that carries the state.
     """
     change, surface = ALONG, system.surface
     functions, blocks = [law.function for law in laws], system.blocks
 
-    def landed(d) -> tuple[jax.Array, jax.Array]:
+    def landed(s: Ended) -> tuple[jax.Array, jax.Array]:
+        d = s.d + displacement(system, x + (compensation + s.d), s.correction, leaf)
         return (d, jnp.zeros(())) if surface is None else surface.reached(x, compensation, d)
 
     def misses(d, ends) -> jax.Array:
@@ -76,7 +86,7 @@ def corrected(
 
     def moved(s: Ended) -> tuple[Ended, list]:
         """With the correction that was found before, what is missed; and the gradients there."""
-        d, left = landed(s.d + s.correction)
+        d, left = landed(s)
         ends = [f.gradient(x + (compensation + d)) for f in functions]
         return s._replace(d=d, left=left, defect=misses(d, ends)), ends
 
@@ -84,15 +94,21 @@ def corrected(
         """The next correction, and the lengths of its directions.
 
         These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
-        of their own, as entropies beside a momentum, those by which a function changes most in d.
+        of their own, as entropies beside a momentum, those by which a function changes most in d; or by what the
+        correction of another one leaves by rounding, as that of the energy in baths which take no heat.
         """
-        found = directions(system, x + (compensation + s.d), ends)
+        end = x + (compensation + s.d)
+        found = directions(system, end, ends, leaf)
+        changing = [system.raised(end, v) for v in ends] if leaf else found
         if len(blocks) == 1:
-            lengths = jnp.stack([jnp.linalg.norm(v) for v in found])
+            lengths = jnp.stack([jnp.linalg.norm(v) for v in changing])
         else:
             moved = jnp.linalg.norm(s.d)
-            most = [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(s.d[b]) for b in blocks) for v in found]
-            lengths = jnp.stack(most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
+            most = jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(s.d[b]) for b in blocks) for v in changing])
+            products = jnp.abs(jnp.stack(changing) @ jnp.stack(changing).T)
+            squares = jnp.diagonal(products)
+            shares = products / jnp.where(squares > VANISHED, squares, 1.0)  # of what rounds one in what rounds another
+            lengths = (shares @ most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
         return s._replace(lengths=lengths, correction=correction(system, found, s.defect))
 
     def done(s: Ended) -> jax.Array:
@@ -109,7 +125,8 @@ def corrected(
         return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
 
     none = jnp.zeros(len(laws))
-    s = aimed(*moved(Ended(d, jnp.zeros(()), none, none, jnp.zeros_like(d))))
+    first = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
+    s = aimed(*moved(Ended(first[0], jnp.zeros(()), none, none, first[1])))
     s, ends = moved(s)  # of a short step one correction is enough
     ended = done(s)
 
@@ -122,15 +139,25 @@ def corrected(
     return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
 
 
-def directions(system: System, x, gradients: Sequence[jax.Array]) -> list[jax.Array]:
-    """Those in which corrections of functions with these gradients at x move a state: along the surface."""
+def directions(system: System, x, gradients: Sequence[jax.Array], leaf: bool = False) -> list[jax.Array]:
+    """Those in which corrections of functions with these gradients at x move a state: along the surface.
+
+    With ``leaf`` they are those of the covectors that carry it along its leaf.
+    """
+    if leaf:
+        gradients = [system.poisson.sharp(x, gradient) for gradient in gradients]
     found, surface = [system.raised(x, gradient) for gradient in gradients], system.surface
     return found if surface is None else [surface.along(x, v) for v in found]
 
 
 def correction(system: System, along: Sequence[jax.Array], changes: jax.Array) -> jax.Array:
-    """The displacement in the span of these directions that changes their functions by so much."""
+    """The vector in the span of these directions that changes their functions by so much."""
     return towards(along, changes, passes=min(len(system.blocks), 2))
+
+
+def displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:
+    """What a correction displaces a state x by: ``dH . Pi K = -(Pi dH) . K`` has the sign of the covector K."""
+    return system.poisson.carried(x, -correction) if leaf else correction
 
 
 def ended(

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..functions.frames import towards
 from ..systems import System
 from .base import register
-from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Law, Unlawful
+from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Unlawful
 from .lobatto import ORDERS, ExplicitTableau, lobatto
 
 FIRST, LAST = OWN, OWN + 1
@@ -82,11 +82,11 @@ class MetriplecticRungeKutta(ExplicitMethod):
     def tableau(self) -> ExplicitTableau:
         return lobatto(self.order)
 
-    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
+    def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
         t = self.tableau
-        slopes, rates = self._stages(lambda y: self.rates(system, laws, y), x, compensation, h)
+        slopes, changes = self._stages(rates, x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
-        return Unlawful(h * (t.b @ slopes), h * (t.b @ rates), jnp.asarray(t.d) @ slopes, ends)
+        return Unlawful(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.d) @ slopes, ends)
 
     def plain(self, system: System, x, h) -> jax.Array:
         """A step with one correction and without care for rounding, for derivatives by the parameters of a system.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..systems import System
 from ..tracing.taylor import NoSeriesError, check_series, solution
 from .base import OneStepMethod, register
-from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Law, Unlawful
+from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Unlawful
 from .lobatto import lobatto_rule
 
 LOWEST, HIGHEST = 2, 24
@@ -114,15 +114,13 @@ class MetriplecticTaylor(ExplicitMethod):
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
                 ) from None
 
-    def uncorrected(self, system: System, laws: list[Law], x, compensation, h) -> Unlawful:
+    def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
         nodes, b = self._rule
         numbers = np.arange(1.0, self.order + 1.0)
-        c = solution(lambda y: self.rates(system, laws, y)[0], x, h, self.order)  # from the centre of a chart, exactly
+        c = solution(lambda y: rates(y)[0], x, h, self.order)  # from the centre of a chart, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** numbers @ c)])
-        points = points[-1:] if system.has_generator else points
-        fields, rates = jax.vmap(lambda y: self.rates(system, laws, y))(points)
-        defect = fields[-1] - (numbers @ c) / h
-        changes = rates[-1] if system.has_generator else h * (b @ rates)
+        fields, found = jax.vmap(rates)(points[-1:] if spared else points)
+        defect, changes = fields[-1] - (numbers @ c) / h, found[-1] if spared else h * (b @ found)
         return Unlawful(jnp.sum(c, axis=0), changes, defect / (self.order + 1), c / h)
 
     def weights(self, theta) -> np.ndarray:

@@ -49,6 +49,9 @@ much in a body whose wheel has come to rest, whatever its entropy is counted fro
 
 TINY = float(np.finfo(float).tiny)
 
+CLEAR = 1e-6
+"""What short steps may miss of a field whose rounding is not looked at: to trace it takes as long as the rest."""
+
 STILL = 1e-12
 """A step that moves the state by less, relative to its size, tells nothing: what it does is rounding."""
 
@@ -172,12 +175,16 @@ class Witness:
         whole = WHOLE * float(np.ptp(places, axis=0).max())
         looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
         again, defect = self._worst(looked, whole)
-        least = self._least_field(looked.x[again])
-        tried = [self._step(looked.x[i], looked.h[i], looked.t[i], f) for i, f in zip(again, least, strict=True)]
-        steps = [step for step in tried if step is not None and step.length > STILL]
-        if not steps:  # nothing moves
-            return found
-        found = dataclasses.replace(found, inconsistency=self._inconsistency(steps))
+        for fields in (self._least_field, self._least_field_rounded):
+            least = fields(looked.x[again])
+            tried = [self._step(looked.x[i], looked.h[i], looked.t[i], f) for i, f in zip(again, least, strict=True)]
+            steps = [step for step in tried if step is not None and step.length > STILL]
+            if not steps:  # nothing moves
+                return found
+            missed = self._inconsistency(steps)
+            if len(self.system.blocks) == 1 or missed is None or missed <= CLEAR:
+                break
+        found = dataclasses.replace(found, inconsistency=missed)
         moving = [step is None or step.moved > STILL * step.size for step in tried]
         if not any(moving):
             return found
@@ -196,7 +203,16 @@ class Witness:
             moved[:, block] += ROUNDED * np.abs(x[:, block]).max(axis=1, initial=0.0, keepdims=True) * signs[block]
         before, after = field_at(self.system, np.concatenate([x, moved])).reshape(2, *x.shape)
         change = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
-        return np.stack([change[:, block].max(axis=1, initial=0.0) for block in self.system.blocks], axis=1)
+        return self._of_blocks(change)
+
+    def _least_field_rounded(self, x: np.ndarray) -> np.ndarray:
+        """The same with what rounding leaves in the field: a bath takes the sum of what may cancel in the body."""
+        with np.errstate(all="ignore"):
+            size = at_points(_size_of_field, self.system, x)
+        return np.maximum(self._least_field(x), self._of_blocks(ROUNDED * size))
+
+    def _of_blocks(self, fields: np.ndarray) -> np.ndarray:
+        return np.stack([fields[:, block].max(axis=1, initial=0.0) for block in self.system.blocks], axis=1)
 
     def _worst(self, steps: Steps, whole: float) -> tuple[np.ndarray, np.ndarray]:
 
@@ -325,6 +341,11 @@ def spread(count: int, most: int) -> np.ndarray:
 
 def _largest(values: np.ndarray) -> list[float]:
     return [float(v) for v in np.nan_to_num(values, nan=0.0, posinf=0.0).max(axis=0)]
+
+
+def _size_of_field(system: System, x) -> jnp.ndarray:
+    """The size at which the vector field is rounded, component by component."""
+    return with_rounding(system.vector_field, x)[1]
 
 
 def laws_functions(system: System) -> list[Energy]:

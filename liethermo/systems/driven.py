@@ -233,6 +233,9 @@ class _OfClock(PoissonBySharp):
         """Any points: the tensor is constant."""
         return jnp.broadcast_to(x, alpha.shape)
 
+    def turning(self, covector, alpha) -> jax.Array:
+        return alpha
+
 
 def _clock(dH, unit: float) -> jax.Array:
     """The velocities of t and W, shape (2,), from a gradient of the energy."""

@@ -136,8 +136,25 @@ def turned_by(B, w, A) -> jax.Array:
     """
     s, n = B.shape[:2]
     table = (A[:, None, :, None] * B.swapaxes(0, 1)).reshape(s * n, s * n)
-    stages = solve(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
+    solver = solve_near_identity if s == 1 else solve  # whose matrix is 1 less a skew-Hermitian one
+    stages = solver(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
     return stages @ w @ adjoint(stages)
+
+
+def cayley_rate(k, b, traceless: bool = False) -> jax.Array:
+    """``k'`` for which ``U = (1 - k/2)^-1 (1 + k/2)`` moves by ``U' = B U``, of skew-Hermitian k and B, shape (n, n).
+
+    Parameters
+    ----------
+    traceless : bool
+        Whether k' has to have the trace zero: then U moves by B plus a multiple of the identity.
+    """
+    half, one = 0.5 * k, np.eye(k.shape[-1])
+    found = (one - half) @ b @ (one + half)
+    if not traceless:
+        return found
+    square = one - half @ half
+    return found - (jnp.trace(found) / jnp.trace(square)) * square
 
 
 def spectral_radius(X) -> jax.Array:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..matrices.linear import turned_by
+from ..matrices.linear import cayley_rate, turned_by
 from .poisson import PoissonBySharp
 
 
@@ -54,6 +54,9 @@ class DensityMatrices(PoissonBySharp):
     def on_leaf(self, x, alpha, A) -> jax.Array:
         """``U_i rho U_i^H``, the U_i stages by A of ``U' = -i H U`` from the identity; the eigenvalues stay."""
         return self.vector(turned_by(-1j * self.matrix(alpha), self.matrix(x), A))
+
+    def turning(self, covector, alpha) -> jax.Array:
+        return self.vector(1j * cayley_rate(-1j * self.matrix(covector), -1j * self.matrix(alpha)))
 
 
 @functools.lru_cache(maxsize=64)

@@ -16,7 +16,7 @@ from .._module import Module, forwarded
 from ..algebras.lie_algebra import LieAlgebra
 from ..algebras.on_demand import OnDemand
 from ..errors import ParameterError, ShapeError
-from ..matrices.linear import adjoint, turned_by
+from ..matrices.linear import adjoint, cayley_rate, turned_by
 
 
 class PoissonStructure(Module):
@@ -53,6 +53,33 @@ class PoissonStructure(Module):
             Covectors at the stages.
         A : array, shape (s, s)
             The matrix of the method, times the step.
+        """
+        return None
+
+    def carried(self, x, covector) -> jax.Array:
+        """The displacement of x along its leaf, shape (n,): ``Pi(u) K``, u the middle of that step.
+
+        Parameters
+        ----------
+        x : array, shape (n,)
+        covector : array, shape (n,)
+            K: a gradient times a time.
+        """
+        points = self.on_leaf(x, covector[None], np.full((1, 1), 0.5))
+        assert points is not None
+        return self.sharp(points[0], covector)
+
+    def turning(self, covector, alpha) -> jax.Array | None:
+        """``K'`` for which x, :meth:`carried` by K, moves by ``x' = Pi(x) alpha``, shape (n,); None: not known.
+
+        It begins at K = 0, where it is alpha, and is smooth: so K is found by any method, at its order, and what it
+        carries is on the leaf however K is rounded.
+
+        Parameters
+        ----------
+        covector : array, shape (n,)
+            K.
+        alpha : array, shape (n,)
         """
         return None
 
@@ -110,6 +137,15 @@ class LiePoisson(PoissonStructure):
         basis, dual = found
         turned = turned_by(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
         return jnp.einsum("sij,aji->sa", turned, basis).real
+
+    def turning(self, covector, alpha) -> jax.Array | None:
+        found = _skew_matrices(self.algebra)
+        if found is None:
+            return None
+        basis, dual = found
+        k, b = (-jnp.tensordot(v, basis, 1) for v in (covector, alpha))
+        rate = cayley_rate(k, b, traceless=np.iscomplexobj(basis) and self.dim < basis.shape[-1] ** 2)
+        return -jnp.einsum("ij,aji->a", rate, dual).real
 
 
 @functools.lru_cache(maxsize=64)
@@ -229,6 +265,12 @@ class Beside(PoissonStructure):
         first = self.first.on_leaf(x[:n], alpha[:, :n], A)
         second = self.second.on_leaf(x[n:], alpha[:, n:], A)
         return None if first is None or second is None else jnp.concatenate([first, second], axis=-1)
+
+    def turning(self, covector, alpha) -> jax.Array | None:
+        n = self.first.dim
+        first = self.first.turning(covector[:n], alpha[:n])
+        second = self.second.turning(covector[n:], alpha[n:])
+        return None if first is None or second is None else jnp.concatenate([first, second])
 
 
 class NoPoisson(PoissonStructure):

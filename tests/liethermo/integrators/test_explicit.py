@@ -228,7 +228,9 @@ def uncorrected(method):
 
     class Uncorrected(type(method)):
         def slopes(self, system, x, compensation, h, k):
-            d, _, error, between = self.uncorrected(system, self._laws(system), x, compensation, h)
+            laws = self._laws(system)
+            rates = lambda y: self.rates(system, laws, y)  # noqa: E731
+            d, _, error, between = self.uncorrected(rates, False, x, compensation, h)
             return jnp.stack([d / h, error, jnp.zeros_like(x), k[LEVELS], *between])
 
     return Uncorrected(method.order)

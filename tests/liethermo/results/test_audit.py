@@ -399,3 +399,53 @@ def test_unknown_tolerances_are_named():
             lt.InputError, match=r"'energy_drift'.*energy, entropy, casimirs, residual, attitude, accuracy"
         ):
             run.audit(energy_drift=1e-10)
+
+
+# -- what has nothing to do -------------------------------------------------------------------------------------------
+
+TURNED = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 2)) @ np.array([1.0, 1.0j]))[0]
+LEVELS, PHASES = ((TURNED * values) @ TURNED.conj().T for values in ([0.0, 1.0, 2.5], [1.0, -1.0, 0.3]))
+LOWERING = np.diag([1.0, 1.0], 1)
+
+
+def quantum(H, V, rate, capacity):
+    bath = lt.HeatBaths(capacity=capacity, temperature=0.7)
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, rate)]), bath)
+    return q, q.samples(1, 3)[0] * np.append(np.ones(q.body_dim), 0.0)
+
+
+def body(dissipation, energy=(1.0, 1 / 2, 1 / 3), capacity=2.0):
+    baths = None if capacity is None else lt.HeatBaths(capacity=capacity)
+    entropy = lt.Quadratic(np.ones(3)) if capacity is None else None
+    system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(energy), entropy, dissipation, baths=baths)
+    return system, system.state(np.append([0.4, 0.5, 0.8], [0.0] * (system.dim - 3)))
+
+
+IDLE = {
+    "jumps at rate zero": lambda: quantum(LEVELS, LOWERING, 0.0, 0.8),
+    "jumps without a Hamiltonian": lambda: quantum(0.0 * LEVELS, LOWERING, 0.5, np.inf),
+    "jumps of equal levels": lambda: quantum(np.eye(3), LOWERING, 0.5, np.inf),
+    "jumps that exchange no heat": lambda: quantum(LEVELS, PHASES, 0.4, 0.8),
+    "the identity as a jump": lambda: quantum(LEVELS, np.eye(3), 0.4, np.inf),
+    "a bracket at rate zero": lambda: body(lt.DoubleBracket(0.0)),
+    "a bracket without an energy": lambda: body(lt.DoubleBracket(0.3), np.zeros(3), np.inf),
+    "friction at rate zero": lambda: body(lt.Friction(rate=0.0), capacity=np.inf),
+    "Killing at rate zero": lambda: body(lt.KillingDissipation(0.0), capacity=None),
+    "a projected metric at rate zero": lambda: body(lt.ProjectedMetric(rate=0.0), capacity=None),
+    "four-bracket without an energy": lambda: body(
+        lt.FourBracket.kulkarni_nomizu(np.eye(3), np.eye(3)), np.zeros(3), None
+    ),
+}
+
+
+@pytest.mark.sampled(
+    "jumps without a Hamiltonian-Gauss", "jumps that exchange no heat-Gauss", "a bracket at rate zero-explicit"
+)
+@pytest.mark.parametrize("by", ["Gauss", "explicit"])
+@pytest.mark.parametrize("name", IDLE)
+def test_what_rounding_makes_of_nothing_is_no_motion(name, by):
+    """Baths that take no heat, and energies that are zero, are moved by rounding alone."""
+    methods = {"Gauss": lt.MetriplecticGauss(2), "explicit": lt.MetriplecticRungeKutta(4)}
+    system, x0 = IDLE[name]()
+    audit = lt.integrate(system, x0, (0.0, 2.0), 0.05, methods[by]).audit()
+    assert audit.passed, str(audit)

@@ -1,5 +1,6 @@
 """Poisson structures: the axioms, on Lie algebras and on R^2n, and controls that must fail."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -89,6 +90,17 @@ def test_stages_on_a_leaf(P):
     assert np.abs(P.on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
 
 
+@pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
+def test_a_covector_that_carries_a_state(P):
+    """Its rate is that of the motion, at a covector that is not small; the control: the covector as it is."""
+    rng = np.random.default_rng(4)
+    x, covector, alpha = rng.standard_normal((3, P.dim))
+    end = x + P.carried(x, covector)
+    moved = jax.jvp(lambda K: P.carried(x, K), (covector,), (P.turning(covector, alpha),))[1]
+    assert np.abs(moved - P.sharp(end, alpha)).max() <= 1e-13 * np.abs(x).max() * np.abs(covector).max() ** 2
+    assert np.abs(jax.jvp(lambda K: P.carried(x, K), (covector,), (alpha,))[1] - moved).max() >= 1e-2
+
+
 def gauss_of_two():
     root = np.sqrt(3.0) / 6.0
     return np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]]), np.array([0.5, 0.5])
@@ -102,3 +114,4 @@ def dual(g):
 def test_other_leaves_are_not_known():
     for P in (mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.g2()), mf.LiePoisson(mf.sl(3)), mf.LiePoisson(mf.su(20))):
         assert P.on_leaf(np.ones(P.dim), np.ones((1, P.dim)), np.eye(1)) is None
+        assert P.turning(np.ones(P.dim), np.ones(P.dim)) is None
