@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import is_traced
 from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
@@ -20,6 +21,9 @@ from ..errors import InputError
 from ..functions.density import OfMatrix
 from ..functions.energy import Energy, Function
 from ..functions.frames import frame
+from ..functions.gradients import EPS
+from ..functions.indices import Fixed
+from ..functions.with_baths import WithBaths
 from .base import Dissipation
 from .checks import checked_rate
 
@@ -27,25 +31,10 @@ EIGEN = 1e-9
 """Residual of ``[H, V] = -omega V``, and difference of frequencies, relative to the sizes of H and V, that is zero."""
 
 
-class Operator:
-    """A matrix that cannot change and is compared by value, to be a static field of a module."""
+class Operator(Fixed):
+    """A complex matrix as a static field of a module."""
 
-    def __init__(self, matrix):
-        self._array = np.array(matrix, dtype=complex)
-        self._array.flags.writeable = False
-        self._hash = hash((self._array.shape, self._array.tobytes()))
-
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        return self._array if dtype is None else self._array.astype(dtype)
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __eq__(self, other) -> bool:
-        return isinstance(other, Operator) and np.array_equal(self._array, other._array)
-
-    def __repr__(self) -> str:
-        return f"Operator{self._array.shape}"
+    dtype = complex
 
 
 class Jump(NamedTuple):
@@ -142,6 +131,11 @@ class ThermalJumps(Dissipation):
                 )
         if baths is not None and self.bath >= baths.number:
             raise InputError(f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number}, from 0")
+        if is_traced(system.energy.body if isinstance(system.energy, WithBaths) else system.energy):
+            raise InputError(
+                "ThermalJumps are split by the eigenvectors of the Hamiltonian, which has to be a known one: build a "
+                "system for each, as lt.Study does. Rates, temperatures and capacities may be parameters of a function"
+            )
         hamiltonians = system.hamiltonians()
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if _hermitian(V) else 1.0) for i, V in enumerate(self.operators))
@@ -149,10 +143,13 @@ class ThermalJumps(Dissipation):
             return self._replaced(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
         vectors = _eigenvectors(hamiltonians[0])
         inside = [adjoint(vectors) @ H @ vectors for H in hamiltonians]
-        found = [_split(V, i, inside, vectors) for i, V in enumerate(self.operators)]
+        parts = [_split(V, i, inside, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
-        jumps = tuple(itertools.chain.from_iterable(found))
-        return self._replaced(jumps=jumps, frame=frame, isolated=False, keeps_energy=True)
+        jumps = tuple(itertools.chain.from_iterable(parts))
+        found = self._replaced(jumps=jumps, frame=frame, isolated=False, keeps_energy=True)
+        if not is_traced((self.rates, baths)):
+            found._check_rates(system.at_some_times()[0] if system.is_driven else system)
+        return found
 
     def _replaced(self, **fields) -> ThermalJumps:
         found = object.__new__(ThermalJumps)
@@ -190,6 +187,20 @@ class ThermalJumps(Dissipation):
         # the Hermitian part has both terms of what is lost
         moved = _jumped(self.jumps, rates, rho) - jnp.tensordot(rates, _left(self.jumps), 1) @ rho
         return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
+
+    def _check_rates(self, system) -> None:
+        """Raise InputError where rates at the first temperature of the bath cannot be computed with."""
+        n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
+        omega, T = self._frequencies(system.structure, dH[:n]), dH[n + self.bath]
+        strengths, sizes = self._strengths(omega, T), np.abs(np.asarray(omega))
+        rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
+        for jump, rate, w in zip(self.jumps, rates, sizes, strict=True):
+            if w > 0.0 and not rate * EPS <= w:
+                raise InputError(
+                    f"jumps of V[{jump.source}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
+                    f"rate * exp(omega / 2T) = {rate:.3g}: no rate that doubles hold beside that energy. Give the rate "
+                    "as a function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
+                )
 
     def _inside(self, matrix):
         """A matrix in the frame, in which most entries of the jumps are zero."""

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import scipy
 
 
-class Indices:
-    """An array of integers that cannot change and is compared by value, to be a static field of a module.
+class Fixed:
+    """An array that cannot change and is compared by value, to be a static field of a module.
 
     A tuple of 1e5 numbers would be hashed anew at every call of a compiled function; this is hashed once.
     """
 
+    dtype: ClassVar[type]
+
     def __init__(self, numbers):
-        self._array = np.array(numbers, dtype=np.int64)
+        self._array: np.ndarray = np.array(numbers, dtype=self.dtype)
         self._array.flags.writeable = False
         self._hash = hash((self._array.shape, self._array.tobytes()))
 
     @property
     def shape(self) -> tuple[int, ...]:
         return self._array.shape
-
-    @property
-    def run(self) -> slice | None:
-        """The slice that the numbers are, in order, or None: a slice is read faster than it is gathered."""
-        flat = self._array.ravel()
-        if flat.size == 0 or not np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
-            return None
-        return slice(int(flat[0]), int(flat[0]) + flat.size)
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return self._array if dtype is None else self._array.astype(dtype)
@@ -41,12 +37,25 @@ class Indices:
     def __eq__(self, other) -> bool:
         if self is other:
             return True
-        return (
-            isinstance(other, Indices) and self._hash == other._hash and np.array_equal(self._array, np.asarray(other))
-        )
+        same = type(self) is type(other) and self._hash == other._hash
+        return same and np.array_equal(self._array, np.asarray(other))
 
     def __repr__(self) -> str:
-        return f"Indices{self.shape}"
+        return f"{type(self).__name__}{self.shape}"
+
+
+class Indices(Fixed):
+    """Integers: places."""
+
+    dtype = np.int64
+
+    @property
+    def run(self) -> slice | None:
+        """The slice that the numbers are, in order, or None: a slice is read faster than it is gathered."""
+        flat = self._array.ravel()
+        if flat.size == 0 or not np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+            return None
+        return slice(int(flat[0]), int(flat[0]) + flat.size)
 
 
 def pattern(rows, columns, dim: int) -> scipy.sparse.csr_array:

@@ -127,8 +127,6 @@ def ensemble(
     course = course_of(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
 
     family = Family.of(system, parameters)
-    if np.ndim(x0s) > 2 and getattr(system, "space", None) is None and not getattr(system, "sites", ()):
-        raise InputError(f"initial states have shape (n,) or (trajectories, n), not {np.shape(x0s)}")
     states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
     size = len(states)
@@ -213,6 +211,8 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
     if member is None:
         member = family.member(next(i for i in range(family.size) if i not in family.refused))
     x0s, bad = _states(member, x0s)
+    if x0s.ndim > 2:
+        raise InputError(f"initial states have shape (n,) or (trajectories, n), not {x0s.shape}")
     size = common_size(len(x0s), family.size, attitudes)
     states = np.broadcast_to(x0s, (size, x0s.shape[1]))
     if bad and len(x0s) == 1:
@@ -266,7 +266,7 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
         return np.atleast_2d(np.asarray(member.numbers(x0s, batch=True))), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
-        if rows.ndim < 2 or rows.dtype.kind not in "fiub" or not len(rows):
+        if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
     bad = _by_halves(lambda part: why_not(lambda: member.numbers(rows[part], batch=True)), len(rows))
     good = [i for i in range(len(rows)) if i not in bad]

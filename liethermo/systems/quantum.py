@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Sequence
 
@@ -240,11 +241,13 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        p, vectors = np.linalg.eigh(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
-        traces, least = p.sum(axis=-1), p[:, 0].min()
+        rho = np.asarray(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
+        traces = np.trace(rho, axis1=-2, axis2=-1).real
         trace = traces[np.abs(traces - 1.0).argmax()]
-        if abs(trace - 1.0) > 1e-9:
+        if not abs(trace - 1.0) <= 1e-9:
             return f"the trace of its density matrix is {trace:.12g}, not 1"
+        p = np.linalg.eigvalsh(rho)
+        least = p[:, 0].min()
         if least < -max(self._floor, 0.0):
             return (
                 f"its density matrix has the eigenvalue {least:.3g}, outside the cone of positive matrices: a shorter "
@@ -256,9 +259,10 @@ class QuantumSystem(System):
                 "mix it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the "
                 "system entropy=lt.VonNeumann(floor=1e-12)"
             )
-        gone = p <= self._floor
-        if not gone.any() or not self._has(SteepestEntropyAscent):
+        if not self._has(SteepestEntropyAscent) or not (p <= self._floor).any():
             return ""
+        p, vectors = np.linalg.eigh(rho)
+        gone = p <= self._floor
         kernel, inside = (((vectors * some[:, None]) @ adjoint(vectors)) for some in (gone, ~gone))
         if any(np.abs(kernel @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
             return (
@@ -358,7 +362,7 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
         return _sum_of_terms(hamiltonian)
     if callable(hamiltonian) and not callable(getattr(hamiltonian, "full", None)):
         for t in TIMES:
-            found = checked_hermitian(np.asarray(hamiltonian(t)), f"the Hamiltonian at t = {t:.3g}")
+            found = checked_hermitian(_at(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}")
         structure = mf.DensityMatrices(len(found))
         return len(found), TimeDependent(Expectation(hamiltonian, structure))
     if isinstance(hamiltonian, jax.core.Tracer):
@@ -367,6 +371,17 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         return len(H), Linear(jnp.asarray(mf.DensityMatrices(len(H)).vector(H)))
+
+
+def _at(function, t: float, what: str):
+    """What a function gives at a time; refused where it is none of one argument."""
+    try:
+        inspect.signature(function).bind(t)
+    except TypeError as error:
+        raise InputError(f"{what}, where it is a function, is one of the time t alone: {error}") from None
+    except ValueError:  # it does not tell
+        pass
+    return function(t)
 
 
 def _is_term(part) -> bool:
@@ -392,7 +407,7 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
         if f is None:
             constant.append(H)
             continue
-        value = f(TIMES[0])
+        value = _at(f, TIMES[0], f"the second of term {i} of the Hamiltonian")
         if np.shape(value) or jnp.result_type(value).kind not in "fiu":
             raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
         moved.append(H)

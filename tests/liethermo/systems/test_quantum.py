@@ -668,12 +668,72 @@ def test_ensembles_over_rates_and_states():
     assert np.array_equal(found.x[3], alone)
 
 
+def test_an_ensemble_takes_matrices():
+    """As a single run takes one; and says which of them is none."""
+    q, matrices = qubit(), np.stack([random_density(2, seed) for seed in range(3)])
+    many = lt.ensemble(q, matrices, (0.0, 0.2), 0.1)
+    assert np.array_equal(many.x, lt.ensemble(q, q.state(matrices), (0.0, 0.2), 0.1).x)
+    matrices[1] *= 0.5  # a trace of a half
+    many = lt.ensemble(q, matrices, (0.0, 0.2), 0.1)
+    assert many.ok.tolist() == [True, False, True]
+    assert "trace 0.5, not 1" in many.message(1)
+
+
+WATCHED = {
+    "midpoint": (lt.MetriplecticMidpoint(), 0.05, 1e-3),
+    "explicit": (lt.MetriplecticRungeKutta(8), 0.05, 1e-12),
+    "Taylor": (lt.MetriplecticTaylor(12), 0.25, 1e-12),
+    "adaptive": (lt.MetriplecticRungeKutta(8), lt.Adaptive(1e-11), 1e-9),
+}
+
+
+@pytest.mark.sampled("explicit")
+@pytest.mark.parametrize("name", WATCHED)
+def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
+    """Beside the closed form of the population, which falls to 0.3, and the purity of the last state."""
+    (method, step, within), q = WATCHED[name], qubit()
+    start = np.array([[0.1, 0.1], [0.1, 0.9]])
+    fast, rest = RATE * 2 * np.cosh(1.3 / (2 * T)), np.exp(-1.3 / T) / (1.0 + np.exp(-1.3 / T))
+    time = np.log((0.9 - rest) / (0.3 - rest)) / fast
+    run = lt.integrate(q, start, (0.0, 50.0), step, method, until=lambda x: x[1] - 0.3)
+    assert run.status.code == "event"
+    assert abs(run.t[-1] - time) <= within
+    assert abs(q.density(run.x[-1])[1, 1].real - 0.3) <= 1e-13
+    assert run.audit().passed
+
+    def purity(x):
+        rho = q.density(x)
+        return jnp.sum(jnp.abs(rho) ** 2) - 0.6
+
+    many = lt.ensemble(q, np.stack([start, RHO]), (0.0, 50.0), step, method, until=purity)
+    assert many.ok.all()
+    rho = np.asarray(q.density(many.x))
+    assert np.abs(np.sum(np.abs(rho) ** 2, axis=(1, 2)) - 0.6).max() <= 1e-13
+    alone = lt.integrate(q, start, (0.0, 50.0), step, method, until=purity)
+    assert abs(many.event_time[0] - alone.event_time) <= 1e-12
+
+
 BAD = {
     "term 1 of the Hamiltonian is not Hermitian": lambda q: lt.QuantumSystem([QUBIT, (LOWER, jnp.cos)]),
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
     "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
     "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
     "of term 1 of the Hamiltonian gives a real number": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t: 1j * t)]),
+    "the Hamiltonian, where it is a function, is one of the time": lambda q: lt.QuantumSystem(lambda: QUBIT),
+    "is one of the time t alone: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
+    r"V\[0\] that take the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
+        QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite(0.01)
+    ),
+    r"at T = 0.0001, .* = nan.*Give the rate as a function": lambda q: lt.QuantumSystem(
+        QUBIT, lt.ThermalJumps([(X, lambda w, T: 0.1 / (2 * jnp.sinh(w / (2 * T))))]), infinite(1e-4)
+    ),
+    "eigenvectors of the Hamiltonian, which has to be a known one": lambda q: lt.ensemble(
+        lambda p: lt.QuantumSystem(p * QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite()),
+        q.state(RHO),
+        (0.0, 1.0),
+        0.1,
+        parameters=np.array([0.5, 1.0]),
+    ),
     "Hermitian": lambda q: lt.QuantumSystem(LOWER),
     "square": lambda q: lt.QuantumSystem(np.ones((2, 3))),
     r"V\[0\] has shape \(3, 3\)": lambda q: lt.QuantumSystem(

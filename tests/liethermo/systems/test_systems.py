@@ -292,3 +292,25 @@ def test_the_report_counts_points_outside_the_domain():
     assert 0 < report.points < 32
     assert "outside the domain" in str(report)
     assert system.check(points=state_of(mf.so(3), 0) ** 2 + 0.1).points == 1
+
+
+class Unstartable(lt.LiePoissonSystem):
+    def singular(self, x):
+        return "its gradient is infinite"
+
+
+class UnstartableOnASpace(lt.MetriplecticSystem):
+    singular = Unstartable.singular
+
+
+def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():
+    """Beside an attitude, in the space around a manifold, and with a clock."""
+    energy, entropy = lt.Quadratic([1.0, 1 / 2, 1 / 3]), lt.Quadratic(np.ones(3))
+    body = Unstartable(mf.so(3), energy, entropy, lt.KillingDissipation(0.1), group=mf.SO(3))
+    driven = Unstartable(mf.so(3), energy, entropy, lt.KillingDissipation(0.1), torque=lambda t, mu: 0.1 * mu)
+    on_sphere = UnstartableOnASpace(
+        None, lambda x: x[2], lambda x: x[0], lt.ProjectedMetric(rate=0.1), space=mf.Sphere(2), validate=False
+    )
+    for system in (body, driven, on_sphere):
+        with pytest.raises(lt.InputError, match="cannot start at this x0: its gradient is infinite"):
+            lt.integrate(system, [0.0, 0.0, 1.0], (0.0, 1.0), 0.1)
