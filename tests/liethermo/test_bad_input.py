@@ -150,6 +150,10 @@ CASES = {
         lambda: lt.LieVariational().attitudes(body(), X, 0.1, start=np.eye(2)),
         r"start must have last axes \(3, 3",
     ),
+    "attitude that is no number": (
+        lambda: lt.LieVariational().attitudes(body(), X, 0.1, start=np.full((3, 3), np.nan)),
+        "entries that are not finite",
+    ),
     "one attitude": (lambda: lt.LieVariational().attitudes(body(), X[0], 0.1), r"at least two, shape \(times, 4\)"),
     "wrong system": (lambda: lt.LieVariational().attitudes(oscillator(), RUN, 0.1), "not a SimpleClosedSystem"),
     "order": (lambda: D(lambda q0, q1, S, h: S, [2]), r"the order is 1, 2 or 4, not \[2\]"),

@@ -16,6 +16,7 @@ from manifolds.groups.maps import cayley, dexp, exp
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
+from ...functions.conditions import require
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import program
 from ..base import ONE_SIZE, OneStepMethod, checked_step, kind_of, register, states_of_run
@@ -132,7 +133,9 @@ class LieVariational(OneStepMethod):
         self.check(system)
         steps = np.asarray(_turns(self, system, states_of_run(system, x), checked_step(h)))
         size = steps.shape[-1]
-        path = [np.eye(size) if start is None else np.asarray(square_matrices(start, size, "start"))]
+        g0 = np.eye(size) if start is None else square_matrices(start, size, "start")
+        require(g0, np.isfinite, "start is an element of the group, and has entries that are not finite: {value}")
+        path = [np.asarray(g0)]
         for turn in steps:
             path.append(path[-1] @ turn)
         return np.array(path)
