@@ -147,7 +147,7 @@ class _Body:
         else:
             if not self.lifting.loops:
                 self.lifting.loops = any(_loops(p) for p in params.values())
-            keep = name == "pow" and isinstance(inputs[1], Literal) and float(2.0 * inputs[1].val).is_integer()
+            keep = name == "pow" and isinstance(inputs[1], Literal) and float(2.0 * np.real(inputs[1].val)).is_integer()
             inputs = self._without_numbers(inputs[:1]) + inputs[1:] if keep else self._without_numbers(inputs)
         return inputs, params
 

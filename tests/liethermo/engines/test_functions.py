@@ -136,6 +136,13 @@ def test_newton_has_them_too(name):
     assert np.abs(ours.x - other.x).max() <= 1e-12
 
 
+def test_a_power_of_a_complex_number():
+    """Traced without NumPy's warning that an imaginary part is lost, which none is."""
+    f = lambda m: jnp.real((1.5 + 1j * m[0]) ** 2.5) + m[1] ** 2  # noqa: E731
+    found = lt.LiePoissonSystem(mf.so(3), f).energy.gradient(X0)
+    np.testing.assert_allclose(found, jax.grad(f)(X0), rtol=1e-15)
+
+
 def test_what_cannot_be_compiled_is_named():
     system = body(lambda m: jnp.abs(lax.asinh(m[0] + 1j)))
     with pytest.raises(lt.LiethermoError, match=r"primitive 'asinh' on complex numbers \(test_functions.py:\d+"):
