@@ -147,8 +147,8 @@ class _Body:
         else:
             if not self.lifting.loops:
                 self.lifting.loops = any(_loops(p) for p in params.values())
-            keep = name == "pow" and isinstance(inputs[1], Literal) and float(2.0 * np.real(inputs[1].val)).is_integer()
-            inputs = self._without_numbers(inputs[:1]) + inputs[1:] if keep else self._without_numbers(inputs)
+            place = _place_of_formula(name, inputs)
+            inputs = [a if i == place else self._without_numbers([a])[0] for i, a in enumerate(inputs)]
         return inputs, params
 
     def _without_numbers(self, inputs: list) -> list:
@@ -249,6 +249,17 @@ def _is_number(atom) -> bool:
     if not isinstance(atom, Literal) or getattr(atom.aval, "dtype", None) != np.float64:
         return False
     return bool(atom.val != 0.0) and np.shape(atom.val) == ()
+
+
+FORMULAS = {"pow": (1, 2.0), "polygamma": (0, 1.0)}
+"""Which input says by what formula a primitive is computed: where so many times the number is an integer."""
+
+
+def _place_of_formula(name: str, inputs: list) -> int | None:
+    """The place of an input that is to stay a number, if there is one."""
+    place, times = FORMULAS.get(name, (0, 0.0))
+    known = times and isinstance(inputs[place], Literal)
+    return place if known and float(times * np.real(inputs[place].val)).is_integer() else None
 
 
 def _loops(parameter) -> bool:

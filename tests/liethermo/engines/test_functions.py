@@ -143,6 +143,12 @@ def test_a_power_of_a_complex_number():
     np.testing.assert_allclose(found, jax.grad(f)(X0), rtol=1e-15)
 
 
+def test_the_order_of_a_polygamma_function_is_known_to_the_compiler():
+    system = body(lambda m: special.polygamma(1, 2.0 + m[0]) + m[1] ** 2)
+    run = lt.integrate(system, X0, (0.0, 0.2), 0.1, lt.MetriplecticRungeKutta(4), engine="compiled")
+    assert run.audit().energy_drift <= 4e-15
+
+
 def test_what_cannot_be_compiled_is_named():
     system = body(lambda m: jnp.abs(lax.asinh(m[0] + 1j)))
     with pytest.raises(lt.LiethermoError, match=r"primitive 'asinh' on complex numbers \(test_functions.py:\d+"):
