@@ -32,6 +32,9 @@ LIMIT = 200_000
 
 UNKNOWN = "of unknown origin"
 
+OURS = Path(__file__).parents[1], Path(chains.__file__).parents[1]
+"""Folders of both packages, whose lines are none of the user's."""
+
 
 class UnsupportedPrimitive(LiethermoError):
     """A function that cannot be unrolled.
@@ -446,8 +449,9 @@ CONTROL = {
 
 
 def origin(eqn) -> str:
-    """The innermost line outside JAX that led to an equation."""
+    """The innermost line of a user's that led to an equation, in a function or in a call."""
     for frame in getattr(eqn.source_info.traceback, "frames", ()):
-        if not {"jax", "jaxlib", "equinox"} & set(Path(frame.file_name).parts):
-            return f"{Path(frame.file_name).name}:{frame.line_num}, in {frame.function_name}"
+        path = Path(frame.file_name)
+        if not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, OURS)):
+            return f"{path.name}:{frame.line_num}, in {frame.function_name}"
     return UNKNOWN

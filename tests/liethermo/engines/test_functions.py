@@ -153,6 +153,9 @@ def test_what_cannot_be_compiled_is_named():
     system = body(lambda m: jnp.abs(lax.asinh(m[0] + 1j)))
     with pytest.raises(lt.LiethermoError, match=r"primitive 'asinh' on complex numbers \(test_functions.py:\d+"):
         lt.integrate(system, X0, (0.0, 0.1), 0.1, engine="compiled")
+    transformed = body(lambda m: jnp.sum(jnp.abs(jnp.fft.fft(m)) ** 4))  # of which no line is known
+    with pytest.raises(lt.LiethermoError, match=r"primitive 'fft' \((of unknown origin|test_functions.py:\d+)"):
+        lt.integrate(transformed, X0, (0.0, 0.1), 0.1, engine="compiled")
 
 
 FUNCTIONS_OF_MATRICES = {
