@@ -1,4 +1,4 @@
-"""Fluids on the sphere as su(N): the time of a step with selective decay, against the isospectral midpoint without."""
+"""Fluids on the sphere as su(N): against the isospectral midpoint; with a magnetic field, and what it keeps."""
 
 from __future__ import annotations
 
@@ -16,6 +16,11 @@ from ..timing import race
 DEGREES, TURN, RATE = (2, 12), 0.05, 1e-3
 """Degrees of the first vorticity; how far the fastest part of the fluid turns in a step, in radians; of the decay."""
 
+LONG, MAGNETIC_RATE = 10_000, 1e-3
+"""Steps in which the invariants of the magnetic fluid are followed, and of its friction."""
+
+METHOD = lt.MetriplecticRungeKutta(4)
+
 
 def run(quick: bool) -> Report:
     """Time steps of both, on matrices of growing size."""
@@ -23,7 +28,7 @@ def run(quick: bool) -> Report:
     rows, targets = [], []
     for N in sizes:
         steps, rounds = (2, 1) if quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
-        found, ratio = process.call("fluids", str(N), str(steps), str(rounds), one_core=True)
+        found, ratio = process.call("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
         rows += found
         if not quick and N in (128, 256):
             targets.append(
@@ -48,10 +53,105 @@ def run(quick: bool) -> Report:
         "NumPy and machine code, without dissipation. The library takes steps of `MetriplecticRungeKutta(4)` with "
         "selective decay, the energy exact and the entropy never falling."
     )
-    return Report("Large matrix algebras: a fluid on the sphere", text, [Table(caption, columns, rows)], targets, {})
+    magnetic, more = with_field(quick)
+    tables = [Table(caption, columns, rows), *magnetic]
+    return Report("Large matrix algebras: a fluid on the sphere", text, tables, targets + more, {})
 
 
-def child(*numbers: str):
+def with_field(quick: bool) -> tuple[list[Table], list[Target]]:
+    """A step with a magnetic field beside one without, and the invariants in many steps."""
+    sizes = (12,) if quick else (64, 128, 256)
+    steps, rounds, long = (4, 1, 20) if quick else (40, 3, LONG)
+    rows, targets = [], []
+    for N in sizes:
+        found = process.call("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
+        rows.append([N, *found, found[1] / found[0]])
+        targets.append(Target(f"a step with a magnetic field beside one without, su({N})", 2.5, rows[-1][-1]))
+    beside = Table(
+        "A step without decay of `zeitlin` and of `magnetic_fluid` at the same N, by the same method, each so long "
+        f"that its fastest part turns by {TURN} radians.",
+        {"N": "count", "Without": "seconds", "With": "seconds", "Ratio": "ratio"},
+        rows,
+    )
+    kept, runs = [], [(12, 0.0)] if quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
+    for N, rate in runs:
+        found = process.call("fluids", "kept", str(N), str(long), str(rate))
+        kept.append([N, "ideal" if rate == 0.0 else "with friction", *found])
+        if rate == 0.0:
+            work = f"{long:,} steps of a magnetic fluid, su({N}): energy, cross helicity and tr B^3"
+            targets.append(Target(work, 1e-12, max(found[1], *found[3:6]), "error"))
+    names = ("Energy, largest change", "Energy, last by first", "tr W B", "tr B^2", "tr B^3", "tr B^4", "tr W B^2")
+    columns = {"N": "count", "": "text", "Time of the run": "seconds"}
+    caption = (
+        f"{long:,} steps, each so long that the fastest wave turns by {TURN} radians; the largest relative changes "
+        "along the run. Cross helicity and traces are computed from the matrices of the states, apart from the "
+        "library's own. Friction is to lower the energy alone. The trace of the fourth power is not followed by the "
+        "steps, so it is kept to their order."
+    )
+    kinds = ("error", "number", *["error"] * 5)
+    return [beside, Table(caption, columns | dict(zip(names, kinds, strict=True)), kept)], targets
+
+
+def child(what: str, *given: str):
+    """The part that runs in a process of its own."""
+    return {"plain": plain, "beside": beside_plain, "kept": kept_in}[what](*given)
+
+
+def spread(q: lt.models.QuantisedSphere, mu) -> float:
+    """How fast what the state is the stream function of turns at most."""
+    return float(q.gamma * np.ptp(np.linalg.eigvalsh(1j * np.asarray(q.matrix(mu)))))
+
+
+def magnetic_start(N: int) -> tuple:
+    """A flow and a field, as states of their own and as one, and the steps of the flow alone and of both."""
+    q, degrees = lt.models.QuantisedSphere(N), (min(DEGREES[0], N - 1), min(DEGREES[1], N - 1))
+    W, B = q.random(0, degrees, 4.0), q.random(1, degrees, 1.0)
+    turn = spread(q, q.inverse_laplacian(W))
+    return q, W, q.magnetic_state(W, B), TURN / turn, TURN / max(turn, spread(q, B))
+
+
+def beside_plain(*numbers: str) -> list[float]:
+    """Times of a step without a magnetic field and with one, without the call."""
+    N, steps, rounds = map(int, numbers)
+    _, W, x, alone, both = magnetic_start(N)
+    works = {
+        (name, count): functools.partial(
+            lt.integrate, system, start, (0.0, count * h), h, METHOD, save_every=count, engine="array"
+        )
+        for name, system, start, h in (
+            ("without", lt.models.zeitlin(N), W, alone),
+            ("with", lt.models.magnetic_fluid(N), x, both),
+        )
+        for count in (2, 2 + steps)
+    }
+    found = race(works, rounds=rounds)
+    return [(found[n, 2 + steps].processor - found[n, 2].processor) / steps for n in ("without", "with")]
+
+
+def kept_in(N: str, steps: str, rate: str) -> list[float]:
+    """The time of a run, and the largest relative changes of what the magnetic fluid is to keep."""
+    q, _, x, _, h = magnetic_start(int(N))
+    system, count = lt.models.magnetic_fluid(int(N), float(rate)), int(steps)
+    run = lt.integrate(system, x, (0.0, count * h), h, METHOD, save_every=max(1, count // 20), engine="array")
+    energy = run.stats.energy_range or (run.energy.min(), run.energy.max())
+    rows = []
+    for state in run.x:
+        W, B = (1j * np.asarray(q.matrix(f)) for f in q.magnetic_fields(state))
+        powers = [np.linalg.matrix_power(B, k) for k in range(5)]
+        traces = [np.trace(W @ B), *(np.trace(powers[k]) for k in (2, 3, 4)), np.trace(W @ powers[2])]
+        sizes = [norm(W) * norm(B), norm(B) ** 2, norm(B) * norm(powers[2]), norm(powers[2]) ** 2]
+        rows.append((np.real(traces), [*sizes, norm(W) * norm(powers[2])]))
+    values, sizes = np.swapaxes(rows, 0, 1)
+    changes = np.abs(values - values[0]).max(axis=0) / sizes[0]
+    first = float(run.energy[0])
+    drift, left = (energy[1] - energy[0]) / abs(first), float(run.energy[-1]) / first
+    return [run.stats.wall_time, float(drift), left, *map(float, changes)]
+
+
+norm = np.linalg.norm
+
+
+def plain(*numbers: str):
     """Both in one process; the rows of the table and the ratio of the times."""
     N, steps, rounds = map(int, numbers)
     q = lt.models.QuantisedSphere(N)
@@ -59,7 +159,7 @@ def child(*numbers: str):
     W, scheme = np.asarray(q.matrix(x)), IsospectralMidpoint(N)
     h = TURN / (q.gamma * np.abs(np.linalg.eigvalsh(1j * scheme.stream(W))).max() * 2.0)
     system = lt.models.zeitlin(N, "enstrophy", RATE)
-    span, method = (0.0, h * steps), lt.MetriplecticRungeKutta(4)
+    span, method = (0.0, h * steps), METHOD
     ours = functools.partial(lt.integrate, system, x, span, h, method, save_every=steps, engine="array", progress=False)
     peer = functools.partial(scheme.integrate, W, h * q.gamma, steps)
     outcomes = race(

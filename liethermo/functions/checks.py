@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
 
 
 def recognised(energy: Energy, dim: int) -> Energy:
-    """The same energy, those of its plain functions marked that are written as polynomials of degree two."""
+    """The same energy, the degrees of its plain functions marked that are written as polynomials."""
     if isinstance(energy, Sum):
         return Sum(tuple(recognised(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
@@ -25,8 +26,9 @@ def recognised(energy: Energy, dim: int) -> Energy:
     if isinstance(energy, Pullback):
         (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))
-    if isinstance(energy, Function) and not energy.quadratic and polynomial_degree(value_of, energy, dim) <= 2:
-        return Function(energy.function, quadratic=True)
+    if isinstance(energy, Function) and energy.degree == math.inf:
+        degree = polynomial_degree(value_of, energy, dim)
+        return energy if degree == math.inf else Function(energy.function, degree)
     return energy
 
 

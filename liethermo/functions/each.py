@@ -46,7 +46,7 @@ class Each(Energy):
     phi: Energy | Callable
     parameters: tuple[jax.Array, ...]
     places: Indices = eqx.field(static=True)
-    quadratic: bool = eqx.field(static=True)
+    degree: float = eqx.field(static=True)
 
     def __init__(self, phi, places, *parameters):
         self.places = places if isinstance(places, Indices) else _checked_places(places)
@@ -59,14 +59,14 @@ class Each(Energy):
             if parameters:
                 raise InputError("an Energy is the same at every place: parameters are for a function")
             self.phi = recognised(check_scalar(phi, r, "the energy at a place"), r)
-            self.quadratic = self.phi.is_quadratic
+            self.degree = self.phi.degree
             return
         if not callable(phi):
             raise FunctionError(f"phi is a function or an Energy, not {type(phi).__name__}")
         first = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
         check_scalar(Function(lambda y: phi(y, *first)), r, "the function at a place")
         self.phi = settled(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in first))
-        self.quadratic = polynomial_degree(_value_at, (self.phi, first), r) <= 2
+        self.degree = polynomial_degree(_value_at, (self.phi, first), r)
 
     @property
     def terms(self) -> tuple[Energy, ...]:
@@ -76,7 +76,7 @@ class Each(Energy):
 
     @property
     def is_quadratic(self) -> bool:
-        return self.quadratic
+        return self.degree <= 2
 
     def value(self, x) -> jax.Array:
         return jnp.sum(jax.vmap(lambda y, *a: self._at(a).value(y))(self._gathered(x), *self.parameters))
@@ -118,7 +118,7 @@ class Each(Energy):
         """The summand with these parameters."""
         if isinstance(self.phi, Energy):
             return self.phi
-        return Function(lambda y: self.phi(y, *parameters), quadratic=self.quadratic)
+        return Function(lambda y: self.phi(y, *parameters), degree=self.degree)
 
     def _gathered(self, x) -> jax.Array:
         """The components at each place, shape (..., n) to (..., m, r)."""

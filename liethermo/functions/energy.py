@@ -7,6 +7,7 @@ midpoint is one already; a general term gets a correction of its own, along its 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -95,6 +96,11 @@ class Energy(Module):
     def is_quadratic(self) -> bool:
         """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
         return False
+
+    @property
+    def degree(self) -> float:
+        """Its degree as a polynomial, at most; infinity where it is not known to be one. Quadratures may be exact."""
+        return 2.0 if self.is_quadratic else math.inf
 
     def discrete_gradient(self, scheme: Scheme, x, d, compensation) -> jax.Array:
         """The discrete gradient of one term by a scheme, shape (n,), from x + compensation to x + compensation + d."""
@@ -280,11 +286,11 @@ class Function(Energy):
     """
 
     function: Callable
-    quadratic: bool = eqx.field(static=True, default=False)
+    degree: float = eqx.field(static=True, default=math.inf)
 
     @property
     def is_quadratic(self) -> bool:
-        return self.quadratic
+        return self.degree <= 2
 
     def value(self, x) -> jax.Array:
         return jnp.asarray(self.function(x))

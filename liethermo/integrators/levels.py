@@ -23,6 +23,9 @@ NOISY = 1e-8
 more than its rounding, and does not add up, since the values at which one step ends are those that the next begins
 with."""
 
+SIMPSON = 4
+"""Degree up to which his rule with gradients is exact."""
+
 DIFFERENCE = 16.0 * EPS
 """What a change of a function may be off, relative to the size at which its values are rounded: a few roundings of
 both."""
@@ -76,13 +79,16 @@ def corrected(
         d = s.d + displacement(system, x + (compensation + s.d), s.correction, leaf)
         return (d, jnp.zeros(())) if surface is None else surface.reached(x, compensation, d)
 
+    def along(f: Energy, d, first, last) -> jax.Array:
+        """A discrete gradient: of a polynomial a mean of gradients, those at both ends among them."""
+        mean = 0.5 * (first + last)
+        if f.degree > SIMPSON:
+            return change(f, x, d, compensation)
+        return mean if f.is_quadratic else (mean + 2.0 * f.gradient(x + (compensation + 0.5 * d))) / 3.0
+
     def misses(d, ends) -> jax.Array:
-        """The mean of the gradients at both ends is a discrete gradient of a quadratic function."""
-        along = [
-            0.5 * (first + last) if f.is_quadratic else change(f, x, d, compensation)
-            for f, first, last in zip(functions, starts, ends, strict=True)
-        ]
-        return changes - jnp.stack([jnp.dot(gradient, d) for gradient in along])
+        found = [along(f, d, *both) for f, *both in zip(functions, starts, ends, strict=True)]
+        return changes - jnp.stack([jnp.dot(gradient, d) for gradient in found])
 
     def moved(s: Ended) -> tuple[Ended, list]:
         """With the correction that was found before, what is missed; and the gradients there."""

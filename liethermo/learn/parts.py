@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -53,7 +54,7 @@ class Energy(Function):
                 f"lt.learn.{type(self).__name__} takes the number of components of a network, or an equinox.Module, "
                 f"not {type(function).__name__}; what is known is added to it with +"
             )
-        self.quadratic = False
+        self.degree = math.inf
 
     def gradient(self, x) -> jax.Array:
         return _gradient(self.function, x)

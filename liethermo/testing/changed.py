@@ -172,7 +172,7 @@ def shifted(energy: Energy, constant: float) -> Energy:
     if isinstance(last, Quadratic):
         last = Quadratic(last.A, last.b, last.c + constant)
     else:
-        last = Function(_Shifted(last, jnp.asarray(constant)), quadratic=last.is_quadratic)
+        last = Function(_Shifted(last, jnp.asarray(constant)), degree=last.degree)
     return Sum((*others, last)) if others else last
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +25,7 @@ FOLLOWED_DEGREE = 4
 """Traces of powers up to this one are followed along a motion."""
 
 Parts = tuple[jax.Array, ...]
-"""A matrix by its real part and, of complex ones, its imaginary part."""
+"""A matrix by its real part and, of complex ones, its imaginary part; none of the identity."""
 
 
 @dataclass(frozen=True)
@@ -288,20 +289,60 @@ class MatrixTrace:
         M = g.tables.matrix(raised)
         if g.known.compact:  # i (a + i b) = -b + i a
             M = (-M[1], M[0]) if len(M) == 2 else (jnp.zeros_like(M[0]), M[0])
-        left = M
-        for _ in range(self.degree // 2 - 1):
-            left = _product(left, M)
-        if self.degree == 1:
-            return jnp.trace(M[0], axis1=-2, axis2=-1)
-        right = _product(left, M) if self.degree % 2 else left
-        found = jnp.sum(left[0] * jnp.swapaxes(right[0], -1, -2), axis=(-2, -1))  # Re tr(A B)
-        return found if len(M) == 1 else found - jnp.sum(left[1] * jnp.swapaxes(right[1], -1, -2), axis=(-2, -1))
+        return _trace_of_power(self.degree, g.known.compact, M)
 
     def __str__(self) -> str:
         return f"tr({'(i M)' if self.algebra.known.compact else 'M'}**{self.degree})"
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _trace_of_power(n: int, hermitian: bool, M: Parts) -> jax.Array:
+    """``Re tr(M**n)``, shape (..., N, N) to (...); its derivatives take as few products as it takes itself."""
+    return _real_trace(_power(M, n - n // 2), _power(M, n // 2))
+
+
+@_trace_of_power.defjvp
+def _by_one(n: int, hermitian: bool, primals, tangents):
+    (M,), (dM,) = primals, tangents
+    return _trace_of_power(n, hermitian, M), n * _trace_beside(n - 1, hermitian, M, dM)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _trace_beside(n: int, hermitian: bool, M: Parts, D: Parts) -> jax.Array:
+    """``Re tr(M**n D)``."""
+    return _real_trace(_power(M, n), D)
+
+
+@_trace_beside.defjvp
+def _by_both(n: int, hermitian: bool, primals, tangents):
+    """The sum of ``Re tr(M**(n-1-i) D M**i dM)``; of Hermitian matrices those of i and n-1-i are equal."""
+    (M, D), (dM, dD) = primals, tangents
+    found = _trace_beside(n, hermitian, M, dD)
+    for i in range(n if not hermitian else (n + 1) // 2):
+        times = 2.0 if hermitian and 2 * i != n - 1 else 1.0
+        found = found + times * _real_trace(_product(_product(_power(M, n - 1 - i), D), _power(M, i)), dM)
+    return _trace_beside(n, hermitian, M, D), found
+
+
+def _power(M: Parts, n: int) -> Parts:
+    """``M**n``, an empty tuple being 1."""
+    if n <= 1:
+        return M if n else ()
+    half = _power(M, n // 2)
+    return _product(_product(half, half), M if n % 2 else ())
+
+
+def _real_trace(X: Parts, Y: Parts) -> jax.Array:
+    """``Re tr(X Y)``."""
+    if not (X and Y):
+        return jnp.trace((X or Y)[0], axis1=-2, axis2=-1)
+    terms = [jnp.sum(x * jnp.swapaxes(y, -1, -2), axis=(-2, -1)) for x, y in zip(X, Y, strict=True)]
+    return terms[0] - sum(terms[1:])
+
+
 def _product(X: Parts, Y: Parts) -> Parts:
+    if not (X and Y):
+        return X or Y
     if len(X) == 1:
         return (X[0] @ Y[0],)
     (a, b), (c, d) = X, Y

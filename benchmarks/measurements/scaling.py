@@ -1,0 +1,152 @@
+"""Time and memory by size: fields, spins, graphs and matrices from ten sites to ten million, by the engine "auto"."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines.choice import Chosen
+from liethermo.runs.preparation import as_run
+
+from .. import child as process
+from ..report import Report, Table, Target
+from .lattice import start
+from .memory import STATUS, resident
+
+SIZES = tuple(10**i for i in range(1, 8))
+FEW, LEAST_TIME, MOST = 2, 1.0, 2_000
+"""Steps of a short run; seconds, and steps at most, that the long one takes longer."""
+
+PATIENCE, SHARE = 60.0, 0.7
+"""Seconds that a step may take, and the share of the memory that a process may: else a size is left out."""
+
+MIDPOINT, EXPLICIT = lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)
+
+
+def field(n: int) -> tuple[lt.System, Any]:
+    """A wave equation with a cubic force: a plain function of all positions and momenta."""
+
+    def energy(x):
+        q, p = x[:n], x[n:]
+        return 0.5 * jnp.sum(p**2) + 0.5 * jnp.sum((q - jnp.roll(q, 1)) ** 2) + 0.25 * jnp.sum(q**4)
+
+    random = np.random.default_rng(0).standard_normal(2 * n)
+    return lt.MetriplecticSystem(mf.Canonical(n), energy, validate=False), random
+
+
+def spins(n: int) -> tuple[lt.System, Any]:
+    """A ring of spins that heat a bath."""
+    return lt.models.spin_lattice(n, 1.0, 0.1, rate=0.1), start(n)
+
+
+def graph(n: int) -> tuple[lt.System, Any]:
+    """Heat on a square grid of bodies, nearly n of them."""
+    edge = round(math.sqrt(n))
+    temperatures = np.random.default_rng(0).uniform(0.8, 1.2, edge**2)
+    return lt.models.heat_grid((edge, edge)), np.log(temperatures)
+
+
+def matrices(n: int) -> tuple[lt.System, Any]:
+    """A fluid on the sphere, its matrix of nearly n entries."""
+    N = round(math.sqrt(n))
+    sphere = lt.models.QuantisedSphere(N)
+    return lt.models.zeitlin(N, "enstrophy", 1e-3), sphere.random(0, (1, min(N - 1, 12)), 1.0)
+
+
+KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
+    "a field": (field, MIDPOINT, 0.05),
+    "spins": (spins, MIDPOINT, 0.02),
+    "a graph": (graph, MIDPOINT, 1.0),
+    "su(N)": (matrices, EXPLICIT, 1e-3),
+}
+"""What makes a system and a state of so many sites, the method and the step."""
+
+
+def run(quick: bool) -> Report:
+    """One table, each row in a process of its own."""
+    rows, skipped, largest = [], {}, {}
+    for kind in KINDS:
+        for n in SIZES[:2] if quick else SIZES:
+            if reason := too_large(rows[-1] if rows and rows[-1][0] == kind else None):
+                skipped[f"{kind}, {n:,} sites"] = reason
+                break
+            found = process.call("scaling", kind, str(n))
+            row = [kind, found["sites"], found["engine"], found["first"], found["step"] / found["sites"]]
+            rows.append([*row, found["step"], found["peak"]])
+            largest[kind] = found["sites"]
+    columns = {"System": "text", "Sites": "count", "Engine": "text", "First answer": "seconds"}
+    columns |= {"A step, for each site": "seconds", "A step": "seconds", "Peak memory": "gigabytes"}
+    caption = (
+        'Each row is a process of its own with `engine="auto"`. The first answer is that of two steps, the system made '
+        "and the programs compiled. Times are those of the processor, all threads together; peak memory is that of the "
+        "process, the packages among it."
+    )
+    text = (
+        "A field is a plain function of positions and momenta on a ring; spins are a ring with a bath; a graph is a "
+        "square grid of bodies in steps in which neighbours exchange their heat; a site of su(N) is an entry of the "
+        "matrix of a fluid on the sphere, in explicit steps of order 4. The others take midpoint steps."
+    )
+    targets = [
+        Target(f"first answer with 10⁵ sites, {kind}", 5.0, next((r[3] for r in rows if r[0] == kind and
+               0.9e5 < r[1] < 1.1e5), None), "seconds") for kind in KINDS
+    ]  # fmt: skip
+    return Report("Time and memory by size", text, [Table(caption, columns, rows)], targets, skipped)
+
+
+def too_large(last: list | None) -> str:
+    """Why a system of ten times the size of the last row is not tried; empty where it is."""
+    if last is None:
+        return ""
+    seconds, peak = last[-2:]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if 10.0 * seconds > PATIENCE:
+        return f"a step would take more than {PATIENCE:g} s"
+    if peak is not None and 10.0 * (peak - PACKAGES) > SHARE * memory:
+        return f"more than {SHARE * memory / 1e9:.0f} GB would be needed"
+    return ""
+
+
+PACKAGES = 0.5e9
+"""Memory of a process that has compiled something small."""
+
+
+def child(kind: str, n: str) -> dict:
+    """The part that runs in a process of its own."""
+    make, method, h = KINDS[kind]
+    times = [time.process_time()]
+    system, x0 = make(int(n))
+
+    def steps(count: int) -> lt.Solution:
+        return lt.integrate(system, x0, (0.0, count * h), h, method, save_every=count)
+
+    for _ in range(2):
+        steps(FEW)
+        times.append(time.process_time())
+    first, short = np.diff(times)
+    many = FEW + 1
+    while (seconds := _timed(functools.partial(steps, many)) - short) < LEAST_TIME and many < MOST:
+        many = min(MOST, 2 * many)
+    chosen = Chosen(*as_run(system, method), "auto", many)
+    chosen.begin(jnp.asarray(x0))
+    return {
+        "sites": len(np.ravel(x0)) // {"a field": 2, "spins": 3}.get(kind, 1) + (kind == "su(N)"),
+        "engine": chosen.name,
+        "first": first,
+        "step": seconds / (many - FEW),
+        "peak": resident() if STATUS.is_file() else None,
+    }
+
+
+def _timed(work: Callable) -> float:
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
