@@ -65,7 +65,7 @@ def matrices(n: int) -> tuple[lt.System, Any]:
 KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
     "a field": (field, MIDPOINT, 0.05),
     "spins": (spins, MIDPOINT, 0.02),
-    "a graph": (graph, MIDPOINT, 1.0),
+    "a graph": (graph, MIDPOINT, 0.1),
     "su(N)": (matrices, EXPLICIT, 1e-3),
 }
 """What makes a system and a state of so many sites, the method and the step."""
@@ -92,8 +92,8 @@ def run(quick: bool) -> Report:
     )
     text = (
         "A field is a plain function of positions and momenta on a ring; spins are a ring with a bath; a graph is a "
-        "square grid of bodies in steps in which neighbours exchange their heat; a site of su(N) is an entry of the "
-        "matrix of a fluid on the sphere, in explicit steps of order 4. The others take midpoint steps."
+        "square grid of bodies that exchange heat; a site of su(N) is an entry of the matrix of a fluid on the sphere, "
+        "in explicit steps of order 4. The others take midpoint steps."
     )
     targets = [
         Target(f"first answer with 10⁵ sites, {kind}", 5.0, next((r[3] for r in rows if r[0] == kind and

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -46,7 +47,7 @@ class Each(Energy):
     phi: Energy | Callable
     parameters: tuple[jax.Array, ...]
     places: Indices = eqx.field(static=True)
-    degree: float = eqx.field(static=True)
+    degree: float = eqx.field(static=True, default=math.inf)
 
     def __init__(self, phi, places, *parameters):
         self.places = places if isinstance(places, Indices) else _checked_places(places)

@@ -15,6 +15,7 @@ from ..functions.checks import check_shape
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
+from .check import MATRIX_DIM
 from .embedded import EmbeddedSystem
 
 
@@ -102,7 +103,11 @@ class MetriplecticSystem(System):
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         dim = poisson.dim
-        check_shape(poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)")
+        if dim <= MATRIX_DIM:
+            check_shape(poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)")
+        else:
+            at = f"a state and a covector of shape ({dim},)"
+            check_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
