@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
+from liethermo.functions.checks import recognised
 from liethermo.functions.energy import as_energy
 from liethermo.functions.gradients import GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import finer, gauss
@@ -158,6 +159,23 @@ def test_mean_value_is_exact_on_polynomials_of_its_degree():
         points, weights = np.polynomial.legendre.leggauss(12)
         exact = sum(w / 2 * energy.gradient(x + (c + 1) / 2 * d) for c, w in zip(points, weights, strict=True))
         assert np.allclose(lt.MeanValue(nodes=nodes)(energy, x, d), exact, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("degree", [3, 6, 7])
+def test_the_change_of_a_polynomial_is_found_without_its_values(degree):
+    """Up to degree six three nodes are exact, so a constant beside it, which coarsens its values, does no harm."""
+    x, d = np.array([0.7, -0.4]), np.array([0.9, 1.3])
+
+    def change(claimed=None, constant=0.0):
+        energy = as_energy(lambda x: x[0] ** degree + x[0] * x[1] ** (degree - 1) + constant, "H")
+        energy = recognised(energy, 2) if claimed is None else lt.Function(energy.function, claimed)
+        assert energy.degree == (claimed or degree)
+        return float(GRADIENTS["gonzalez"](energy, x, d) @ d)
+
+    exact = float(np.diff([y[0] ** degree + y[0] * y[1] ** (degree - 1) for y in (x, x + d)])[0])
+    assert change() == pytest.approx(exact, rel=1e-14)
+    assert (change(constant=1e9) == pytest.approx(exact, rel=1e-14)) == (degree <= 6)
+    assert (change(claimed=6) == pytest.approx(exact, rel=1e-9)) == (degree <= 6)  # a control
 
 
 @each_gradient

@@ -154,6 +154,19 @@ def test_canonical_structure():
     assert system.entropy_law is None
 
 
+def test_a_field_on_many_sites_makes_no_matrix():
+    n = 100_000
+    field = lt.MetriplecticSystem(mf.Canonical(n), lambda x: 0.5 * jnp.sum(x**2) + jnp.sum(x[:n] ** 4))
+    assert np.isfinite(field.vector_field(np.ones(2 * n))).all()
+    with pytest.raises(lt.FunctionError, match=rf"Pi\(x\) of a covector has shape \({2 * n},\), not \({n},\)"):
+        lt.MetriplecticSystem(_Halved(n), lambda x: x @ x)
+
+
+class _Halved(mf.Canonical):
+    def sharp(self, x, alpha):
+        return super().sharp(x, alpha)[::2]
+
+
 def test_batches_of_states():
     system, x = lt.models.rigid_body(), np.random.default_rng(0).standard_normal((4, 2, 3))
     assert system.energy(x).shape == (4, 2)

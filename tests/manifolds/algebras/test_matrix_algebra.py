@@ -1,10 +1,14 @@
 """Classical algebras by products of matrices, against the same algebras by structure constants."""
 
+import functools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import manifolds as mf
+from manifolds.algebras.matrix_algebra import MatrixTrace
 
 LONG = [("u", 3), ("so", 5), ("sp", 2), ("gl", 3)]
 PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark.slow) for p in LONG)]
@@ -61,6 +65,24 @@ def test_traces_are_independent_casimirs_as_many_as_there_are(pair):
             assert np.abs(m.ad_star(gradient, mu)).max() < 1e-13 * np.abs(gradient).max()
             gradients.append(gradient / np.linalg.norm(gradient))
     assert np.linalg.matrix_rank(np.array(gradients), tol=1e-6) == len(gradients) == m.casimir_count()
+
+
+def test_derivatives_of_traces_are_those_of_powers_of_matrices(pair):
+    """First and second ones, and those of the first along a second momentum, against powers differentiated by JAX."""
+    m, _ = pair
+    mu, nu, direction = np.random.default_rng(2).standard_normal((3, m.dim))
+
+    def plain(mu, degree):
+        M = m.dual_matrix(mu) * (1j if m.known.compact else 1.0)
+        return jnp.trace(jnp.linalg.matrix_power(M, degree)).real
+
+    for degree in (2, 3, 4, 5):
+        F, f = MatrixTrace(m, degree), functools.partial(plain, degree=degree)
+        along = [jax.grad(lambda mu, f=f: jax.jvp(f, (mu,), (nu,))[1]) for f in (F, f)]
+        pairs = [(F(mu), f(mu)), (jax.hessian(F)(mu), jax.hessian(f)(mu))]
+        pairs += zip(*(jax.jvp(gradient, (mu,), (direction,)) for gradient in along), strict=True)
+        for found, expected in pairs:
+            np.testing.assert_allclose(found, expected, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
 @pytest.mark.slow
