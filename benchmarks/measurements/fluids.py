@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -94,7 +95,8 @@ def with_field(quick: bool) -> tuple[list[Table], list[Target]]:
 
 def child(what: str, *given: str):
     """The part that runs in a process of its own."""
-    return {"plain": plain, "beside": beside_plain, "kept": kept_in}[what](*given)
+    parts: dict[str, Callable] = {"plain": plain, "beside": beside_plain, "kept": kept_in}
+    return parts[what](*given)
 
 
 def spread(q: lt.models.QuantisedSphere, mu) -> float:

@@ -73,7 +73,8 @@ KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
 
 def run(quick: bool) -> Report:
     """One table, each row in a process of its own."""
-    rows, skipped, largest = [], {}, {}
+    rows: list[list] = []
+    skipped: dict[str, str] = {}
     for kind in KINDS:
         for n in SIZES[:2] if quick else SIZES:
             if reason := too_large(rows[-1] if rows and rows[-1][0] == kind else None):
@@ -82,7 +83,6 @@ def run(quick: bool) -> Report:
             found = process.call("scaling", kind, str(n))
             row = [kind, found["sites"], found["engine"], found["first"], found["step"] / found["sites"]]
             rows.append([*row, found["step"], found["peak"]])
-            largest[kind] = found["sites"]
     columns = {"System": "text", "Sites": "count", "Engine": "text", "First answer": "seconds"}
     columns |= {"A step, for each site": "seconds", "A step": "seconds", "Peak memory": "gigabytes"}
     caption = (

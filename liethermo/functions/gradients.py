@@ -125,7 +125,7 @@ class MeanValue(DiscreteGradient):
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
         points, weights = _gauss(self.nodes)
-        mean = weights @ jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(points)
+        mean = jnp.asarray(weights) @ jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(points)
         if term.degree <= 2 * self.nodes:
             return mean
         difference = _difference(term, x, d, compensation, mean)
