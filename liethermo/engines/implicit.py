@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from manifolds.matrices.linear import solve
+from manifolds.matrices.linear import inverse
 
 
 def solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
@@ -89,12 +89,16 @@ def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **r
                 whole[i] = value
             return misfit(jax.tree_util.tree_unflatten(structure, whole), k)
 
-        still = [jnp.zeros_like(dot) for dot in dots]
         _, change = jax.linearize(of_moving, k, *(leaves[i] for i in moving))
-        moved = change(jnp.zeros_like(k), *dots)
-        columns = jax.vmap(lambda d: change(d.reshape(k.shape), *still).ravel())(jnp.eye(k.size))
-        step = solve(columns.T, moved.reshape(-1, 1))
-        return -step.reshape(k.shape)
+        fixed, still = jax.lax.stop_gradient(change), [jnp.zeros_like(dot) for dot in dots]
+        matrix = jax.vmap(lambda d: fixed(d.reshape(k.shape), *still).ravel(), out_axes=1)(jnp.eye(k.size))
+        inverted = inverse(matrix)
+        return jax.lax.custom_linear_solve(
+            lambda d: change(d, *still),
+            -change(jnp.zeros_like(k), *dots),
+            solve=lambda _, b: (inverted @ b.ravel()).reshape(k.shape),
+            transpose_solve=lambda _, b: (b.ravel() @ inverted).reshape(k.shape),
+        )
 
     levels = [(0, *level[:-1], *(level[i] for i in moving)) for level in axes]
     return k, _mapped(one, levels)(k, *leaves, *dots)

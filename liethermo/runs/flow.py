@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from manifolds._arrays import is_traced
 from manifolds._precision import by_own_settings
+from manifolds.matrices.linear import inverse
 
 from ..engines import implicit
 from ..engines.stages import Equations, Solved, explicit, fixed_point, solve_stages
 from ..engines.stepping import equations, finish, holds_energy, shifted, steering
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
-from ..tracing.programs import program
+from ..tracing.programs import hasty_program, program
 from .preparation import begun, of_steps, started
 from .timetable import Course
 
@@ -40,8 +44,9 @@ def flow(
     theorem). This derivative is exact for the discrete flow, and keeps the slopes of all its steps in memory. The
     function works under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``, and it has derivatives of every
     order. Parameters are the arrays among the leaves of the system, the arguments from which a function builds it, and
-    numbers in closures. Without a transformation the function runs a compiled program, which is reused for other
-    numbers.
+    numbers in closures. Without ``jax.jit`` the function runs compiled programs, which are reused for other numbers. They
+    are compiled in little time where the run is short. In a function that is called often, ``jax.jit`` makes calls
+    quicker.
 
     Parameters
     ----------
@@ -89,16 +94,33 @@ def flow(
     calls = tuple(table.calls(limit=table.steps, saves=table.steps))
     sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
     # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.
-    known = not method.explicit and is_traced((system, method, x))
-    given = _constant((system, method, x)) if known else (system, method, x)
-    newton = method.explicit or is_traced(given)
-    path, steps = _path(given, sizes, counts, newton, known)
-    if not newton and not np.isfinite(path[-1]).all():  # Newton's method is compiled where a step needs it
-        path, steps = _path(given, sizes, counts, True, known)
+    given, last = (system, method, x), save_every is None
+    known = not method.explicit and is_traced(given)
+    values = _constant(given) if known else given
+    newton = method.explicit or is_traced(values)
+    compiled = hasty_program if table.steps * x.size <= HASTY else program
+    path, steps = compiled(_path)(values, sizes, counts, newton, known, last)
+    if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # it is compiled where a step needs it
+        path, steps = compiled(_path)(values, sizes, counts, True, known, last)
     if known:
-        path = _known_path(system, method, x, sizes, steps)
-    path = shown.points(path[:, :n]) if shown.space is None else path[:, :n]
-    return path[-1] if save_every is None else path
+        leaves = jax.tree_util.tree_leaves(given)
+        moves, moving = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
+        order = _order(moving)
+        if order and sum(leaf.size for leaf in moving) ** order <= DERIVATIVES:
+            found = compiled(_derivatives)(values, moves, order, sizes, steps, last)
+            path = program(_polynomial)(path, found, moving, _constant(moving))
+        else:
+            path = program(_known_path)(*given, sizes, steps, last, _as_guessed)
+    path = path if path.shape[-1] == n else path[..., :n]
+    return shown.points(path) if shown.space is None else path
+
+
+HASTY = 1_000
+"""Steps times components up to which a program is not optimised: that would take longer than it saves in many calls."""
+
+DERIVATIVES = 256
+"""Entries of a derivative of one component up to which it is found at once, forwards, for all that is differentiated
+by: in a program of its own, which can be compiled as it is best."""
 
 
 def _constant(tree: Any) -> Any:
@@ -106,15 +128,28 @@ def _constant(tree: Any) -> Any:
     return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
 
 
-@program
+def _order(moving: Sequence) -> int:
+    """How many derivatives are taken by some tracers whose values are known; zero where one is not known."""
+    most = 0
+    for leaf in moving:
+        count = 0
+        while isinstance(leaf, jax.core.Tracer):
+            if leaf.to_concrete_value() is None:
+                return 0
+            leaf, count = leaf.primal, count + 1
+        most = max(most, count)
+    return most
+
+
 def _path(
     given: tuple[System, OneStepMethod, jax.Array],
     sizes,
     counts: tuple[tuple[int, int], ...],
     newton: bool,
     known: bool,
+    last: bool,
 ) -> tuple[jax.Array, list]:
-    """The states kept, the first among them: a program of its own, in which all numbers are arguments.
+    """The states kept, the first among them, or the last alone: for programs in which all numbers are arguments.
 
     With ``known`` also, for each call, compensations at the begin of each step and the slopes that solve its equations.
     """
@@ -133,18 +168,59 @@ def _path(
         carry, (kept, solved) = jax.lax.scan(save, carry, length=saves)
         states.append(kept)
         steps.append(solved)
-    return jnp.concatenate(states), steps
+    return _kept(states, last), steps
 
 
-@program
-def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list) -> jax.Array:
+def _kept(states: Sequence, last: bool) -> jax.Array:
+    return states[-1][-1] if last else jnp.concatenate(states)
+
+
+def _derivatives(
+    given: tuple, moves: tuple[bool, ...], order: int, sizes, steps: list, last: bool
+) -> tuple[jax.Array, ...]:
+    """The derivatives of the path up to an order, by all leaves that move in one row: shapes (..., n, p, ..., p)."""
+    leaves, structure = jax.tree_util.tree_flatten(given)
+    start, back = ravel_pytree([leaf for leaf, moving in zip(leaves, moves, strict=True) if moving])
+
+    def path(v):
+        moved = iter(back(v))
+        whole = [next(moved) if moving else leaf for leaf, moving in zip(leaves, moves, strict=True)]
+        system, method, x = jax.tree_util.tree_unflatten(structure, whole)
+        return _known_path(system, method, x, sizes, steps, last, solve), ()
+
+    solve = _as_guessed if order == 1 else functools.partial(_improved, order)  # each the shorter program there
+
+    def derived(function):
+        def derivative(v):
+            found, lower = jax.jacfwd(function, has_aux=True)(v)
+            return found, (*lower, found)
+
+        return derivative
+
+    function = path
+    for _ in range(order):
+        function = derived(function)
+    return function(start)[1]
+
+
+def _polynomial(path, derivatives: Sequence, moving: Sequence, here: Sequence) -> jax.Array:
+    """Taylor's polynomial where it is differentiated: its derivatives there are those given."""
+    d = ravel_pytree([a - b for a, b in zip(moving, here, strict=True)])[0]
+    for order, term in enumerate(derivatives, start=1):
+        for _ in range(order):
+            term = term @ d
+        path = path + term / math.factorial(order)
+    return path
+
+
+def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool, solve: Callable) -> jax.Array:
     """The states of a path whose steps are solved: as functions of the first and of the parameters."""
     states = [x[None]]
     for i, solved in enumerate(steps):
 
         def step(x, known, h=sizes[i]):
             compensation, k = known
-            k = _stages(system, method, x, compensation, h, k, lambda own: own.guess)
+            k = solve(system, method, x, compensation, h, k)
             return method.move(system, x, compensation, h, k)[0], None
 
         def save(x, known, step=step):
@@ -153,7 +229,32 @@ def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list) ->
 
         x, kept = jax.lax.scan(save, x, solved)
         states.append(kept)
-    return jnp.concatenate(states)
+    return _kept(states, last)
+
+
+def _as_guessed(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
+    """The slopes of a step that are known, differentiated as the implicit function that they are."""
+    return _stages(system, method, x, compensation, h, k, lambda own: own.guess)
+
+
+def _improved(order: int, system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
+    """The same, with derivatives up to an order: by so many steps of Newton's method with a matrix that is constant.
+
+    Each step makes one more derivative right, and programs hold the equations once.
+    """
+
+    def misfit(given, k):
+        system, method, x, h = given
+        return method.slopes(system, x, compensation, h, k) - k
+
+    given = system, method, x, h
+    matrix = jax.jacfwd(lambda k: misfit(_constant(given), k))(k)
+    inverted = inverse(matrix.reshape(k.size, k.size))
+
+    def better(k, _):
+        return k - (inverted @ misfit(given, k).ravel()).reshape(k.shape), None
+
+    return jax.lax.scan(better, k, length=order)[0]
 
 
 def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:

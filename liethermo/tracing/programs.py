@@ -11,7 +11,10 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from manifolds._arrays import is_traced
 
 from .remembered import Latest
 
@@ -66,11 +69,15 @@ def _program(function: Function, options: dict | None) -> Function:
     @functools.wraps(function)
     def call(*arguments):
         whole, dynamic, key = _split(function, arguments)
-        if options and any(isinstance(leaf, jax.core.Tracer) for leaf in dynamic):
-            return whole(dynamic)  # a part of another program, which is compiled in its own way
-        return _programs.find(key, lambda: jax.jit(whole, compiler_options=options))(dynamic)
+        own = None if options is None or _within(dynamic) else options
+        return _programs.find((key, own is None), lambda: jax.jit(whole, compiler_options=own))(dynamic)
 
     return call  # type: ignore[return-value]
+
+
+def _within(dynamic: tuple) -> bool:
+    """Whether a call is a part of another program, which is compiled in its own way; or may become one."""
+    return is_traced(dynamic, jnp.zeros(()))
 
 
 def _strong(array):

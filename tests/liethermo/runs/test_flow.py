@@ -345,3 +345,39 @@ def test_a_system_has_the_parameters_of_the_object_whose_method_is_its_energy():
     columns = [(end(jnp.ones(3) + h * e) - end(jnp.ones(3) - h * e)) / (2 * h) for e in np.eye(3)]
     assert np.abs(found - np.stack(columns, axis=1)).max() < 1e-9
     assert np.abs(found).max() > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_derivatives_found_at_once(order, monkeypatch):
+    """They are those of the program that a transformation goes through, by states and by parameters together."""
+
+    def end(y):
+        return lt.flow(
+            nonlinear(jnp.append(y[3] * PARAMETERS[:3], 0.5)), y[:3], (0.0, 0.2), 0.1, lt.MetriplecticGauss(2)
+        )
+
+    def derived(y):
+        derivative = end
+        for _ in range(order):
+            derivative = jax.jacfwd(derivative)
+        return derivative(y)
+
+    y = jnp.append(X0, 1.0)
+    found = derived(y)
+    monkeypatch.setattr(flow_module, "DERIVATIVES", 0)
+    through = derived(y)
+    assert np.abs(found - through).max() < 1e-12 * np.abs(through).max()
+    assert np.abs(through).max() > 1e-3
+
+
+def test_a_linearised_flow_in_another_program():
+    """What is known of it when it is linearised can be a part of any program."""
+    x, v = X0, jnp.array([0.1, -0.2, 0.3])
+    end = lambda x: lt.flow(body(PARAMETERS), x, (0.0, 0.3), 0.1)  # noqa: E731
+    _, push = jax.linearize(end, x)
+    _, pull = jax.vjp(end, x)
+    assert np.abs(jax.jit(push)(v) - jax.jvp(end, (x,), (v,))[1]).max() < 1e-15
+    assert np.abs(jax.jit(lambda v: jax.jvp(end, (x,), (v,))[1])(v) - push(v)).max() < 1e-14
+    assert abs(jax.jit(pull)(v)[0] @ v - v @ push(v)) < 1e-15
+    assert np.abs(jax.jit(lambda: end(x))() - end(x)).max() < 1e-15
