@@ -1,4 +1,4 @@
-"""The first trajectory of a new process: import, trace, compile, run."""
+"""The first trajectory of a new process, and the first flow: import, trace, compile, run."""
 
 from __future__ import annotations
 
@@ -30,6 +30,42 @@ system = {system}
 built = time.monotonic()
 solution = lt.integrate(system, [0.001, 1.0, 0.001], (0.0, 100.0), 0.1, engine="{engine}")
 print(json.dumps([imported, built, time.monotonic(), solution.audit().passed]))
+"""
+
+FLOWS = {
+    "so(3)": "lt.models.rigid_body(rate=0.5), jnp.array([0.1, 1.0, 0.1])",
+    "S^2": "relaxing(mf.Sphere(2)), jnp.asarray(mf.Sphere(2).random(3))",
+    "SPD(2)": "relaxing(mf.SPD(2)), jnp.asarray(mf.SPD(2).random(3))",
+}
+"""Systems, and states to start from."""
+
+ASKED = {
+    "value": ("end", 1.0),
+    "jacfwd": ("jax.jacfwd(end)", 2.0),
+    "grad": ("jax.grad(lambda x: jnp.sum(end(x) ** 3))", 2.5),
+    "hessian": ("jax.hessian(lambda x: jnp.sum(end(x) ** 3))", 5.0),
+}
+"""What is asked of a flow, and the seconds that the first answer may take."""
+
+FLOW = """
+import json, time
+
+import jax, jax.numpy as jnp
+import liethermo as lt
+import manifolds as mf
+from benchmarks.measurements.manifolds import relaxing
+
+began = time.process_time()
+system, x = {system}
+end = lambda x: lt.flow(system, x, (0.0, 0.1 * {steps}), 0.1).ravel()
+asked = {asked}
+jax.block_until_ready(asked(x))
+first, calls = time.process_time() - began, []
+for _ in range(20):
+    began = time.perf_counter()
+    jax.block_until_ready(asked(x))
+    calls.append(time.perf_counter() - began)
+print(json.dumps([first, min(calls)]))
 """
 
 COLUMNS = {
@@ -65,8 +101,43 @@ def run(quick: bool) -> Report:
     for name, bound in ("compiled engine, cold", 2.0), ("compiled engine, cached", 1.1):
         worst = max(total for (_, which), total in totals.items() if which == name)
         targets.append(Target(f"first trajectory in a new process, {name}", bound, worst, "seconds"))
+    flows, found = _flows(quick)
+    targets += found
     text = "From the start of the Python process to the end of its first trajectory; the slower system counts."
-    return Report("First trajectory", text, [table], targets)
+    return Report("First trajectory", text, [table, flows], targets)
+
+
+def _flows(quick: bool) -> tuple[Table, list[Target]]:
+    """What `lt.flow` and its derivatives take, each in a new process without a cache."""
+    columns = {
+        "": "text",
+        "Steps": "count",
+        "First answer": "seconds",
+        "Target": "seconds",
+        "A call afterwards": "seconds",
+    }
+    rows: list[list] = []
+    for name, system in FLOWS.items():
+        for what, (asked, bound) in list(ASKED.items())[: 1 if quick else None]:
+            for steps in (10,) if quick else (10, 1_000):
+                with tempfile.TemporaryDirectory() as cache:
+                    script = FLOW.format(system=system, asked=asked, steps=steps)
+                    first, call = json.loads(child.python("-c", script, cache=cache))
+                rows.append([f"{name}, {what}", steps, first, bound, call])
+    caption = (
+        "`lt.flow` by `MetriplecticGauss(1)`, outside of `jax.jit`, from the definition of the system to the first "
+        "answer: time of the processor. The gradient and the Hessian are those of the sum of cubes of the end."
+    )
+    found = []
+    for what, (_, bound) in ASKED.items():
+        slowest = max((row for row in rows if row[0].endswith(what)), key=lambda row: row[2], default=None)
+        if slowest is not None:
+            found.append(
+                Target(
+                    f"first {what} of a flow, the slowest ({slowest[0].split(',')[0]})", bound, slowest[2], "seconds"
+                )
+            )
+    return Table(caption, columns, rows), found
 
 
 def _times(script: str, cache: str) -> list:

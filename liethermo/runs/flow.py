@@ -44,8 +44,8 @@ def flow(
     theorem). This derivative is exact for the discrete flow, and keeps the slopes of all its steps in memory. The
     function works under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``, and it has derivatives of every
     order. Parameters are the arrays among the leaves of the system, the arguments from which a function builds it, and
-    numbers in closures. Without ``jax.jit`` the function runs compiled programs, which are reused for other numbers. They
-    are compiled in little time where the run is short. In a function that is called often, ``jax.jit`` makes calls
+    numbers in closures. Without ``jax.jit`` the function runs compiled programs, which are reused for other numbers.
+    They are compiled in little time where the run is short. In a function that is called often, ``jax.jit`` makes calls
     quicker.
 
     Parameters
