@@ -195,7 +195,7 @@ class ThermalJumps(Dissipation):
         strengths, sizes = self._strengths(omega, T), np.abs(np.asarray(omega))
         rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
         for jump, rate, w in zip(self.jumps, rates, sizes, strict=True):
-            if w > 0.0 and not rate * EPS <= w:
+            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # not so by the rate that was given
                 raise InputError(
                     f"jumps of V[{jump.source}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
                     f"rate * exp(omega / 2T) = {rate:.3g}: no rate that doubles hold beside that energy. Give the rate "

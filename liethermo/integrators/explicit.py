@@ -83,7 +83,7 @@ class ExplicitMethod(TransportingMethod):
 
     Where the motion has a form without the gradient of the entropy, as Lindblad's equation has
     [:attr:`liethermo.Dissipation.has_generator`], the stages are spared the entropy:
-    ``S(x') = max(S(y), S(x))``, to the same order.
+    ``S(x') = max(S(y), S(x))``, to the same order, y being the step on the levels of all that is conserved.
 
     A subclass says what the step is before it is corrected: :meth:`uncorrected`.
 
@@ -186,11 +186,14 @@ class ExplicitMethod(TransportingMethod):
         d, changes, error, between = self.uncorrected(rates, spared, begin, rest, h)
         if leaf:
             d, error, between = d[n:], error[:n], between[:, :n]
-        if system.has_generator:
-            changes = self._own_changes(laws, x, compensation, d)
         if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
             changes = changes + self._steering(system, laws, starts, x, compensation, k[LEVELS], leaf)
-        d, defect = corrected(system, laws, starts, x, compensation, d, changes, self.corrections, leaf)
+
+        def ended(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
+            found = slice(len(laws))
+            return corrected(system, laws, starts[found], x, compensation, d, changes[found], self.corrections, leaf)
+
+        d, defect = self._held(laws, x, compensation, ended) if system.has_generator else ended(laws)
         return jnp.stack([d / h, error, jnp.broadcast_to(defect / h, x.shape), k[LEVELS], *between])
 
     def _steering(
@@ -221,18 +224,19 @@ class ExplicitMethod(TransportingMethod):
 
         return jax.lax.stop_gradient(jax.lax.cond((found != 0.0).any(), allowed, lambda: found))
 
-    def _own_changes(self, laws: list[Law], x, compensation, d) -> jax.Array:
-        """What an uncorrected step changes the functions by that have to rise or fall, where that has the right sign.
+    def _held(self, laws: list[Law], x, compensation, ended: Callable) -> tuple[jax.Array, jax.Array]:
+        """The end of a step on the levels of what is conserved; on all of them where a function changes wrongly there.
 
-        The motion does so too, so that a step with the wrong sign is off the motion by no less than what is mended.
+        These are to rise or to fall, as the motion makes them: so a step with the wrong sign is off the motion by no
+        less than what is mended.
         """
-
-        def own(law: Law) -> jax.Array:
-            if law.sign == 0.0:
-                return jnp.zeros(())
-            return law.sign * jnp.maximum(law.sign * jnp.dot(ALONG(law.function, x, d, compensation), d), 0.0)
-
-        return jnp.stack([own(law) for law in laws])
+        conserved = [law for law in laws if law.sign == 0.0]
+        if len(conserved) in (0, len(laws)):
+            return ended(laws)
+        found = ended(conserved)
+        d, others = found[0], laws[len(conserved) :]
+        right = jnp.stack([law.sign * jnp.dot(ALONG(law.function, x, d, compensation), d) >= 0.0 for law in others])
+        return jax.lax.cond(right.all(), lambda: found, lambda: ended(laws))
 
     def rates(self, system: System, laws: list[Law], x) -> tuple[jax.Array, jax.Array]:
         """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants.
