@@ -47,6 +47,9 @@ ASKED = {
 }
 """What is asked of a flow, and the seconds that the first answer may take."""
 
+MANY = ("value", "jacfwd")
+"""What is asked of a long run too, whose programs are optimised."""
+
 FLOW = """
 import json, time
 
@@ -119,7 +122,7 @@ def _flows(quick: bool) -> tuple[Table, list[Target]]:
     rows: list[list] = []
     for name, system in FLOWS.items():
         for what, (asked, bound) in list(ASKED.items())[: 1 if quick else None]:
-            for steps in (10,) if quick else (10, 1_000):
+            for steps in (10, 1_000) if what in MANY and not quick else (10,):
                 with tempfile.TemporaryDirectory() as cache:
                     script = FLOW.format(system=system, asked=asked, steps=steps)
                     first, call = json.loads(child.python("-c", script, cache=cache))

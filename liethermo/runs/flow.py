@@ -20,9 +20,11 @@ from manifolds.matrices.linear import inverse
 from ..engines import implicit
 from ..engines.stages import Equations, Solved, explicit, fixed_point, solve_stages
 from ..engines.stepping import equations, finish, holds_energy, shifted, steering
+from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import hasty_program, program
+from .adaptive import Adaptive
 from .preparation import begun, of_steps, started
 from .timetable import Course
 
@@ -85,9 +87,11 @@ def flow(
     >>> jax.jacfwd(end)(0.5).shape
     (3,)
     """
+    method = DEFAULT_METHOD if method is None else method
+    _check(system, t_span, step, method)
     x, table = system.state(x0), Course(t_span, step, save_every)
     n, shown = system.dim, system
-    system, method = of_steps(system, DEFAULT_METHOD if method is None else method, None, attitude is not None)
+    system, method = of_steps(system, method, None, attitude is not None)
     begin = x, table.start, attitude
     # of what is traced nothing is known that a start could be refused for
     x = jnp.asarray(begun(system, *begin) if is_traced(system, x) else started(system, method, *begin))
@@ -113,6 +117,21 @@ def flow(
             path = program(_known_path)(*given, sizes, steps, last, _as_guessed)
     path = path if path.shape[-1] == n else path[..., :n]
     return shown.points(path) if shown.space is None else path
+
+
+def _check(system, t_span, step, method) -> None:
+    """Raise InputError where what is given is for another kind of run."""
+    if not isinstance(system, System):
+        raise InputError(f"flow takes a system, such as lt.models.rigid_body(), not {type(system).__name__}")
+    if not isinstance(method, OneStepMethod):
+        raise InputError(f"method is a OneStepMethod, such as lt.MetriplecticGauss(2), not {method!r}")
+    if isinstance(step, Adaptive):
+        raise InputError("flow takes steps of one size, a number, not lt.Adaptive: lt.integrate has adaptive steps")
+    if is_traced(t_span, step):
+        raise InputError(
+            "t_span and step are numbers, not traced: they are not differentiated or mapped. The derivative by the end "
+            "time is system.vector_field at the end; for other times multiply the energy and the rates by a factor"
+        )
 
 
 HASTY = 1_000

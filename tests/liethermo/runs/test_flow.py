@@ -381,3 +381,41 @@ def test_a_linearised_flow_in_another_program():
     assert np.abs(jax.jit(lambda v: jax.jvp(end, (x,), (v,))[1])(v) - push(v)).max() < 1e-14
     assert abs(jax.jit(pull)(v)[0] @ v - v @ push(v)) < 1e-15
     assert np.abs(jax.jit(lambda: end(x))() - end(x)).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"system": lambda x: x}, "takes a system.*not function"),
+        ({"method": "DOP853"}, "OneStepMethod.*not 'DOP853'"),
+        ({"method": lt.Reference()}, "OneStepMethod.*not Reference"),
+        ({"step": lt.Adaptive(1e-6)}, "steps of one size.*lt.integrate"),
+    ],
+    ids=["system", "name", "reference", "adaptive"],
+)
+def test_what_is_for_another_kind_of_run(arguments, said):
+    with pytest.raises(lt.InputError, match=said):
+        lt.flow(**({"system": body(PARAMETERS), "x0": X0, "t_span": (0.0, 1.0), "step": 0.1} | arguments))
+
+
+def test_times_are_not_differentiated():
+    for derivative in (
+        lambda: jax.grad(lambda h: lt.flow(body(PARAMETERS), X0, (0.0, 1.0), h)[0])(0.1),
+        lambda: jax.jit(lambda T: lt.flow(body(PARAMETERS), X0, (0.0, T), 0.1))(1.0),
+    ):
+        with pytest.raises(lt.InputError, match=r"not traced.*vector_field at the end"):
+            derivative()
+
+
+@pytest.mark.slow
+def test_derivatives_in_other_units():
+    """States of 1e20 and parameters of 1e-20 together: each derivative is that in units of one."""
+
+    def end(y):
+        return lt.flow(lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * jnp.sum(m * m * y[3:])), y[:3], (0.0, 1.0), 0.1)
+
+    y, units = jnp.append(X0, 1.0 / PARAMETERS[:3]), np.repeat([1e20, 1e-20], 3)
+    first, second = (derivative(y) for derivative in (jax.jacfwd(end), jax.hessian(end)))
+    assert np.abs(jax.jacfwd(end)(units * y) * units / 1e20 - first).max() < 1e-15
+    assert np.abs(jax.hessian(end)(units * y) * units[:, None] * units / 1e20 - second).max() < 1e-14
+    assert np.abs(second).max() > 0.1
