@@ -21,6 +21,7 @@ NAMES = (
     "bodies",
     "network",
     "lattice",
+    "scaling",
     "large",
     "magnet",
     "first_run",

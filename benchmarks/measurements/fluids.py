@@ -17,7 +17,7 @@ from ..timing import race
 DEGREES, TURN, RATE = (2, 12), 0.05, 1e-3
 """Degrees of the first vorticity; how far the fastest part of the fluid turns in a step, in radians; of the decay."""
 
-LONG, MAGNETIC_RATE = 10_000, 1e-3
+LONG, MAGNETIC_RATE = 10_000, 1e-4
 """Steps in which the invariants of the magnetic fluid are followed, and of its friction."""
 
 METHOD = lt.MetriplecticRungeKutta(4)
