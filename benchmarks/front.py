@@ -109,7 +109,10 @@ THEMES: dict[str, list[Pair]] = {
 }
 """Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
 
-COSTS = ("first_run", "network", "memory", "studies", "manifolds", "functions", "isolated_body", "large", "magnet")
+COSTS = (
+    *("first_run", "network", "memory", "scaling", "studies", "manifolds", "functions", "isolated_body", "large"),
+    *("magnet", "fluids"),
+)
 """Measurements without another program: their targets that are no ratios are a table of their own."""
 
 WHOLE = {"Learning": ("learn_gas", "learn_pendulum", "learn_body")}

@@ -273,7 +273,7 @@ def _figures_of_speed(path: Path) -> list[str]:
 
 def test_figures_of_speed_are_on_the_pages_of_benchmarks_alone():
     """Those pages are written by what measures them; elsewhere they would differ from it sooner or later."""
-    benchmarks = [ROOT / "docs/reference/benchmarks.md", ROOT / "docs/reference/benchmarks_runs.md"]
+    benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs", "scaling")]
     assert all(len(_figures_of_speed(page)) > 50 for page in benchmarks)
     ours = [path for path in TEXTS if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
     texts = [*ours, ROOT / "CHANGELOG.md"]
@@ -359,3 +359,35 @@ def test_no_text_mistakes_the_controlled_body_for_one_with_friction_inside():
 )
 def test_a_body_told_wrongly_is_found(text):
     assert _wrong_bodies(text)
+
+
+CITED = re.compile(r"[\[(]([A-Z][^\[\]()`]*?\b(?:19|20)\d\d\b[^\[\]()`]*)[\])](?!\()")
+
+
+def _cited(text: str) -> list[tuple[str, str]]:
+    """Names and years of what a text cites in parentheses or brackets, such as ``(Holm and Janke 1993)``."""
+    works = [work for found in CITED.findall(" ".join(text.split())) for work in found.split(";")]
+    parts = [part for work in works if (part := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
+    names = re.compile(" and others| et al\\.|,? and |,? & |, ")
+    return [(name, part[2]) for part in parts for name in names.split(part[1]) if name]
+
+
+def test_what_the_pages_cite_is_in_the_bibliography():
+    own = ROOT / "docs" / "reference" / "bibliography.md"
+    entries = [" ".join(entry.split()) for entry in own.read_text().split("\n\n")]
+    for page in PAGES:
+        if page == own or page.parent.name == "reference":
+            continue
+        for name, year in _cited(page.read_text()):
+            assert any(name in entry and f"({year})" in entry for entry in entries), f"{_name(page)}: {name} {year}"
+
+
+def test_citations_are_found():
+    text = (
+        "as (Holm and Janke 1993; Beretta 1984) and [Hairer, Lubich & Wanner 2006, II.4], not (in 2005) or [A 1999](b)"
+    )
+    assert _cited(text) == [
+        *[(name, "1993") for name in ("Holm", "Janke")],
+        ("Beretta", "1984"),
+        *[(name, "2006") for name in ("Hairer", "Lubich", "Wanner")],
+    ]

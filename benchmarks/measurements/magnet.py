@@ -13,7 +13,8 @@ from ..heat_bath import heat_bath
 from ..report import Report, Table, Target
 
 CRITICAL = 1.4429
-"""Of ``E = -J sum s_i . s_j`` on the simple cubic lattice, in units of J [Holm & Janke 1993: 1 / 0.6930(1)]."""
+"""Of ``E = -J sum s_i . s_j`` on the simple cubic lattice, in units of J [Chen, Ferrenberg & Landau 1993]: the inverse
+of 0.693035(37)."""
 
 UNIVERSAL = 0.6217
 """Binder's cumulant of a cube with periodic sides at the transition [Holm & Janke 1993]."""
@@ -188,9 +189,9 @@ def report(found: list[Series]) -> Report:
     text = (
         "The classical Heisenberg magnet on a simple cubic lattice, `lt.models.spin_lattice` in a bath of constant "
         "temperature, beside a heat bath with over-relaxation (Monte Carlo, in NumPy). Errors are those of blocks of "
-        f"at least eight autocorrelation times. The transition is at kT = {CRITICAL} J, where U = {UNIVERSAL} of "
-        "large cubes (Holm and Janke 1993). Between the runs next to it cumulants are taken to be straight lines, and "
-        "the error of a crossing is found by drawing from theirs."
+        f"at least eight autocorrelation times. The transition is at kT = {CRITICAL} J (Chen, Ferrenberg and Landau "
+        f"1993), where U = {UNIVERSAL} of large cubes (Holm and Janke 1993). Between the runs next to it cumulants are "
+        "taken to be straight lines, and the error of a crossing is found by drawing from theirs."
     )
     best = min(crossings, key=lambda c: c[2], default=None)
     distance = None if best is None else abs(best[1] / CRITICAL - 1.0) + best[2] / CRITICAL

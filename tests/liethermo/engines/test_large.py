@@ -207,3 +207,29 @@ def test_krylov_solves_what_dense_elimination_solves():
     short = krylov(lambda v: matrix @ v, b, replace(RULES, forcing=1e-3, kept=2))
     assert np.linalg.norm(matrix @ short - b) <= 1.01e-3 * np.linalg.norm(b)
     assert not np.asarray(krylov(lambda v: matrix @ v, jnp.zeros(60), RULES)).any()
+
+
+@pytest.mark.parametrize(("strength", "length"), [(12.0, 1.0), (0.1, 1e6)], ids=["slow", "large"])
+def test_one_of_many_components_is_solved_like_the_others(strength, length):
+    """The root mean square hides none: a spin whose updates shrink by a half, or one that is a million times longer."""
+    n, h = 40, 0.05 / length
+    energy = lambda m: -jnp.sum(m * jnp.roll(m, 1, axis=0)) - strength * m[0, 2] ** 2  # noqa: E731
+    spins = np.random.default_rng(0).standard_normal((n, 3))
+    spins[0] = 0.6 * length, 0.0, 0.8 * length
+    given = lt.LiePoissonSystem(mf.power(mf.so(3), n), energy), lt.MetriplecticMidpoint()
+    system, method = as_run(*given)
+    assert system.dim > RULES.many
+    engine = array.ArrayEngine(system, method)
+    state = engine.begin(jnp.asarray(spins.ravel()))
+    for _ in range(10):
+        before, state = state, engine.step(state, h)
+        left = np.abs(method.slopes(system, before.x, before.compensation, h, state.k) - state.k)[0]
+        own = np.abs(np.asarray(before.x)).reshape(n, 3).max(axis=1, keepdims=True) / h + np.abs(state.k[0]).reshape(
+            n, 3
+        )
+        assert (left.reshape(n, 3) / own).max() < 1e-14, np.unravel_index(np.argmax(left.reshape(n, 3) / own), (n, 3))
+    lengths = [np.linalg.norm(np.asarray(x).reshape(n, 3), axis=1) for x in (spins, state.x)]
+    np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-14)
+    assert abs(float(state.energy) - float(engine.begin(jnp.asarray(spins.ravel())).energy)) <= 1e-14 * float(
+        state.energy_sensitivity
+    )
