@@ -70,8 +70,6 @@ def write(results: Path, page: Path) -> None:
         if report.series:
             work_precision(report.series, figure := page.parent / f"{name}.svg")
             parts.append(f"![Time against error]({figure.name})")
-        if name == "scaling":  # for another page
-            _save(page.parent / "scaling.md", [table.markdown() for table in report.tables])
         if name == "magnet":
             magnet(report.tables[0], page.parent / "magnet.svg")
             parts.append("![Magnetisation, specific heat and Binder's cumulant against the temperature](magnet.svg)")

@@ -66,7 +66,6 @@ extensions = [
 
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "_ext", "generated/executed", "generated/spec_keys.md", "generated/facts.md"]
-exclude_patterns += ["reference/scaling.md"]  # a part of another page
 nitpicky = False  # types in the docstrings are prose
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]

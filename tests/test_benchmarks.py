@@ -72,7 +72,7 @@ PAGES = ROOT / "docs" / "reference"
 
 def test_both_pages_are_those_of_the_kept_results(tmp_path):
     page.write(RESULTS, tmp_path / "benchmarks.md")
-    for name in ("benchmarks.md", "benchmarks_runs.md", "scaling.md"):
+    for name in ("benchmarks.md", "benchmarks_runs.md"):
         assert (tmp_path / name).read_text() == (PAGES / name).read_text(), (
             f"{name}: python -m benchmarks --kept --page"
         )

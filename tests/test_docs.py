@@ -273,7 +273,7 @@ def _figures_of_speed(path: Path) -> list[str]:
 
 def test_figures_of_speed_are_on_the_pages_of_benchmarks_alone():
     """Those pages are written by what measures them; elsewhere they would differ from it sooner or later."""
-    benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs", "scaling")]
+    benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs")]
     assert all(len(_figures_of_speed(page)) > 50 for page in benchmarks)
     ours = [path for path in TEXTS if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
     texts = [*ours, ROOT / "CHANGELOG.md"]
