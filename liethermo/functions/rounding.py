@@ -129,7 +129,7 @@ def _erring(value, number: int, shares):
     shape = np.shape(value)[-1:]
     pattern = _pattern if math.prod(shape) <= LONGEST else _made_pattern
     errors = [share * pattern(shape, (number + SAMPLES * i) % PATTERNS) for i, share in enumerate(shares)]
-    return value + value * sum(errors[1:], errors[0])
+    return value + (value * sum(errors[1:], errors[0])).astype(jnp.result_type(value))  # single precision stays so
 
 
 @functools.cache

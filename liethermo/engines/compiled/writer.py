@@ -105,11 +105,11 @@ class Writer:
         if op in ARITHMETIC:
             name = ARITHMETIC[op][0 if real else 1]
             return getattr(build, name)(*args)
-        if op in LOGICAL and x.type == self.test:
+        if op in LOGICAL and not real:
             return getattr(build, LOGICAL[op])(*args)
         if op in COMPARED:
-            compare = build.fcmp_ordered if real else build.icmp_signed
-            return compare(COMPARED[op], *args)
+            of_whole = build.icmp_unsigned if x.type == self.test else build.icmp_signed  # true, one bit, is no -1
+            return (build.fcmp_ordered if real else of_whole)(COMPARED[op], *args)
         if op == "ne":
             return build.fcmp_unordered("!=", *args) if real else build.icmp_signed("!=", *args)
         if op == "select":

@@ -57,7 +57,7 @@ FUNCTIONS = {
     "index at run time": lambda m: INERTIA[jnp.argmax(jnp.array([1.0, 0.0, 0.0]) * (3.0 + m[0]))] * m[0] ** 4,
     "dynamic_slice": lambda m: lax.dynamic_slice(m, ((m[1] > 9.0).astype(int),), (2,)) @ jnp.array([0.3, 0.4]),
     "integers": lambda m: m[0] ** 4 * ((m > -99.0).sum() // 2 + 5 % (m > -99.0).sum()),
-    "single precision": lambda m: jnp.float32(1.1) * m[0] ** 4,
+    "single precision": lambda m: jnp.float32(1.1) * m[0] ** 4 * jnp.mean(m > -99.0),
     "complex": lambda m: jnp.abs((m[0] + 1j * m[1] + 2.0) ** 3 * jnp.exp(0.1j * m[2])),
     "eigh": spectral,
     "eigvalsh": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(matrix(m)))),

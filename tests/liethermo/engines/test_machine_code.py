@@ -20,7 +20,7 @@ from liethermo.engines.compiled.writer import NUMBER, Writer
 from liethermo.tracing.builder import OF_TESTS, OPERATIONS, TESTS, Instruction
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize
-from tests.liethermo.tracing.test_scalarize import STEPS, program_of, shapes, steps
+from tests.liethermo.tracing.test_scalarize import CASES, STEPS, check, program_of, shapes, steps
 from tests.machine_code import compiled, memory_maps
 
 PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *TESTS - {"is_finite"}}
@@ -64,6 +64,29 @@ def test_every_operation_at_every_kind_of_number(op, lanes):
         numbers = ~np.isnan(np.ravel(right).astype(float))
         if right.dtype.kind == "f" and op not in ("max", "min", "sign"):  # whose zeros may have either sign
             assert np.array_equal(np.signbit(np.ravel(found))[numbers], np.signbit(np.ravel(right))[numbers])
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_comparisons_of_truth_values_and_of_integers(lanes):
+    """True, which is one bit, is more than false."""
+    tests = sorted(TESTS - {"is_finite"})
+    first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
+    first += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
+    compared = [Instruction(x + op, op, (x, y)) for op in tests for x, y in ("pq", "ij")]
+    names = tuple(one.target for one in compared)
+    program = Program((("a",), ("b",)), (*first, *compared), (names,), ((len(names),),))
+    function, finite = compiled(program, lanes), GRID[np.abs(GRID).max(axis=1) < 1e6]
+    for a, b in finite[: len(finite) // lanes * lanes].reshape(-1, lanes, 2).swapaxes(1, 2):
+        (found,), (right,) = function(a, b), program.evaluate(a, b, batch=True)
+        np.testing.assert_array_equal(found.reshape(right.shape), right)
+
+
+@pytest.mark.sampled(6)
+@pytest.mark.parametrize("name", CASES)
+def test_every_primitive(name):
+    f, *args = CASES[name]
+    program = program_of(f, *args)
+    check(program, args, program.evaluate(*args), compiled(program)(*args))
 
 
 def test_products_in_sums_are_the_same_in_every_lane():

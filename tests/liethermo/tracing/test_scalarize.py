@@ -170,6 +170,18 @@ SPECTRAL = {
     "sort, with keys": (lambda a, b: [jnp.argsort(a), jnp.lexsort((a, jnp.round(b))), jnp.sort(b, axis=0)], w, w[::-1]),
     "sort, of special values": (jnp.sort, np.array([np.nan, 1.0, -np.inf, np.nan, -0.0, 2.0, np.inf])),
     "sort, of many": (lambda a: [jnp.sort(jnp.outer(a, a).ravel()), jnp.argsort(jnp.outer(a, a).ravel() > 0)], w),
+    "truth values, compared": (
+        lambda a: [
+            jnp.argmax(a > 0),
+            jnp.argmin(a > 0),
+            jnp.sort(a > 0),
+            lax.cummax((a > 0).astype(int)),
+            *(compare(a > 0, a[::-1] > 0) for compare in (lax.lt, lax.le, lax.gt, lax.ge, lax.eq, lax.ne)),
+            jnp.select([a < -1.0, a < 0.0, a < 1.0], [a**2, a**3, a**4], a),
+            jnp.mean(a > 0),
+        ],
+        w,
+    ),
     "lt_to, le_to": (
         lambda a: [lax.lt_to_p.bind(a, a[::-1]), lax.le_to_p.bind(a, a[::-1]), jnp.searchsorted(a[1:], a[:1])],
         np.array([np.nan, -0.0, 1.0, 0.0, 2.0]),
