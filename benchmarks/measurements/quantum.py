@@ -11,10 +11,14 @@ import scipy.linalg
 import liethermo as lt
 
 from .. import laws, peers
+from ..ensembles import laws as ensemble_laws
+from ..machine import cores
 from ..report import Report, Table, UnavailableError, ratio
 from ..timing import race
 
 TEMPERATURE, RATE, END = 0.8, 0.1, 100.0
+
+LOWER, MANY_END = np.array([[0.0, 1.0], [0.0, 0.0]]), 250.0
 
 EARLY, LOOKS = 5.0, 20
 """The time at which the error is measured beside that at the end, when coherences have decayed; states kept."""
@@ -68,6 +72,40 @@ def mesolve(levels: int, rho: np.ndarray, tolerance: float):
     return solve
 
 
+def qubit(parameters) -> lt.QuantumSystem:
+    bath = lt.HeatBaths(capacity=np.inf, temperature=parameters["temperature"])
+    return lt.QuantumSystem(np.diag([0.0, 1.0]), lt.ThermalJumps([(LOWER, parameters["rate"])]), bath)
+
+
+def many(number: int) -> tuple[lt.Ensemble, np.ndarray]:
+    """A run of qubits from random states in baths of as many temperatures, at as many rates; and how far each is from
+    the Gibbs state of its bath at the end."""
+    rng = np.random.default_rng(0)
+    parameters = {"rate": rng.uniform(0.1, 0.4, number), "temperature": rng.uniform(0.4, 2.0, number)}
+    some = qubit({"rate": 0.1, "temperature": 1.0})
+    states = some.samples(number, 1) * np.append(np.ones(some.body_dim), 0.0)
+    method = lt.MetriplecticTaylor(20)
+    found = lt.ensemble(qubit, states, (0.0, MANY_END), 2.5, method, parameters=parameters)
+    weights = np.exp(-np.outer(1.0 / parameters["temperature"], [0.0, 1.0]))
+    gibbs = np.zeros((number, some.body_dim))
+    gibbs[:, :2] = weights / weights.sum(axis=1, keepdims=True)
+    return found, np.abs(found.x[:, : some.body_dim] - gibbs).max(axis=1)
+
+
+def _many(quick: bool) -> Table:
+    number = 100 if quick else 100_000
+    outcome = race({"ours": lambda: many(number)}, rounds=1 if quick else 3)["ours"]
+    found, distance = outcome.result
+    cells = [f"{number:,}", outcome.seconds, outcome.seconds / number, float(distance.max())]
+    columns = {"Qubits": "text", "To the end": "seconds", "Time a qubit": "seconds", "Distance from Gibbs": "error"}
+    return Table(
+        f"An ensemble of qubits, each with a temperature and a rate of its own, by Taylor steps of order 20 to "
+        f"T = {MANY_END:g}: the worst of all. Times by the clock, on {cores()} cores.",
+        columns | laws.COLUMNS,
+        [[*cells, *ensemble_laws(found).cells()]],
+    )
+
+
 def run(quick: bool) -> Report:
     rows, rounds = [], 1 if quick else 5
     small, large = ((2, 20, 2.5), (3, 20, 1.25), (4, 20, 1.25)), ((8, 16, 0.5), (16, 16, 0.25))
@@ -105,4 +143,4 @@ def run(quick: bool) -> Report:
         rows,
     )
     text = "Levels in a bath of constant temperature, where the motion is Lindblad's equation. Processor times."
-    return Report("Density matrices", text, [table], [])
+    return Report("Density matrices", text, [table, _many(quick)], [])

@@ -679,6 +679,24 @@ def test_an_ensemble_takes_matrices():
     assert "trace 0.5, not 1" in many.message(1)
 
 
+@pytest.mark.slow
+def test_many_qubits_reach_the_gibbs_states_of_their_baths():
+    """Each with a temperature and a rate of its own."""
+
+    def member(p):
+        return lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, p["rate"])]), infinite(p["temperature"]))
+
+    rng, number = np.random.default_rng(0), 1000
+    parameters = {"rate": rng.uniform(0.1, 0.4, number), "temperature": rng.uniform(0.4, 2.0, number)}
+    x0s = np.pad(np.asarray(qubit().structure.vector(np.stack([random_density(2, i) for i in range(number)]))), (0, 1))
+    many = lt.ensemble(member, x0s[:-1], (0.0, 250.0), 2.5, lt.MetriplecticTaylor(20), parameters=parameters)
+    assert many.audit().passed
+    assert many.energy_drift.max() <= 1e-14
+    weights = np.exp(-np.outer(1.0 / parameters["temperature"], np.diag(QUBIT).real))
+    gibbs = np.eye(2) * (weights / weights.sum(axis=1, keepdims=True))[:, None, :]
+    assert np.abs(qubit().density(many.x) - gibbs).max() <= 1e-9
+
+
 WATCHED = {
     "midpoint": (lt.MetriplecticMidpoint(), 0.05, 1e-3),
     "explicit": (lt.MetriplecticRungeKutta(8), 0.05, 1e-12),
