@@ -89,7 +89,7 @@ def many(number: int) -> tuple[lt.Ensemble, np.ndarray]:
     weights = np.exp(-np.outer(1.0 / parameters["temperature"], [0.0, 1.0]))
     gibbs = np.zeros((number, some.body_dim))
     gibbs[:, :2] = weights / weights.sum(axis=1, keepdims=True)
-    return found, np.abs(found.x[:, : some.body_dim] - gibbs).max(axis=1)
+    return found, np.abs(np.asarray(found.x)[:, : some.body_dim] - gibbs).max(axis=1)
 
 
 def _many(quick: bool) -> Table:

@@ -126,6 +126,8 @@ def inverse(a) -> jax.Array:
 def turned_by(B, w, A) -> jax.Array:
     """``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
 
+    Multiples of the identity are left out of B: they move the phase of U alone, and may be large.
+
     Parameters
     ----------
     B : array, shape (s, n, n)
@@ -135,25 +137,26 @@ def turned_by(B, w, A) -> jax.Array:
         The matrix of a Runge-Kutta method, times the step.
     """
     s, n = B.shape[:2]
-    table = (A[:, None, :, None] * B.swapaxes(0, 1)).reshape(s * n, s * n)
+    table = (A[:, None, :, None] * _traceless(B).swapaxes(0, 1)).reshape(s * n, s * n)
     solver = solve_near_identity if s == 1 else solve  # whose matrix is 1 less a skew-Hermitian one
     stages = solver(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
     return stages @ w @ adjoint(stages)
 
 
-def cayley_rate(k, b, traceless: bool = False) -> jax.Array:
+def _traceless(a):
+    """Matrices, shape (..., n, n), less multiples of the identity."""
+    n = a.shape[-1]
+    return a - (jnp.trace(a, axis1=-2, axis2=-1) / n)[..., None, None] * np.eye(n)
+
+
+def cayley_rate(k, b) -> jax.Array:
     """``k'`` for which ``U = (1 - k/2)^-1 (1 + k/2)`` moves by ``U' = B U``, of skew-Hermitian k and B, shape (n, n).
 
-    Parameters
-    ----------
-    traceless : bool
-        Whether k' has to have the trace zero: then U moves by B plus a multiple of the identity.
+    Both are taken without their traces, and k' is without one: it moves U by B and a multiple of the identity, which
+    changes the phase of U alone.
     """
-    half, one = 0.5 * k, np.eye(k.shape[-1])
-    found = (one - half) @ b @ (one + half)
-    if not traceless:
-        return found
-    square = one - half @ half
+    half, one = 0.5 * _traceless(k), np.eye(k.shape[-1])
+    found, square = (one - half) @ _traceless(b) @ (one + half), one - half @ half
     return found - (jnp.trace(found) / jnp.trace(square)) * square
 
 

@@ -144,8 +144,7 @@ class LiePoisson(PoissonStructure):
             return None
         basis, dual = found
         k, b = (-jnp.tensordot(v, basis, 1) for v in (covector, alpha))
-        rate = cayley_rate(k, b, traceless=np.iscomplexobj(basis) and self.dim < basis.shape[-1] ** 2)
-        return -jnp.einsum("ij,aji->a", rate, dual).real
+        return -jnp.einsum("ij,aji->a", cayley_rate(k, b), dual).real
 
 
 @functools.lru_cache(maxsize=64)

@@ -550,6 +550,16 @@ def test_a_matrix_is_a_state_whatever_its_numbers_are():
     assert np.array_equal(one.density(run.x[-1]), [[1.0]])
 
 
+@pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(6), lt.MetriplecticGauss(2)], ids=str)
+def test_a_constant_that_is_added_to_the_energy_changes_nothing(method):
+    runs = [
+        lt.integrate(lt.QuantumSystem(random_hermitian(2) + shift * np.eye(2)), RHO, (0.0, 1.0), 0.1, method)
+        for shift in (0.0, 1e4)
+    ]
+    assert np.abs(runs[0].x - runs[1].x).max() <= 1e-11
+    assert runs[1].audit().resolved
+
+
 def test_couplings_and_products_keep_the_floor_of_the_entropy():
     floor = lt.VonNeumann(floor=1e-10)
     q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.2), entropy=floor)

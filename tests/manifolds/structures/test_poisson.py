@@ -98,6 +98,9 @@ def test_a_covector_that_carries_a_state(P):
     end = x + P.carried(x, covector)
     moved = jax.jvp(lambda K: P.carried(x, K), (covector,), (P.turning(covector, alpha),))[1]
     assert np.abs(moved - P.sharp(end, alpha)).max() <= 1e-13 * np.abs(x).max() * np.abs(covector).max() ** 2
+    if isinstance(P, mf.DensityMatrices):  # a constant that is added to the energy moves nothing
+        constant = np.append(np.ones(P.size), np.zeros(P.dim - P.size))
+        assert np.abs(P.turning(covector, alpha + 1e6 * constant) - P.turning(covector, alpha)).max() <= 1e-8
     assert np.abs(jax.jvp(lambda K: P.carried(x, K), (covector,), (alpha,))[1] - moved).max() >= 1e-2
 
 
