@@ -31,7 +31,7 @@ def run(system, x0, method=None, steps=STEPS, h=STEP):
     if system.algebra.name in TRANSCENDENTAL:  # their entropies are singular nearby: stay close to the initial state
         h = h / 10
     size, speed = np.linalg.norm(x0), np.linalg.norm(system.vector_field(x0))
-    h = min(h, 0.3 * size / speed) if speed > 0.0 else h  # no step of these tests is to be a stiff one
+    h = min(h, 0.05 * size / speed) if speed > 0.0 else h  # longer ones of some have no solution
     return lt.integrate(system, x0, (0.0, steps * h), h, method or lt.MetriplecticMidpoint())
 
 
