@@ -452,7 +452,7 @@ def meeting(size, gap):
 GAPS = [0.0, 1e-12, 1e-8, 1e-4, 0.3]
 
 
-@pytest.mark.parametrize("size", [2, 3, 4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [2, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 8))])
 @pytest.mark.parametrize(
     "method",
     [
