@@ -175,8 +175,10 @@ class Witness:
         whole = WHOLE * float(np.ptp(places, axis=0).max())
         looked = looked_at(self.system, self.x[: count + 1], self.t[: count + 1], self.h, self.again.path)
         again, defect = self._worst(looked, whole)
-        for fields in (self._least_field, self._least_field_rounded):
-            least = fields(looked.x[again])
+        least = self._least_field(looked.x[again])
+        for closer in (False, True):
+            if closer:
+                least = np.maximum(least, self._rounding_of_field(looked.x[again]))
             tried = [self._step(looked.x[i], looked.h[i], looked.t[i], f) for i, f in zip(again, least, strict=True)]
             steps = [step for step in tried if step is not None and step.length > STILL]
             if not steps:  # nothing moves
@@ -205,11 +207,10 @@ class Witness:
         change = np.nan_to_num(np.abs(after - before), nan=0.0, posinf=0.0)
         return self._of_blocks(change)
 
-    def _least_field_rounded(self, x: np.ndarray) -> np.ndarray:
-        """The same with what rounding leaves in the field: a bath takes the sum of what may cancel in the body."""
+    def _rounding_of_field(self, x: np.ndarray) -> np.ndarray:
+        """What rounding leaves in the field of each block: a bath takes the sum of what may cancel in the body."""
         with np.errstate(all="ignore"):
-            size = at_points(_size_of_field, self.system, x)
-        return np.maximum(self._least_field(x), self._of_blocks(ROUNDED * size))
+            return self._of_blocks(ROUNDED * at_points(_size_of_field, self.system, x))
 
     def _of_blocks(self, fields: np.ndarray) -> np.ndarray:
         return np.stack([fields[:, block].max(axis=1, initial=0.0) for block in self.system.blocks], axis=1)

@@ -27,7 +27,7 @@ at."""
 
 
 JACOBI_DIM = 40
-"""Components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers; of larger \
+"""Components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers; of larger
 systems for three functions."""
 
 

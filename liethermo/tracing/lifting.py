@@ -82,9 +82,10 @@ class _Body:
         self.outputs = self._run(jaxpr, consts, env)
 
     def _run(self, jaxpr: Jaxpr, consts: Sequence, env: dict[Var, Any]) -> list:
-        exponents = {eqn.invars[1] for eqn in jaxpr.eqns if eqn.primitive.name == "pow" and type(eqn.invars[1]) is Var}
+        named = [(eqn.invars, FORMULAS[eqn.primitive.name]) for eqn in jaxpr.eqns if eqn.primitive.name in FORMULAS]
+        formulas = {inputs[place] for inputs, (place, _) in named if type(inputs[place]) is Var}
         for var, value in zip(jaxpr.constvars, consts, strict=True):
-            env[var] = self._constant(var, value, var in exponents)
+            env[var] = self._constant(var, value, var in formulas)
 
         def read(atom):
             return atom if isinstance(atom, Literal) else env[atom]
@@ -123,10 +124,10 @@ class _Body:
         self.constants[var] = self._fixed[var] = value
         return var
 
-    def _constant(self, var: Var, value, exponent: bool):
+    def _constant(self, var: Var, value, formula: bool):
         if isinstance(value, jax.core.Tracer):
             return self._number(value, var.aval)
-        if getattr(var.aval, "dtype", None) == np.float64 and not exponent:
+        if getattr(var.aval, "dtype", None) == np.float64 and not formula:
             return self._number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep(Var(var.aval), value)
 
