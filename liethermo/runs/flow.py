@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +14,6 @@ from jax.flatten_util import ravel_pytree
 
 from manifolds._arrays import is_traced
 from manifolds._precision import by_own_settings
-from manifolds.matrices.linear import inverse
 
 from ..engines import implicit
 from ..engines.stages import Equations, Solved, explicit, fixed_point, solve_stages
@@ -26,6 +24,7 @@ from ..systems import System
 from ..tracing.programs import hasty_program, program
 from .adaptive import Adaptive
 from .preparation import begun, of_steps, started
+from .sensitivities import derivatives
 from .timetable import Course
 
 
@@ -47,8 +46,8 @@ def flow(
     function works under ``jax.grad``, ``jax.jacfwd``, ``jax.vmap`` and ``jax.jit``, and it has derivatives of every
     order. Parameters are the arrays among the leaves of the system, the arguments from which a function builds it, and
     numbers in closures. Without ``jax.jit`` the function runs compiled programs, which are reused for other numbers.
-    They are compiled in little time where the run is short. In a function that is called often, ``jax.jit`` makes calls
-    quicker.
+    They are compiled in little time where the run is short, and derivatives of small systems are interpreted. In a
+    function that is called often, ``jax.jit`` makes calls quicker.
 
     Parameters
     ----------
@@ -110,11 +109,12 @@ def flow(
         leaves = jax.tree_util.tree_leaves(given)
         moves, moving = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
         order = _order(moving)
-        if order and sum(leaf.size for leaf in moving) ** order <= DERIVATIVES:
-            found = compiled(_derivatives)(values, moves, order, sizes, steps, last)
+        count = sum(leaf.size for leaf in moving)
+        if order and count <= DIRECTIONS and count**order <= DERIVATIVES:
+            found = _derivatives(values, moves, order, sizes, counts, steps, last)
             path = program(_polynomial)(path, found, moving, _constant(moving))
         else:
-            path = program(_known_path)(*given, sizes, steps, last, _as_guessed)
+            path = program(_known_path)(*given, sizes, steps, last)
     path = path if path.shape[-1] == n else path[..., :n]
     return shown.points(path) if shown.space is None else path
 
@@ -137,9 +137,9 @@ def _check(system, t_span, step, method) -> None:
 HASTY = 1_000
 """Steps times components up to which a program is not optimised: that would take longer than it saves in many calls."""
 
-DERIVATIVES = 256
-"""Entries of a derivative of one component up to which it is found at once, forwards, for all that is differentiated
-by: in a program of its own, which can be compiled as it is best."""
+DIRECTIONS, DERIVATIVES = 64, 256
+"""Numbers that are differentiated by, and entries of the derivative of one component, up to which a derivative is found
+at once, forwards, for all that is differentiated by."""
 
 
 def _constant(tree: Any) -> Any:
@@ -170,7 +170,8 @@ def _path(
 ) -> tuple[jax.Array, list]:
     """The states kept, the first among them, or the last alone: for programs in which all numbers are arguments.
 
-    With ``known`` also, for each call, compensations at the begin of each step and the slopes that solve its equations.
+    With ``known`` also, for each call, the state at the begin of each step, its compensation, and the slopes that solve
+    its equations.
     """
     system, method, x = given
     carry, states, steps = first_carry(system, method, x), [x[None]], []
@@ -178,7 +179,7 @@ def _path(
 
         def step(carry, _, h=sizes[i]):
             after = one_step(system, method, carry, h, iterated if newton else without_newton)
-            return after, (carry[1], after[2]) if known else None
+            return after, (*carry[:2], after[2]) if known else None
 
         def save(carry, _, step=step, every=every):
             carry, solved = jax.lax.scan(step, carry, length=every)
@@ -195,31 +196,15 @@ def _kept(states: Sequence, last: bool) -> jax.Array:
 
 
 def _derivatives(
-    given: tuple, moves: tuple[bool, ...], order: int, sizes, steps: list, last: bool
-) -> tuple[jax.Array, ...]:
+    given: tuple, moves: tuple[bool, ...], order: int, sizes, counts, steps: list, last: bool
+) -> list[np.ndarray]:
     """The derivatives of the path up to an order, by all leaves that move in one row: shapes (..., n, p, ..., p)."""
-    leaves, structure = jax.tree_util.tree_flatten(given)
-    start, back = ravel_pytree([leaf for leaf, moving in zip(leaves, moves, strict=True) if moving])
-
-    def path(v):
-        moved = iter(back(v))
-        whole = [next(moved) if moving else leaf for leaf, moving in zip(leaves, moves, strict=True)]
-        system, method, x = jax.tree_util.tree_unflatten(structure, whole)
-        return _known_path(system, method, x, sizes, steps, last, solve), ()
-
-    solve = _as_guessed if order == 1 else functools.partial(_improved, order)  # each the shorter program there
-
-    def derived(function):
-        def derivative(v):
-            found, lower = jax.jacfwd(function, has_aux=True)(v)
-            return found, (*lower, found)
-
-        return derivative
-
-    function = path
-    for _ in range(order):
-        function = derived(function)
-    return function(start)[1]
+    each = [np.repeat(h, saves * every) for h, (saves, every) in zip(sizes, counts, strict=True)]
+    parts = [[np.asarray(part).reshape(-1, *part.shape[2:]) for part in call] for call in steps]
+    x, compensation, k = (np.concatenate(part) for part in zip(*parts, strict=True))
+    found = derivatives(given, moves, order, np.concatenate(each), (x, compensation, k))
+    ends = np.cumsum([0, *(every for saves, every in counts for _ in range(saves))])
+    return [derivative[-1] if last else derivative[ends] for derivative in found]
 
 
 def _polynomial(path, derivatives: Sequence, moving: Sequence, here: Sequence) -> jax.Array:
@@ -232,14 +217,14 @@ def _polynomial(path, derivatives: Sequence, moving: Sequence, here: Sequence) -
     return path
 
 
-def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool, solve: Callable) -> jax.Array:
+def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool) -> jax.Array:
     """The states of a path whose steps are solved: as functions of the first and of the parameters."""
     states = [x[None]]
     for i, solved in enumerate(steps):
 
         def step(x, known, h=sizes[i]):
-            compensation, k = known
-            k = solve(system, method, x, compensation, h, k)
+            _, compensation, k = known
+            k = _as_guessed(system, method, x, compensation, h, k)
             return method.move(system, x, compensation, h, k)[0], None
 
         def save(x, known, step=step):
@@ -254,26 +239,6 @@ def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, la
 def _as_guessed(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
     """The slopes of a step that are known, differentiated as the implicit function that they are."""
     return _stages(system, method, x, compensation, h, k, lambda own: own.guess)
-
-
-def _improved(order: int, system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
-    """The same, with derivatives up to an order: by so many steps of Newton's method with a matrix that is constant.
-
-    Each step makes one more derivative right, and programs hold the equations once.
-    """
-
-    def misfit(given, k):
-        system, method, x, h = given
-        return method.slopes(system, x, compensation, h, k) - k
-
-    given = system, method, x, h
-    matrix = jax.jacfwd(lambda k: misfit(_constant(given), k))(k)
-    inverted = inverse(matrix.reshape(k.size, k.size))
-
-    def better(k, _):
-        return k - (inverted @ misfit(given, k).ravel()).reshape(k.shape), None
-
-    return jax.lax.scan(better, k, length=order)[0]
 
 
 def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:

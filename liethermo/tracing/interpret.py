@@ -27,6 +27,9 @@ from .traced import settled
 LIMIT = 30_000
 """Instructions up to which unrolling and interpreting are faster than compiling."""
 
+PORTION = 1_000
+"""Points that are taken at once: values in between stay in fast memory."""
+
 LIMIT_FOR_DEGREES = 8_000
 """The same for degrees, which are known of whole arrays too, if less sharply."""
 
@@ -65,9 +68,14 @@ def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray]
         return lambda points: _by_compiler(function, model, points)
     program, structure = found
 
-    def interpreted(points):
+    def evaluated(points):
         own = [np.broadcast_to(value, (len(points), *value.shape)) for value in values]
-        return jax.tree_util.tree_unflatten(structure, program.evaluate(*own, points, batch=True))
+        return program.evaluate(*own, points, batch=True)
+
+    def interpreted(points):
+        portions = np.array_split(points, max(1, -(-len(points) // PORTION)))
+        found = [np.concatenate(parts) for parts in zip(*map(evaluated, portions), strict=True)]
+        return jax.tree_util.tree_unflatten(structure, found)
 
     return interpreted
 

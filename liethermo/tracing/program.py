@@ -5,9 +5,8 @@ from __future__ import annotations
 import functools
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -70,13 +69,45 @@ class Program:
 
     def run(self, *given: Sequence) -> list[list]:
         """The entries of the outputs for those of the inputs: numbers, or arrays of them for many points at once."""
-        values: dict[Scalar, Any] = {}
-        for names, entries in zip(self.inputs, given, strict=True):
-            values.update(zip(names, entries, strict=True))
+        places, start, instructions, results = self._plan
+        values = start.copy()
+        for own, entries in zip(places, given, strict=True):
+            for place, entry in zip(own, entries, strict=True):
+                values[place] = entry
         with np.errstate(all="ignore"):
-            for target, op, args in self.instructions:
-                values[target] = meaning(op)(*(values[a] if type(a) is str else a for a in args))
-        return [[values[a] if type(a) is str else a for a in entries] for entries in self.outputs]
+            for function, target, args in instructions:
+                values[target] = function(*[values[a] for a in args])
+        return [[values[place] for place in own] for own in results]
+
+    @functools.cached_property
+    def _plan(self) -> tuple[list[list[int]], list, list[tuple[Callable, int, list[int]]], list[list[int]]]:
+        """How it is interpreted: the places of inputs, what is at each place at the start, instructions, and results.
+
+        A place is free again after its value is read for the last time. So arrays of many points stay in fast memory.
+        """
+        last = {a: i for i, instruction in enumerate(self.instructions) for a in instruction.args if type(a) is str}
+        last.update((a, len(self.instructions)) for entries in self.outputs for a in entries if type(a) is str)
+        places: dict[str, int] = {}
+        start: list = []
+        free: list[int] = []
+
+        def place(value=None) -> int:
+            start.append(value)
+            return len(start) - 1
+
+        def read(args) -> list[int]:
+            return [places[a] if type(a) is str else place(a) for a in args]
+
+        places.update((name, place()) for names in self.inputs for name in names)
+        inputs, instructions = [read(names) for names in self.inputs], []
+        for i, (target, op, args) in enumerate(self.instructions):
+            own = read(args)
+            free += [places[a] for a in set(args) if type(a) is str and last[a] == i]
+            places[target] = free.pop() if free else place()
+            instructions.append((meaning(op), places[target], own))
+            if target not in last:
+                free.append(places[target])
+        return inputs, start, instructions, [read(entries) for entries in self.outputs]
 
     def degree(self, place: int) -> float:
         """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
