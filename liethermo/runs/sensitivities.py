@@ -123,9 +123,9 @@ def derivatives(
     place = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
 
     def along(rows: Callable[[slice], np.ndarray], many: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of misfit and move, shapes (steps, m, many) and (steps, n, many).
+        """Derivatives of misfit and move, shapes (steps, m, many) and (steps, n, many).
 
-        ``rows`` gives those of some steps, shape (steps, many, 2**rank, n + q + m): not of all at once, which is much.
+        ``rows`` gives the rows of some steps, shape (steps, many, 2**rank, n + q + m): those of all steps are large.
         """
         step, found = _Step(given, tuple(moves), k.shape[1:], rank), np.empty((count, many, m + n))
         portion = max(1, ENTRIES // (many * 2**rank * (n + q + m)))
