@@ -32,6 +32,9 @@ SMALL_PROGRAM = 30_000
 """Operations of a step up to which it is compiled in no more time than XLA takes, so that "auto" always takes it. On a
 step of 8,000 operations XLA spends three times as long, on one of 28,000 as long."""
 
+LARGE_PROGRAM = 50_000
+"""Operations from which it is said that compiling takes minutes: the time grows with their square."""
+
 COMPILED_STEPS = 20_000
 """Steps from which it is worth compiling for some seconds more."""
 
@@ -44,7 +47,7 @@ Engine: TypeAlias = ArrayEngine | CompiledEngine | SparseEngine
 
 
 class CompiledEngineWarning(UserWarning):
-    """A system that the compiled engine cannot run, so that the array engine does."""
+    """A system that the compiled engine cannot run, so that the array engine does, or that it compiles for minutes."""
 
 
 class Chosen:
@@ -137,7 +140,14 @@ class Chosen:
         if self.asked == "compiled" or (auto and is_small(system)):
             compiled = CompiledEngine(system, method, planned=self.steps)
             try:
-                if operations(compiled) <= SMALL_PROGRAM or not auto or long:
+                size = operations(compiled)
+                if not auto and size > LARGE_PROGRAM:
+                    warn(
+                        f"a step of {size:,} operations takes minutes to compile: leave out engine, or take "
+                        "engine='array', to start at once",
+                        CompiledEngineWarning,
+                    )
+                if size <= SMALL_PROGRAM or not auto or long:
                     return compiled
             except UnsupportedPrimitive as error:
                 if not (auto and error.too_large):  # as little of a surprise as one that is too long to be worth it

@@ -189,7 +189,7 @@ def conclude(system: System, method: OneStepMethod, state: State, h, solved: Sol
         energy_sensitivity=jnp.fmax(state.energy_sensitivity, sizes[0]),
         entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, sizes[1]),
     )
-    failed = state._replace(status=failure, residual=residual)
+    failed = state._replace(status=failure.astype(state.status.dtype), residual=residual)
     if x.size > rules.large:  # a choice entry by entry would read both
         return jax.lax.cond(good, lambda: new_state, lambda: failed)
     return jax.tree_util.tree_map(lambda a, b: jnp.where(good, a, b), new_state, failed)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
+from liethermo.engines.choice import CompiledEngineWarning
 from liethermo.engines.codes import Code
 from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.stepper import CompiledEngine
@@ -118,6 +120,29 @@ def test_every_engine_goes_by_the_rules_it_is_given():
         assert np.array_equal(state.x, x0)
         assert int(engine(system, method).step(state_of_engine := hasty.begin(x0), 0.1).status) == Code.COMPLETED
         assert np.array_equal(state_of_engine.x, x0)
+
+
+def test_rules_of_large_systems_in_machine_code():
+    """A choice of all of a state at once, where a system is large, is one of numbers of the kinds that it has there."""
+    for method in (lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)):
+        usual = CompiledEngine(BODY, method)
+        large = CompiledEngine(BODY, method, Rules(large=2))
+        state = large.advance(large.begin(X0), 0.1, 1, 20)[0]
+        assert int(state.status) == Code.COMPLETED
+        assert np.abs(state.x - usual.advance(usual.begin(X0), 0.1, 1, 20)[0].x).max() < 1e-14
+    hasty = CompiledEngine(BODY, lt.MetriplecticGauss(1), Rules(large=2, fixed_point=1, newton=1))
+    failed = hasty.step(hasty.begin(X0), 0.1)
+    assert int(failed.status) == Code.NOT_CONVERGED
+    assert np.array_equal(failed.x, X0)
+
+
+def test_what_takes_minutes_to_compile_is_said(monkeypatch):
+    monkeypatch.setattr("liethermo.engines.choice.LARGE_PROGRAM", 2)
+    with pytest.warns(CompiledEngineWarning, match="takes minutes to compile: leave out engine"):
+        lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lt.integrate(BODY, X0, (0.0, 1.0), 0.1)
 
 
 def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
