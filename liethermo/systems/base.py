@@ -26,6 +26,7 @@ from ..functions.frames import frame
 from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
+from ..tracing.remembered import remembered
 from ..tracing.traced import settled
 from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
@@ -33,6 +34,9 @@ from .kinds import Decided, Kind
 
 SCALES = (1.0, 1e-4, 1e4)
 """Scales of the random points at which the system is asked which functions it conserves."""
+
+MANY = 10_000
+"""Components of a state above which one point of each scale is enough."""
 
 AROUND, NEARER = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 """States near which it is asked too, and how near, relative to the size of a state."""
@@ -390,18 +394,22 @@ class System(Kind):
         """What it conserves; with ``declared``, what its dissipation has to preserve unless it is seen not to."""
         if self.decided is not None:
             return self.decided
-        claimed, casimirs = set(self.momentum_maps), self.casimirs()
+        verdicts = _verdicts_anywhere(self) if near is None else self._verdicts(near)
+        if declared:
+            verdicts = verdicts | {name: True for name in self.preserved_names if verdicts.get(name, True) is None}
+        constant = {name for name, verdict in verdicts.items() if verdict}
+        return Decided(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
+
+    def _verdicts(self, near=None) -> dict[str, bool | None]:
+        """Whether it conserves each of its functions: by construction, or at random points."""
+        claimed = set(self.momentum_maps)
         if not self.pushed_by and (self.dissipation is None or self.dissipation.keeps_casimirs):
-            claimed |= set(casimirs)
+            claimed |= set(self.casimirs())
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
             open_ = is_traced(self) or self.pushed_by  # a torque that is zero at some times tells nothing of others
             kept = [False] * len(others) if open_ else self.conserves(tuple(others.values()), near)
-        verdicts = dict(zip(others, kept, strict=True))
-        if declared:
-            verdicts |= {name: True for name in self.preserved_names if verdicts.get(name, True) is None}
-        constant = claimed | {name for name, verdict in verdicts.items() if verdict}
-        return Decided(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
+        return dict.fromkeys(claimed, True) | dict(zip(others, kept, strict=True))
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
         """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""
@@ -430,7 +438,8 @@ class System(Kind):
         if self.is_driven:
             found = [system.conserves(functions, near) for system in self.at_some_times()]
             return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
-        points = np.concatenate([self.samples(4, seed, scale) for seed, scale in enumerate(SCALES)])
+        count = 4 if self.dim <= MANY else 1
+        points = np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(SCALES)])
         if near is not None:
             points = np.concatenate([points, self._around(near)])
         rates, sizes = at_points(_rates_of_change, (self, functions), points)  # shape (points, parts, functions)
@@ -568,6 +577,11 @@ def _first_factors(space: mf.Space) -> mf.Space:
     assert isinstance(space, mf.Product)
     first, *others = space.factors[:-1]
     return mf.Product(first, *others) if others else first
+
+
+@remembered
+def _verdicts_anywhere(system: System) -> dict[str, bool | None]:
+    return system._verdicts()
 
 
 def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):

@@ -30,6 +30,9 @@ LIMIT = 30_000
 PORTION = 1_000
 """Points that are taken at once: values in between stay in fast memory."""
 
+LARGE = 10_000
+"""Components of a point from which it is not tried to unroll a function, and points are taken one after another."""
+
 LIMIT_FOR_DEGREES = 8_000
 """The same for degrees, which are known of whole arrays too, if less sharply."""
 
@@ -50,6 +53,8 @@ def at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
 @remembered
 def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
     """The map from points, shape (m, dim), to :func:`at_points` there, unrolled once."""
+    if dim > LARGE:
+        return lambda points: _by_compiler(function, model, points)
     model = settled(model, function, (dim,))
     leaves, form, rebuild = _parts(model)
     values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
@@ -140,4 +145,8 @@ def _by_compiler(function: Callable, model: Any, points: np.ndarray) -> Any:
 
 @hasty_program
 def _compiled(function, model, points):
-    return jax.vmap(lambda x: function(model, x))(points)
+    def one(x):
+        return function(model, x)
+
+    # products of many large matrices at once are slower than one after another
+    return jax.lax.map(one, points) if points.shape[1] > LARGE else jax.vmap(one)(points)
