@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from benchmarks import child, front, laws, native, page, reference, simulators
 from benchmarks.__main__ import RESULTS, main
@@ -97,7 +98,7 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
 
 
 def test_the_statistics_of_the_magnet():
-    """Autocorrelation and error of a process that is known; where two lattices cross."""
+    """Autocorrelation and error of a process that is known."""
     random, rho, n = np.random.default_rng(0), 0.9, 60_000
     x = random.standard_normal(n)
     for i in range(1, n):
@@ -108,15 +109,42 @@ def test_the_statistics_of_the_magnet():
     mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
-    small, large = [(0.65, 0.001), (0.62, 0.001), (0.58, 0.001)], [(0.66, 0.001), (0.622, 0.001), (0.5, 0.001)]
-    T, error = magnet.crossing((1.3, 1.4, 1.5), small, large)
-    assert abs(T - (1.4 + 0.1 * 0.002 / 0.082)) < 1e-12
-    assert 0.5 < error / (0.1 * 0.001 * np.sqrt(2) / 0.082) < 2.0
-    assert np.isnan(magnet.crossing((1.3, 1.4, 1.5), large, [(0.7, 0.0)] * 3)[0])
 
 
-def _series(rows):
-    return magnet.Series("", 1, 1.0, len(rows), 1, rows)
+def _series(rows, temperature=1.0):
+    return magnet.Series("", 1, temperature, len(rows), 1, rows)
+
+
+def test_where_the_cumulants_of_two_lattices_are_equal():
+    """A double well, whose cumulants are integrals, and vectors in a plane of energy m⁴, where it is 1 - pi / 6."""
+    x, random, n = np.linspace(-4.0, 4.0, 8_001), np.random.default_rng(0), 40_000
+    well = 0.8 * (x**2 - 1.2) ** 2
+
+    def cumulant(T):
+        second, fourth = (float((x**k * np.exp(-well / T)).sum() / np.exp(-well / T).sum()) for k in (2, 4))
+        return 1.0 - fourth / (3.0 * second**2)
+
+    equal = brentq(lambda T: cumulant(T) - (1.0 - np.pi / 6.0), 0.5, 3.0)
+    T = 1.03 * equal
+    below = np.cumsum(np.exp(-well / T))
+    drawn, square = (
+        np.interp(random.random(n), below / below[-1], x),
+        np.abs(np.sqrt(T / 2) * random.standard_normal(n)),
+    )
+    a = _series(np.column_stack([0.8 * (drawn**2 - 1.2) ** 2, drawn, np.zeros((n, 2))]), T)
+    b = _series(np.column_stack([square**2, np.sqrt(square), np.zeros((n, 2))]), T)
+    slopes = (cumulant(T + 1e-3) - cumulant(T - 1e-3)) / 2e-3, 0.0
+    for series, slope, value in zip((a, b), slopes, (cumulant(T), 1.0 - np.pi / 6.0), strict=True):
+        for quantity, exact in (magnet.slope, slope), (magnet.cumulant, value):
+            found, error = magnet.with_error(quantity, series)
+            assert abs(found - exact) < 4 * error < 0.05
+    found, error = magnet.crossing(a, b)
+    assert abs(found - equal) < 4 * error < 0.4 * equal
+    assert np.abs(np.array(magnet.crossing(b, a)) - (found, error)).max() < 1e-12
+    assert magnet.crossings([a, b])[0][1:3] == [found, error]
+    both = magnet.joined([a, b])
+    assert both.steps == 2 * n
+    assert len(both.rows) == len(a.settled().rows) + len(b.settled().rows)
 
 
 @pytest.mark.sampled(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,16 +21,13 @@ UNIVERSAL = 0.6217
 
 RATE, STEP = 2.0, 0.025
 
-SIZES = {6: 50_000, 8: 100_000, 12: 64_000, 16: 70_000}
-"""Steps at the transition, by the number of sites along an edge."""
+SIZES = {6: (50_000,), 8: (100_000,), 12: (64_000,), 16: (70_000,), 24: (60_000, 30_000), 32: (40_000, 28_000)}
+"""Steps of the runs at the transition, by the number of sites along an edge."""
 
-AWAY = {1.30: 0.1, 1.37: 0.1, 1.50: 0.5, 1.60: 0.1}
+AWAY = {1.30: 0.4, 1.37: 0.2, 1.50: 0.5, 1.60: 0.2}
 """Other temperatures, and the share of the steps there, where the spins are less slow."""
 
-PORTION, EVERY, SWEEPS = 2000, 20, {8: 6000, 12: 2500, 16: 1200}
-
-NEAR = (1.37, CRITICAL, 1.50)
-"""Temperatures between which cumulants are taken to be straight, to find where they cross."""
+PORTION, EVERY, SWEEPS = 2000, 20, {8: 6000, 12: 4000, 16: 3000, 24: 2000, 32: 2000}
 
 
 @dataclass(frozen=True)
@@ -58,9 +55,10 @@ class Series:
         return autocorrelation(self.square)
 
     def settled(self) -> Series:
-        """Without the beginning: a twentieth, and no less than eight times the autocorrelation."""
-        skipped = max(len(self.rows) // 20, int(8 * autocorrelation(self.square[len(self.rows) // 10 :])))
-        return Series(self.by, self.length, self.temperature, self.steps, self.between, self.rows[skipped:])
+        """Without the beginning: a twentieth, and eight times the autocorrelation, if that is no more than half."""
+        n = len(self.rows)
+        skipped = max(n // 20, min(n // 2, int(8 * autocorrelation(self.square[n // 10 :]))))
+        return replace(self, rows=self.rows[skipped:])
 
     def blocks(self) -> list[np.ndarray]:
         """Rows in blocks of at least eight autocorrelation times, four to forty of them."""
@@ -101,25 +99,36 @@ def with_error(quantity, series: Series) -> tuple[float, float]:
     return quantity(series, everything), float(np.sqrt((len(blocks) - 1) * np.var(left)))
 
 
-def crossing(temperatures, small, large, draws: int = 2000) -> tuple[float, float]:
-    """Where the cumulants of two lattices are equal, on straight lines between temperatures, and its standard error.
+def slope(series: Series, chosen) -> float:
+    """The derivative of the cumulant by the temperature, from how m² and m⁴ fluctuate with the energy."""
+    energy, square = series.energy[chosen] * series.length**3, series.square[chosen]
+    second, fourth = square.mean(), (square**2).mean()
+    changes = [((x - x.mean()) * energy).mean() / series.temperature**2 for x in (square, square**2)]
+    return float((2.0 * fourth * changes[0] / second - changes[1]) / (3.0 * second**2))
 
-    ``small`` and ``large`` have a cumulant and its error for each temperature; the error of the crossing is found by
-    drawing from these. NaN where the lines do not cross.
+
+def crossing(a: Series, b: Series) -> tuple[float, float]:
+    """Where the cumulants of two lattices are equal, from runs at one temperature, and its standard error.
+
+    Each is a straight line through its value there.
     """
-    (of_small, of_large), random = np.swapaxes([small, large], 1, 2), np.random.default_rng(0)
+    temperature = a.temperature
 
-    def at(a, b) -> float:
-        off = np.asarray(a) - np.asarray(b)
-        changes = np.flatnonzero((off[:-1] < 0.0) & (off[1:] >= 0.0))
-        if not len(changes):
-            return np.nan
-        i = changes[-1]
-        return temperatures[i] - off[i] * (temperatures[i + 1] - temperatures[i]) / (off[i + 1] - off[i])
+    def at(of_a, of_b) -> float:
+        apart = cumulant(a, of_a) - cumulant(b, of_b)
+        return temperature - apart / (slope(a, of_a) - slope(b, of_b))
 
-    drawn = [at(*(random.normal(*values) for values in (of_small, of_large))) for _ in range(draws)]
-    found = np.array(drawn)[np.isfinite(drawn)]
-    return at(of_small[0], of_large[0]), float(found.std()) if len(found) else np.nan
+    whole_a, whole_b = np.arange(len(a.rows)), np.arange(len(b.rows))
+    left_a = [at(np.delete(whole_a, block), whole_b) for block in a.blocks()]
+    left_b = [at(whole_a, np.delete(whole_b, block)) for block in b.blocks()]
+    variance = sum((len(left) - 1) * np.var(left) for left in (left_a, left_b))
+    return at(whole_a, whole_b), float(np.sqrt(variance))
+
+
+def joined(runs: list[Series]) -> Series:
+    """Runs under the same conditions as one, each without its beginning."""
+    rows = np.concatenate([run.settled().rows for run in runs])
+    return replace(runs[0], steps=sum(run.steps for run in runs), rows=rows)
 
 
 def by_noise(length: int, temperature: float, steps: int, seed: int) -> Series:
@@ -147,28 +156,40 @@ NOISE, MONTE_CARLO = "noise", "Monte Carlo"
 
 def run(quick: bool) -> Report:
     """Runs at the transition and on both sides of it, on lattices of several sizes."""
-    found = []
-    sizes = {4: 400, 6: 400} if quick else SIZES
+    runs: list[list[Series]] = []
+    sizes = {4: (1_000,), 6: (1_000, 1_000)} if quick else SIZES
     for seed, (length, steps) in enumerate(sizes.items(), start=21):
-        found.append(by_noise(length, CRITICAL, steps, seed))
+        runs.append([by_noise(length, CRITICAL, count, seed + 1000 * i) for i, count in enumerate(steps)])
         others = enumerate(AWAY.items())
-        found += [by_noise(length, T, int(share * steps), 10 * seed + i) for i, (T, share) in others]
+        runs += [[by_noise(length, T, int(share * steps[0]), 10 * seed + i)] for i, (T, share) in others]
     temperatures = sorted([CRITICAL, *AWAY])
     for length, sweeps in ({4: 200} if quick else SWEEPS).items():
         chains = heat_bath(length, temperatures, sweeps)
-        found += [Series(MONTE_CARLO, length, T, sweeps, 1, rows) for T, rows in zip(temperatures, chains, strict=True)]
-    return report(found)
+        runs += [
+            [Series(MONTE_CARLO, length, T, sweeps, 1, rows)] for T, rows in zip(temperatures, chains, strict=True)
+        ]
+    found = [joined(some) for some in runs]
+    at = [series for series in found if series.by == NOISE and series.temperature == CRITICAL]
+    return report([summary(series) for series in found], crossings(at))
 
 
-def report(found: list[Series]) -> Report:
-    """The table of all runs, and the crossings of those at the transition."""
-    rows, cumulants = [], {}
-    for series in sorted((series.settled() for series in found), key=lambda s: (s.by, s.length, s.temperature)):
-        quantities = [with_error(f, series) for f in (magnetisation, specific_heat, cumulant)]
-        times = series.autocorrelation * series.between
-        rows.append([series.by, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())])
-        if series.by == NOISE:
-            cumulants[series.length, series.temperature] = quantities[2]
+def summary(series: Series) -> list:
+    """A row of the table: what a run has come to, with a standard error each."""
+    quantities = [with_error(f, series) for f in (magnetisation, specific_heat, cumulant)]
+    times = series.autocorrelation * series.between
+    return [series.by, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())]
+
+
+def crossings(found: list[Series]) -> list[list]:
+    """For each two of some lattices: where their cumulants are equal, its error, and how far from the transition."""
+    pairs = itertools.combinations(sorted(found, key=lambda series: series.length), 2)
+    places = [(f"{a.length}³ and {b.length}³", *crossing(a, b)) for a, b in pairs]
+    return [[name, T, error, abs(T / CRITICAL - 1.0)] for name, T, error in places]
+
+
+def report(rows: list[list], crossed: list[list]) -> Report:
+    """The table of all runs, and that of crossings."""
+    rows = sorted(rows, key=lambda row: (row[0], row[1], float(row[2])))
     columns = {"By": "text", "Edge": "count", "kT / J": "text", "Steps or sweeps": "count", "Autocorrelation": "number"}
     for name in ("m", "c", "U"):
         columns |= {name: "precise", f"± of {name}": "error"}
@@ -176,25 +197,20 @@ def report(found: list[Series]) -> Report:
         "Magnetisation m and specific heat c of a spin, Binder's cumulant U, with a standard error each; steps of "
         f"{STEP} with the rate {RATE:g}. The autocorrelation of m² is in steps, or sweeps."
     )
-    lengths = [n for n in sorted({length for length, _ in cumulants}) if all((n, T) in cumulants for T in NEAR)]
-    crossings: list[tuple[str, float, float]] = []
-    for a, b in itertools.combinations(lengths, 2):
-        small, large = ([cumulants[n, T] for T in NEAR] for n in (a, b))
-        crossings.append((f"{a}³ and {b}³", *crossing(NEAR, small, large)))
-    crossed = Table(
+    where = Table(
         "Where Binder's cumulants of two lattices are equal.",
         {"Lattices": "text", "kT / J": "precise", "±": "error", "From the transition": "number"},
-        [[name, T, error, abs(T / CRITICAL - 1.0)] for name, T, error in crossings],
+        crossed,
     )
     text = (
         "The classical Heisenberg magnet on a simple cubic lattice, `lt.models.spin_lattice` in a bath of constant "
         "temperature, beside a heat bath with over-relaxation (Monte Carlo, in NumPy). Errors are those of blocks of "
         f"at least eight autocorrelation times. The transition is at kT = {CRITICAL} J (Chen, Ferrenberg and Landau "
-        f"1993), where U = {UNIVERSAL} of large cubes (Holm and Janke 1993). Between the runs next to it cumulants are "
-        "taken to be straight lines, and the error of a crossing is found by drawing from theirs."
+        f"1993), where U = {UNIVERSAL} of large cubes (Holm and Janke 1993). Near it a cumulant is taken to be a "
+        "straight line; its slope follows from how the magnetisation fluctuates with the energy in the same run."
     )
-    best = min(crossings, key=lambda c: c[2], default=None)
+    best = min(crossed, key=lambda c: c[2], default=None)
     distance = None if best is None else abs(best[1] / CRITICAL - 1.0) + best[2] / CRITICAL
     work = "Binder's crossing with the least error: from the transition, a standard error added"
     targets = [Target(work, 0.01, distance, "number")]
-    return Report("A magnet at its transition", text, [Table(caption, columns, rows), crossed], targets)
+    return Report("A magnet at its transition", text, [Table(caption, columns, rows), where], targets)
