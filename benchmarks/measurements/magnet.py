@@ -21,13 +21,17 @@ UNIVERSAL = 0.6217
 
 RATE, STEP = 2.0, 0.025
 
-SIZES = {6: (50_000,), 8: (100_000,), 12: (64_000,), 16: (70_000,), 24: (60_000, 30_000), 32: (40_000, 28_000)}
+SIZES = {6: (50_000,), 8: (100_000,), 12: (64_000,), 16: (70_000,), 24: (60_000,), 32: (40_000, 28_000)}
 """Steps of the runs at the transition, by the number of sites along an edge."""
 
 AWAY = {1.30: 0.4, 1.37: 0.2, 1.50: 0.5, 1.60: 0.2}
 """Other temperatures, and the share of the steps there, where the spins are less slow."""
 
-PORTION, EVERY, SWEEPS = 2000, 20, {8: 6000, 12: 4000, 16: 3000, 24: 2000, 32: 2000}
+PORTION, EVERY, SWEEPS = 2000, 20, {8: 6000, 12: 4000, 16: 3000, 24: 1200, 32: 800}
+
+
+ENOUGH = 20
+"""Blocks of a run from which the error of a crossing is known: of fewer the slope of a cumulant is too uncertain."""
 
 
 @dataclass(frozen=True)
@@ -181,10 +185,12 @@ def summary(series: Series) -> list:
 
 
 def crossings(found: list[Series]) -> list[list]:
-    """For each two of some lattices: where their cumulants are equal, its error, and how far from the transition."""
-    pairs = itertools.combinations(sorted(found, key=lambda series: series.length), 2)
-    places = [(f"{a.length}³ and {b.length}³", *crossing(a, b)) for a, b in pairs]
-    return [[name, T, error, abs(T / CRITICAL - 1.0)] for name, T, error in places]
+    """For each two of some lattices: where their cumulants are equal, its error, from how many blocks; how far off."""
+    rows = []
+    for a, b in itertools.combinations(sorted(found, key=lambda series: series.length), 2):
+        (T, error), blocks = crossing(a, b), min(len(series.blocks()) for series in (a, b))
+        rows.append([f"{a.length}³ and {b.length}³", T, error, blocks, abs(T / CRITICAL - 1.0)])
+    return rows
 
 
 def report(rows: list[list], crossed: list[list]) -> Report:
@@ -199,7 +205,7 @@ def report(rows: list[list], crossed: list[list]) -> Report:
     )
     where = Table(
         "Where Binder's cumulants of two lattices are equal.",
-        {"Lattices": "text", "kT / J": "precise", "±": "error", "From the transition": "number"},
+        {"Lattices": "text", "kT / J": "precise", "±": "error", "Blocks": "count", "From the transition": "number"},
         crossed,
     )
     text = (
@@ -207,9 +213,11 @@ def report(rows: list[list], crossed: list[list]) -> Report:
         "temperature, beside a heat bath with over-relaxation (Monte Carlo, in NumPy). Errors are those of blocks of "
         f"at least eight autocorrelation times. The transition is at kT = {CRITICAL} J (Chen, Ferrenberg and Landau "
         f"1993), where U = {UNIVERSAL} of large cubes (Holm and Janke 1993). Near it a cumulant is taken to be a "
-        "straight line; its slope follows from how the magnetisation fluctuates with the energy in the same run."
+        "straight line; its slope follows from how the magnetisation fluctuates with the energy in the same run. The "
+        f"error of a crossing is known where each run has {ENOUGH} blocks at least."
     )
-    best = min(crossed, key=lambda c: c[2], default=None)
+    known = [row for row in crossed if row[3] >= ENOUGH]
+    best = min(known, key=lambda row: row[2], default=None)
     distance = None if best is None else abs(best[1] / CRITICAL - 1.0) + best[2] / CRITICAL
     work = "Binder's crossing with the least error: from the transition, a standard error added"
     targets = [Target(work, 0.01, distance, "number")]
