@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 
 from .front import Comparison
 from .report import Table
@@ -70,29 +71,30 @@ def beside(themes: dict[str, list[Comparison]], path: Path) -> None:
 
 
 def magnet(table: Table, path: Path) -> None:
-    """Magnetisation, specific heat and Binder's cumulant against the temperature, a curve for each lattice."""
+    """Magnetisation, specific heat and Binder's cumulant against the temperature: lattices, the smaller the paler."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from .measurements.magnet import CRITICAL, NOISE, UNIVERSAL
+    from .measurements.magnet import CRITICAL, MONTE_CARLO, NOISE, UNIVERSAL
 
     lengths = sorted({row[1] for row in table.rows})
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(1, 3, figsize=(9.0, 3.2), layout="constrained")
-        for colour, length in enumerate(lengths):
-            for by, style in ((NOISE, {"fmt": "o", "ms": 4}), ("Monte Carlo", {"fmt": "-", "lw": 0.8})):
+        colours = plt.get_cmap("viridis_r")(np.linspace(0.1, 1.0, len(lengths)))
+        for colour, length in zip(colours, lengths, strict=True):
+            for by, style in ((NOISE, {"fmt": "o", "ms": 3.5}), (MONTE_CARLO, {"fmt": "-", "lw": 0.8})):
                 rows = [row for row in table.rows if row[0] == by and row[1] == length]
                 for ax, column in zip(axes, (5, 7, 9), strict=True):
                     values, errors = ([row[i] for row in rows] for i in (column, column + 1))
-                    label = f"{length}³, {by}" if rows else None
+                    label = f"{length}³ spins" if by == NOISE and ax is axes[0] else None
                     temperatures = [float(row[2]) for row in rows]
-                    ax.errorbar(temperatures, values, errors, color=f"C{colour}", label=label, **style)
+                    ax.errorbar(temperatures, values, errors, color=colour, label=label, **style)
         for ax, name in zip(axes, ("magnetisation", "specific heat", "Binder's cumulant"), strict=True):
             ax.axvline(CRITICAL, color="0.6", linewidth=0.8, zorder=0)
             ax.set(xlabel="kT / J", ylabel=name)
             ax.spines[["top", "right"]].set_visible(False)
         axes[2].axhline(UNIVERSAL, color="0.6", linewidth=0.8, zorder=0)
-        axes[0].legend(frameon=False, fontsize=7)
+        figure.legend(frameon=False, loc="outside right center")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})
         plt.close(figure)

@@ -35,7 +35,7 @@ from .kinds import Decided, Kind
 SCALES = (1.0, 1e-4, 1e4)
 """Scales of the random points at which the system is asked which functions it conserves."""
 
-MANY = 10_000
+MANY = 2_000
 """Components of a state above which one point of each scale is enough."""
 
 AROUND, NEARER = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)

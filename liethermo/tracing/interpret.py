@@ -30,7 +30,7 @@ LIMIT = 30_000
 PORTION = 1_000
 """Points that are taken at once: values in between stay in fast memory."""
 
-LARGE = 10_000
+LARGE = 2_000
 """Components of a point from which it is not tried to unroll a function, and points are taken one after another."""
 
 LIMIT_FOR_DEGREES = 8_000
