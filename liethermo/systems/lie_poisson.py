@@ -19,6 +19,7 @@ from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
+from ..tracing.interpret import at_points
 from ..tracing.remembered import remembered
 from .base import TIMES, System
 from .baths import EntropyOfBaths, HeatBaths
@@ -268,13 +269,16 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
 @remembered
 def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
     """The moments of inertia of a body with a quadratic energy of its momenta; None where it is no kinetic one."""
-    still = jnp.zeros(dim)
-    squares = np.asarray(jax.jacfwd(energy.gradient)(still))  # its inverse is that of the parts moving freely
-    if np.linalg.eigvalsh(squares)[0] <= 0.0 or np.asarray(energy.gradient(still)).any():
+    (gradient,), (squares,) = at_points(_gradient_and_squares, energy, np.zeros((1, dim)))
+    if np.linalg.eigvalsh(squares)[0] <= 0.0 or gradient.any():  # its inverse is that of the parts moving freely
         return None
     found = np.linalg.inv(squares)[:3, :3]
     found.flags.writeable = False  # it is remembered
     return found
+
+
+def _gradient_and_squares(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
+    return energy.gradient(x), jax.jacfwd(energy.gradient)(x)
 
 
 @functools.lru_cache(maxsize=64)
