@@ -127,10 +127,8 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
     equal = brentq(lambda T: cumulant(T) - (1.0 - np.pi / 6.0), 0.5, 3.0)
     T = 1.03 * equal
     below = np.cumsum(np.exp(-well / T))
-    drawn, square = (
-        np.interp(random.random(n), below / below[-1], x),
-        np.abs(np.sqrt(T / 2) * random.standard_normal(n)),
-    )
+    drawn = np.interp(random.random(n), below / below[-1], x)
+    square = np.abs(np.sqrt(T / 2) * random.standard_normal(n))
     a = _series(np.column_stack([0.8 * (drawn**2 - 1.2) ** 2, drawn, np.zeros((n, 2))]), T)
     b = _series(np.column_stack([square**2, np.sqrt(square), np.zeros((n, 2))]), T)
     slopes = (cumulant(T + 1e-3) - cumulant(T - 1e-3)) / 2e-3, 0.0

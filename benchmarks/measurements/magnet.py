@@ -58,6 +58,11 @@ class Series:
         """The integrated time of m², in rows, up to a window of six of it [Sokal 1997]."""
         return autocorrelation(self.square)
 
+    @property
+    def everything(self) -> np.ndarray:
+        """The places of all rows."""
+        return np.arange(len(self.rows))
+
     def settled(self) -> Series:
         """Without the beginning: a twentieth, and eight times the autocorrelation, if that is no more than half."""
         n = len(self.rows)
@@ -66,8 +71,8 @@ class Series:
 
     def blocks(self) -> list[np.ndarray]:
         """Rows in blocks of at least eight autocorrelation times, four to forty of them."""
-        n = len(self.rows)
-        return np.array_split(np.arange(n), int(np.clip(n / (8 * self.autocorrelation), 4, 40)))
+        count = int(np.clip(len(self.rows) / (8 * self.autocorrelation), 4, 40))
+        return np.array_split(self.everything, count)
 
 
 def autocorrelation(x: np.ndarray) -> float:
@@ -98,9 +103,15 @@ def cumulant(series: Series, chosen) -> float:
 
 def with_error(quantity, series: Series) -> tuple[float, float]:
     """A quantity and its standard error, from the blocks left out one after another."""
-    blocks, everything = series.blocks(), np.arange(len(series.rows))
-    left = [quantity(series, np.delete(everything, block)) for block in blocks]
-    return quantity(series, everything), float(np.sqrt((len(blocks) - 1) * np.var(left)))
+    return quantity(series, series.everything), float(
+        np.sqrt(variance(lambda chosen: quantity(series, chosen), series))
+    )
+
+
+def variance(quantity, series: Series) -> float:
+    """That of a function of the chosen rows of a series, from the blocks left out one after another."""
+    left = [quantity(np.delete(series.everything, block)) for block in series.blocks()]
+    return float((len(left) - 1) * np.var(left))
 
 
 def slope(series: Series, chosen) -> float:
@@ -122,11 +133,9 @@ def crossing(a: Series, b: Series) -> tuple[float, float]:
         apart = cumulant(a, of_a) - cumulant(b, of_b)
         return temperature - apart / (slope(a, of_a) - slope(b, of_b))
 
-    whole_a, whole_b = np.arange(len(a.rows)), np.arange(len(b.rows))
-    left_a = [at(np.delete(whole_a, block), whole_b) for block in a.blocks()]
-    left_b = [at(whole_a, np.delete(whole_b, block)) for block in b.blocks()]
-    variance = sum((len(left) - 1) * np.var(left) for left in (left_a, left_b))
-    return at(whole_a, whole_b), float(np.sqrt(variance))
+    by_a = variance(lambda of_a: at(of_a, b.everything), a)
+    by_b = variance(lambda of_b: at(a.everything, of_b), b)
+    return at(a.everything, b.everything), float(np.sqrt(by_a + by_b))
 
 
 def joined(runs: list[Series]) -> Series:

@@ -53,10 +53,10 @@ class _Step(eqx.Module):
         """System, method, state and slopes that a row says."""
         leaves, structure = jax.tree_util.tree_flatten(self.given)
         *own, x = leaves
-        _, rest = ravel_pytree([leaf for leaf, moving in zip(own, self.moves, strict=False) if moving])
+        _, rest = ravel_pytree([leaf for leaf, moving in zip(own, self.moves[:-1], strict=True) if moving])
         n, m = np.size(x), self.stages[0] * self.stages[1]
         moved = iter(rest(z[n : len(z) - m]))
-        own = [next(moved) if moving else leaf for leaf, moving in zip(own, self.moves, strict=False)]
+        own = [next(moved) if moving else leaf for leaf, moving in zip(own, self.moves[:-1], strict=True)]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*own, x])
         return system, method, z[:n], z[len(z) - m :].reshape(self.stages)
 
@@ -72,7 +72,6 @@ def _along(step: _Step, point) -> jax.Array:
 
     The row of a set of directions has the bits of its number set at their places.
     """
-
     n = np.size(step.given[-1])
     h, compensation, rows = point[0], point[1 : 1 + n], point[1 + n :].reshape(2**step.order, -1)
 
