@@ -144,6 +144,10 @@ class OneStepMethod(Module):
             return casimir and quadratic and by_force
         return casimir and "casimirs" in self.preserves
 
+    def asked_to_preserve(self, system: System) -> tuple[Energy, ...]:
+        """Functions of the states of a system that its user has asked the method to preserve."""
+        return ()
+
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         """The method as it runs on a system: itself on R^n, in the charts of a retraction on a manifold.
 

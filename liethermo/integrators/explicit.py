@@ -152,6 +152,9 @@ class ExplicitMethod(TransportingMethod):
             )
         return method
 
+    def asked_to_preserve(self, system: System) -> tuple[Energy, ...]:
+        return tuple(seen_on(system, C) for C in self.functions)
+
     def _with(self, change: Callable, held: tuple[str, ...]) -> Self:
         """The method with its preserved functions changed, holding these of the system."""
         return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)

@@ -36,7 +36,7 @@ from .base import (
 )
 from .charts import in_charts
 from .composed_entropy import composed_gradients
-from .preserved import check_preserved, preserved_functions, seen_on
+from .preserved import check_preserved, is_momentum_map, preserved_functions, seen_on, share_moved
 from .tableaus import finer, gauss
 
 
@@ -127,9 +127,13 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         held = tuple(sorted(name for name in system.first_integrals() if self._holds(system, name)))
         method = self._with(lambda C: seen_on(system, C), held)
         if self.functions and not is_traced((system, method)):
-            moved = at_points(_share_moved, (system, method.functions), system.samples(4)).max(axis=0)
-            method = method._with(lambda C: C, held, tuple(int(i) for i in np.flatnonzero(moved > STILL)))
+            shares = at_points(share_moved, (system, method.functions), system.samples(4))
+            moving = tuple(int(i) for i in np.flatnonzero(is_momentum_map(shares)))
+            method = method._with(lambda C: C, held, moving)
         return in_charts(method, system, self.retraction, "exp")
+
+    def asked_to_preserve(self, system: System) -> tuple[Energy, ...]:
+        return tuple(seen_on(system, C) for C in self.functions)
 
     def _with(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
         """The method with its preserved functions changed, holding these of the system."""
@@ -330,9 +334,6 @@ class Gradients(NamedTuple):
 
 ENTROPY = "the entropy"
 
-STILL = 1e-10
-"""Largest ``|Pi grad C|``, relative to what Pi does to other covectors, of a function that is a Casimir."""
-
 
 def _made_of(system: System) -> dict[str, Energy]:
     """What the entropy is a function of, by name: Casimirs where all are known and that helps, itself otherwise."""
@@ -355,19 +356,6 @@ def _projector(system: System, u, gradients: list[Gradients], within: int | None
 
     pairs = [(raised(g.discrete), raised(g.plain)) for g in gradients]
     return frame([d for d, _ in pairs], like=[p for _, p in pairs]).off
-
-
-def _share_moved(model: tuple[System, tuple[Energy, ...]], x):
-    """``|Pi grad C|`` of each function, relative to what Pi makes of another covector of that size."""
-    system, functions = model
-    system = system.here(x)
-    found = []
-    for C in functions:
-        gradient, random = C.gradient(x), jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))
-        size = jnp.linalg.norm(gradient) * jnp.linalg.norm(system.poisson.sharp(x, random)) / jnp.linalg.norm(random)
-        moved = jnp.linalg.norm(system.poisson.sharp(x, gradient))
-        found.append(jnp.where(size > 0.0, moved / jnp.where(size > 0.0, size, 1.0), 0.0))
-    return jnp.nan_to_num(jnp.stack(found))
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
 from ..functions.energy import Energy, as_energy
@@ -29,8 +33,35 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
     """
     for C, kept in zip(functions, system.conserves(tuple(functions)), strict=True):
         if kept is False:
-            name = getattr(getattr(C, "function", None), "__name__", str(C))
-            raise InputError(
-                f"the system does not conserve the preserved function {name}: holding it would change the "
-                "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"
-            )
+            raise InputError(why_not_preserved(C))
+
+
+def why_not_preserved(C: Energy) -> str:
+    """Return the message for a function that a system does not conserve."""
+    name = getattr(getattr(C, "function", None), "__name__", str(C))
+    return (
+        f"the system does not conserve the preserved function {name}: holding it would change the "
+        "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"
+    )
+
+
+MAX_CASIMIR_SHARE = 1e-10
+"""Largest ``|Pi grad C|``, relative to what Pi does to other covectors, of a function that is a Casimir."""
+
+
+def share_moved(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
+    """Return ``|Pi grad C|`` of each function at x, relative to ``|Pi v|`` of another covector v of that length."""
+    system, functions = model
+    system = system.here(x)
+    shares = []
+    for C in functions:
+        gradient, random = C.gradient(x), jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))
+        size = jnp.linalg.norm(gradient) * jnp.linalg.norm(system.poisson.sharp(x, random)) / jnp.linalg.norm(random)
+        moved = jnp.linalg.norm(system.poisson.sharp(x, gradient))
+        shares.append(jnp.where(size > 0.0, moved / jnp.where(size > 0.0, size, 1.0), 0.0))
+    return jnp.nan_to_num(jnp.stack(shares))
+
+
+def is_momentum_map(shares: np.ndarray) -> np.ndarray:
+    """Return which functions are no Casimirs, from :func:`share_moved` at points: (..., points, functions)."""
+    return shares.max(axis=-2) > MAX_CASIMIR_SHARE

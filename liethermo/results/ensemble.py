@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from manifolds._tables import html_grid
 from ..engines.codes import TEXTS, Code
 from ..errors import InputError
 from .audit import FAILED, Audit, AuditRow, Tolerances, accuracy_row, coverage_of
-from .evidence import Evidence, Recorded
+from .evidence import Evidence, Recorded, worst_evidence
 from .files import ENSEMBLE_FORMAT, as_parts, checked, described, from_parts, places, series_of
 from .many import laws_of_many
 from .solution import Solution
@@ -394,3 +394,75 @@ NUMBERS = tuple(
 
 NEEDED = ("energy", "x0", *NUMBERS)
 """What every ensemble has."""
+
+STATES = ("x", "x0", "attitude", "attitude0")
+"""The arrays of states, trajectories first."""
+
+
+class Part(NamedTuple):
+    """Some trajectories of an ensemble.
+
+    Attributes
+    ----------
+    run : array of int
+        Their numbers in the whole ensemble, increasing.
+    ensemble : Ensemble
+    """
+
+    run: np.ndarray
+    ensemble: Ensemble
+
+
+def joined(parts: Sequence[Part], size: int, **fields: Any) -> Ensemble:
+    """Return the ensemble of all trajectories; those in no part are inadmissible.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        At least one.
+    size : int
+        The number of trajectories.
+    fields
+        The attributes ``reasons``, ``wall_time`` and ``provenance`` of the result.
+    """
+    ensembles = [part.ensemble for part in parts]
+    first = ensembles[0]
+    engine = " and ".join(sorted({e.engine for e in ensembles}))
+    fields["provenance"] = {**fields["provenance"], "engine": engine}
+    if len(ensembles) == 1 and len(first) == size:
+        return replace(first, **fields)
+
+    def placed(name: str) -> np.ndarray | None:
+        values = getattr(first, name)
+        if values is None:
+            return None
+        empty = {"status": Code.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
+        whole = np.full((size, *values.shape[1:]), empty, dtype=values.dtype)
+        for part, ensemble in zip(parts, ensembles, strict=True):
+            whole[part.run] = getattr(ensemble, name)
+        return whole
+
+    def alone(many: Ensemble, i: int) -> Solution:
+        part = next(part for part in parts if i in part.run)
+        assert part.ensemble.alone is not None
+        return part.ensemble.alone(many, i)
+
+    witnesses = [e.witness for e in ensembles]
+    conserved = [set(e.laws.conserved) for e in ensembles]
+    promised = set.intersection(*conserved)
+    others = [name for e in ensembles for name in (*e.laws.conserved, *e.laws.unpromised) if name not in promised]
+    laws = replace(
+        first.laws,
+        conserved=tuple(name for name in first.laws.conserved if name in promised),
+        unpromised=tuple(dict.fromkeys(others)),
+    )
+    whole: dict[str, Any] = {name: placed(name) for name in (*STATES, *SERIES, *NUMBERS)}
+    return replace(
+        first,
+        **whole,
+        laws=laws,
+        engine=engine,
+        witness=None if None in witnesses else lambda: worst_evidence([w() for w in witnesses if w is not None]),
+        alone=alone,
+        **fields,
+    )

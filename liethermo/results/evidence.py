@@ -96,6 +96,19 @@ class Evidence:
             raise InputError("the largest local error of a step is known with its time, or not at all")
 
 
+def worst_evidence(parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence of several sets of runs together: the largest of each number."""
+    names = dict.fromkeys(name for part in parts for name in part.terms)
+    terms = {name: max(part.terms.get(name, 0.0) for part in parts) for name in names}
+    measured = [part for part in parts if part.local_error is not None]
+    if not measured:
+        return Evidence(terms=terms)
+    errors = [np.inf if part.local_error is None else np.nan_to_num(part.local_error, nan=np.inf) for part in measured]
+    worst = measured[int(np.argmax(errors))]
+    looked = sum(part.looked or 0 for part in measured)
+    return dataclasses.replace(worst, terms=terms, looked=looked)
+
+
 class Recorded(Saved):
     """A result with the evidence for its audit, or what finds that."""
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from manifolds._precision import by_own_settings
 
 from ..engines.choice import is_small, warn_of_fallback
+from ..engines.codes import Code
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
-from ..results.ensemble import Ensemble
+from ..results.ensemble import Ensemble, Part, joined
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, pacing_of
@@ -22,12 +24,13 @@ from .batches import THREADS, Tally, follow_array, follow_compiled, run_array, r
 from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
+from .member_groups import common_inertia, groups_of, outside_own_domain
 from .paced import Many
 from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
-from .timetable import course_of
+from .timetable import Course, course_of
 
 __all__ = ["THREADS", "Ensemble", "ensemble"]
 
@@ -134,69 +137,130 @@ def ensemble(
     if reasons:
         run = np.setdiff1d(run, list(reasons))
         family, states = family.select(run), states[run]
-    given = member = decided(family.representative, states)
-    one_body = _same_inertia(family, member)
-    member, method = as_run(member, method, noise, step.tolerance if isinstance(step, Adaptive) else None)
-    attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
-    family, states = as_family(family, member), np.asarray(begun(member, states, course.start, attitude, batch=True))
-    method.check(member)
-    if off := _off(family, member, method, states):
-        reasons = dict(reasons) | {int(run[i]): text for i, text in off.items()}
-        if len(off) == len(run):
-            raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
-        kept = np.setdiff1d(np.arange(len(run)), list(off))
-        run, family, states = run[kept], family.select(kept), states[kept]
-    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
-    record = Record(family, member, states, course, outputs, np.nan if isinstance(step, Adaptive) else course.h)
-    event = None if until is None else Event(until, member)
-    pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
-
-    def take(engine: str, tally: Tally) -> None:
-        if pacing is not None:
-            many = Many(family, method, pacing, record, tally)
-            (many.run_compiled if engine == "compiled" else many.run_array)()
-        else:
-            (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)
-
-    small = engine == "auto" and is_small(member)
-    chosen = "compiled" if engine == "compiled" or small else "array"
+    plan = _Plan(method, step, course, outputs, engine, until, noise)
+    described = provenance_of(
+        family.representative,
+        method,
+        step if isinstance(step, Adaptive) else course.h,
+        (course.start, course.end),
+        course.every,
+    )
+    inertia = common_inertia(family)
+    described["inertia"] = None if inertia is None else inertia.tolist()
+    groups, refused = groups_of(family, method, states)
+    reasons = dict(reasons) | {int(run[i]): text for i, text in refused.items()}
+    parts: list[Part] = []
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
+        for places, group in groups:
+            own = np.asarray(attitude)[run[places]] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
+            done = sum(len(part.run) for part in parts)
+            stopped = any((part.ensemble.status == Code.INTERRUPTED).any() for part in parts)
+            bar_of_group = functools.partial(_advance, bar, done)
+            part, why = plan.run(group, states[places], run[places], own, bar_of_group, stopped)
+            parts += [] if part is None else [part]
+            reasons |= why
+    if not parts:
+        raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
+    return joined(
+        parts,
+        size,
+        reasons=reasons,
+        wall_time=time.perf_counter() - started,
+        provenance={**described, "noise": None if noise is None else noise.listed()},
+    )
+
+
+def _advance(bar: Progress, done: int, more: float) -> None:
+    bar.update(done + more)
+
+
+class _Plan(NamedTuple):
+    """What is done with each trajectory: the arguments of :func:`ensemble`."""
+
+    method: OneStepMethod
+    step: float | Adaptive
+    course: Course
+    outputs: str
+    engine: str
+    until: Any
+    noise: Fluctuations | None
+
+    def run(
+        self,
+        family: Family,
+        states: np.ndarray,
+        run: np.ndarray,
+        attitude,
+        tell: Callable[[float], None],
+        stopped: bool,
+    ) -> tuple[Part | None, dict[int, str]]:
+        """Run the members of a group from their initial states; None if none can be started.
+
+        The second result says why trajectories could not be started, or have failed, by their numbers.
+
+        Parameters
+        ----------
+        states : array, shape (B, n)
+        run : array of int, shape (B,)
+            The numbers of the trajectories in the ensemble.
+        attitude : array, shape (m, m) or (B, m, m), or None
+        tell : function
+            Called with the number of trajectories that are done.
+        stopped : bool
+            Whether the user has interrupted the ensemble before: no step is taken then.
+        """
+        step, course, noise = self.step, self.course, self.noise
+        member = decided(family.member(0), states)
+        tolerance = step.tolerance if isinstance(step, Adaptive) else None
+        member, method = as_run(member, self.method, noise, tolerance)
+        family = as_family(family, member)
+        states = np.asarray(begun(member, states, course.start, attitude, batch=True))
+        method.check(member)
+        reasons = {int(run[i]): text for i, text in _off(family, member, method, states).items()}
+        if reasons:
+            left = np.flatnonzero(~np.isin(run, list(reasons)))
+            run, family, states = run[left], family.select(left), states[left]
+            if not len(run):
+                return None, reasons
+        paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
+        record = Record(family, member, states, course, self.outputs, np.nan if tolerance is not None else course.h)
+        event = None if self.until is None else Event(self.until, member)
+        own_ends = tolerance is not None or event is not None
+        pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
+
+        def take(engine: str, tally: Tally) -> None:
+            if stopped:
+                return
+            if pacing is not None:
+                many = Many(family, method, pacing, record, tally)
+                (many.run_compiled if engine == "compiled" else many.run_array)()
+            else:
+                (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)
+
+        small = self.engine == "auto" and is_small(member)
+        chosen = "compiled" if self.engine == "compiled" or small else "array"
         if chosen == "compiled":
             try:
-                take(chosen, Tally(bar.update))
+                take(chosen, Tally(tell))
             except UnsupportedPrimitive as error:
-                if engine == "compiled":
+                if self.engine == "compiled":
                     raise
                 warn_of_fallback(error)
                 chosen = "array"
         if chosen == "array":
-            take(chosen, Tally(bar.update))
-    record.close()
-    reasons = dict(reasons) | {int(run[j]): text for j, text in record.reasons.items()}
-    again, most = (follow_compiled, course.steps) if chosen == "compiled" else (follow_array, FOLLOWED)
-    followed = Followed(record, method, again, 1 if isinstance(step, Adaptive) else min(course.parts[0].full, most))
-    return record.result(
-        run,
-        size,
-        reasons=reasons,
-        laws=laws_of(member, method, {}),
-        engine=chosen,
-        wall_time=time.perf_counter() - started,
-        provenance={
-            **provenance_of(
-                given,
-                method,
-                step if isinstance(step, Adaptive) else course.h,
-                (course.start, course.end),
-                course.every,
-            ),
-            **({} if one_body else {"inertia": None}),
-            "engine": chosen,
-            "noise": None if noise is None else noise.listed(),
-        },
-        witness=None if noise_dimension(method) else followed,
-        alone=Alone(record, method, run),
-    )
+            take(chosen, Tally(tell))
+        record.close()
+        again, most = (follow_compiled, course.steps) if chosen == "compiled" else (follow_array, FOLLOWED)
+        equal = 1 if tolerance is not None else min(course.parts[0].full, most)
+        found = record.result(
+            reasons={},
+            laws=laws_of(member, method, {}),
+            engine=chosen,
+            wall_time=0.0,
+            witness=None if noise_dimension(method) else Followed(record, method, again, equal),
+            alone=Alone(record, method, run),
+        )
+        return Part(run, found), reasons | {int(run[j]): text for j, text in record.reasons.items()}
 
 
 def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
@@ -227,10 +291,11 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
 
 def _off(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
     """The trajectories, as they are run, whose first states the method cannot start at, and why."""
-    found = _by_halves(lambda part: no_start(member, method, states[part]), len(states))
-    if family.size == 1:
-        return found
-    own = {i: no_start(family.member(i), method, states[i]) for i in {*found, *family.extremes()}}
+    reasons = _by_halves(lambda part: no_start(member, method, states[part]), len(states))
+    if not any(family.varying):
+        return reasons
+    suspects = {*reasons, *family.extremes(), *outside_own_domain(family, states)}
+    own = {i: no_start(family.member(i), method, states[i]) for i in sorted(suspects)}
     return {i: text for i, text in own.items() if text}
 
 
@@ -249,15 +314,6 @@ def _by_halves(complaint: Callable[[slice], str], size: int) -> dict[int, str]:
     for first in range(0, size, LOOKED_AT):
         look(first, min(first + LOOKED_AT, size))
     return found
-
-
-def _same_inertia(family: Family, member: System) -> bool:
-    """Whether all members have the inertia of this one, by those with the smallest and largest parameters."""
-    inertia = member.inertia
-    if inertia is None or family.alike is not None:
-        return True
-    others = (family.member(i).inertia for i in family.extremes())
-    return all(other is not None and np.array_equal(other, inertia) for other in others)
 
 
 def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:

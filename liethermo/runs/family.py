@@ -39,12 +39,15 @@ class Family:
     alike : System, optional
         The one system that all members are: what has been found for it once need not be found again.
     example : System, optional
-        The member that stands for all where one is looked at, for whoever has checked the members. Which functions a
-        method preserves, for one, is then the same for every part of a family.
+        The member that is shown for all, such as in what is said of where results come from, for whoever has checked
+        the members. Nothing of a run is decided by it: see :mod:`liethermo.runs.member_groups`.
     given : int
         How many of the values, the first ones, are what a function that builds systems is given.
     refused : dict from int to str
         Members that cannot be built, and why.
+    varying : tuple of bool
+        Which of the values differ between members, so that they have one row for each. By default those that have more
+        than one row; a selection of one member keeps what it was selected from, and is run by the same program.
     """
 
     form: Form
@@ -53,6 +56,12 @@ class Family:
     example: System | None = None
     given: int = 0
     refused: Mapping[int, str] = field(default_factory=dict)
+    varying: tuple[bool, ...] = ()
+
+    def __post_init__(self):
+        if len(self.varying) != len(self.values):
+            known = (*self.varying, *(len(value) > 1 for value in self.values[len(self.varying) :]))
+            object.__setattr__(self, "varying", known[: len(self.values)])
 
     @classmethod
     def of(cls, system, parameters) -> Family:
@@ -143,31 +152,42 @@ class Family:
 
     def with_values(self, given: list[np.ndarray]) -> Family:
         """The family of the same form whose members are built from other values."""
-        return replace(self, values=[*given, *self.values[self.given :]])
+        return replace(self, values=[*given, *self.values[self.given :]], varying=())
 
     def through(self, change: Callable[..., System], *fixed: Hashable) -> Family:
         """The family of what a function, one that has an identity, makes of the members, with these arguments."""
         form = self.form
         key = form.key, change, fixed
-        return Family(Form(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *fixed)), self.values)
+        changed = Form(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *fixed))
+        return Family(changed, self.values, varying=self.varying)
+
+    def known(self, tell: Callable[..., System], *fixed: Hashable) -> Family:
+        """The same family, of whose members a function tells more."""
+        if self.alike is not None:
+            return Family.of(tell(self.alike, *fixed), None)
+        return self.through(tell, *fixed)
 
     # -- members --------------------------------------------------------------------------------------------------
 
     @property
     def size(self) -> int:
         """How many members there are."""
-        return common_size(*map(len, self.values))
+        return common_size(*(len(value) for value, varies in self._columns if varies))
 
     def arrays(self, i: int) -> list[jax.Array]:
         """The parameters of one member."""
-        return [jnp.asarray(value[i if len(value) > 1 else 0]) for value in self.values]
+        return [jnp.asarray(value[i if varies else 0]) for value, varies in self._columns]
+
+    @property
+    def _columns(self) -> list[tuple[np.ndarray, bool]]:
+        return list(zip(self.values, self.varying, strict=True))
 
     def member(self, i: int) -> System:
         return self.form.rebuild(self.arrays(i)) if self.alike is None else self.alike
 
     @property
     def representative(self) -> System:
-        """The member that is looked at for all: an example where there is one, the first otherwise."""
+        """The member that is shown for all: an example where there is one, the first otherwise."""
         return self.member(0) if self.example is None else self.example
 
     def extremes(self) -> list[int]:
@@ -226,7 +246,7 @@ class Family:
 
     def select(self, chosen: np.ndarray) -> Family:
         """The family of some members."""
-        values = [value[chosen] if len(value) > 1 else value for value in self.values]
+        values = [value[chosen] if varies else value for value, varies in self._columns]
         return replace(self, values=values, refused={})
 
     # -- as the engines take them -----------------------------------------------------------------------------------
@@ -234,19 +254,18 @@ class Family:
     @property
     def varies(self) -> np.ndarray:
         """Which parameters differ, shape (p,), all arrays one after another."""
-        return np.concatenate([np.zeros(0, bool), *(np.full(value[0].size, len(value) > 1) for value in self.values)])
+        return np.concatenate([np.zeros(0, bool), *(np.full(value[0].size, varies) for value, varies in self._columns)])
 
     def flat(self, chosen: slice | np.ndarray, number: int) -> np.ndarray:
         """The parameters of some members, shape (number, p)."""
-        rows = [value[chosen] if len(value) > 1 else value for value in self.values]
+        rows = [value[chosen] if varies else value for value, varies in self._columns]
         columns = [np.broadcast_to(row.reshape(len(row), -1), (number, row[0].size)) for row in rows]
         return np.concatenate([np.zeros((number, 0)), *columns], axis=1)
 
     def batched(self, chosen: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
         """The parameters of some members, in front where they differ, and the axes for ``vmap``."""
-        differ = [len(value) > 1 for value in self.values]
-        arrays = [jnp.asarray(value[chosen] if d else value[0]) for value, d in zip(self.values, differ, strict=True)]
-        return arrays, [0 if d else None for d in differ]
+        arrays = [jnp.asarray(value[chosen] if varies else value[0]) for value, varies in self._columns]
+        return arrays, [0 if varies else None for varies in self.varying]
 
 
 def common_size(*sizes: int) -> int:

@@ -158,41 +158,32 @@ class Record:
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
-    def result(self, run: np.ndarray, size: int, **fields: Any) -> Ensemble:
-        """All trajectories, ``run`` being the places of those that were, and the others' reasons among the fields."""
-
-        def placed(values, empty: Any = np.nan):
-            if values is None or len(run) == size:
-                return values
-            whole = np.full((size, *values.shape[1:]), empty, dtype=values.dtype)
-            whole[run] = values
-            return whole
-
-        rows = {name: placed(values) for name, values in self.rows.items() if name not in ("distance", "first_step")}
+    def result(self, **fields: Any) -> Ensemble:
+        """All trajectories that were run."""
+        rows: dict[str, Any] = {n: values for n, values in self.rows.items() if n not in ("distance", "first_step")}
         x, energy, entropy, t = self.x, rows.pop("energy"), rows.pop("entropy"), self.times[-1:]
         if self.path is not None:
-            x, energy, entropy = self.path[..., :-2], placed(self.path[..., -2]), placed(self.path[..., -1])
-            t = self.times
+            x, energy, entropy, t = self.path[..., :-2], self.path[..., -2], self.path[..., -1], self.times
         x0, attitude, attitude0, work = self.x0, None, None, None
         if isinstance(self.member, AttitudeSystem):
             x0, attitude0 = map(np.asarray, self.member.split(x0))
             if x is not None:
                 x, attitude = map(np.asarray, self.member.split(x))
         if (driven := driven_part(self.member)) is not None:
-            work = placed(self.work if self.path is None else np.asarray(driven.work(x)))
+            work = self.work if self.path is None else np.asarray(driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
         found = Ensemble(
             t=t,
-            x=placed(x),
+            x=x,
             energy=energy,
             entropy=None if self.member.entropy is None else entropy,
-            status=placed(self.status, Code.INADMISSIBLE),
-            steps=placed(self.steps, 0),
-            iterations=placed(self.iterations, 0),
-            rejected=placed(self.rejected, 0),
-            x0=placed(x0),
-            attitude=placed(attitude),
-            attitude0=placed(attitude0),
+            status=self.status,
+            steps=self.steps,
+            iterations=self.iterations,
+            rejected=self.rejected,
+            x0=x0,
+            attitude=attitude,
+            attitude0=attitude0,
             work=work,
             **rows,
             **fields,

@@ -75,8 +75,10 @@ def builder(build: System | Callable[[dict], System], parameters: tuple[str, ...
     leaves = {jax.tree_util.keystr(path).removeprefix("."): np.shape(leaf) for path, leaf in paths}
     places = {}
     for name in parameters:
-        entry = re.fullmatch(r"(.+?)((?:\[\d+\])+)", name)
-        whole, index = (name, ()) if name in leaves or entry is None else (entry[1], _index(entry[2]))
+        # the name of a leaf may end with an index too, such as numbers[0]
+        entries = (re.fullmatch(re.escape(leaf) + r"((?:\[\d+\])*)", name) for leaf in leaves)
+        matches = {entry.string[: entry.start(1)]: _index(entry[1]) for entry in entries if entry is not None}
+        whole, index = next(((w, i) for w, i in matches.items() if len(i) == len(leaves[w])), (name, ()))
         if whole not in leaves or len(index) != len(leaves[whole]) or any(map(int.__ge__, index, leaves[whole])):
             known = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
             raise InputError(f"the system has no parameter {name!r} that is one number; it has {known}")

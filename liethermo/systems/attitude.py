@@ -141,6 +141,9 @@ class AttitudeSystem(System):
     def outside(self, x) -> str:
         return self.body.outside(self.points(x))
 
+    def domain_margin(self, x):
+        return self.body.domain_margin(self.points(x))
+
     def singular(self, x) -> str:
         return self.body.singular(self.points(x))
 

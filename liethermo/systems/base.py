@@ -22,7 +22,6 @@ from ..dissipation.heating import heated
 from ..errors import AxiomError, CasimirError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
 from ..functions.energy import Energy, as_energy
-from ..functions.frames import frame
 from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
@@ -30,6 +29,7 @@ from ..tracing.remembered import remembered
 from ..tracing.traced import settled
 from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
+from .conservation import is_proportional, judge, rates_of_change
 from .kinds import Decided, Kind
 
 SCALES = (1.0, 1e-4, 1e4)
@@ -345,17 +345,33 @@ class System(Kind):
 
     def _preserved_names(self) -> tuple[str, ...]:
         """What is preserved, by the name of the momentum map or Casimir it is a multiple of, or by one of its own."""
-        known = self.momentum_maps | self.casimirs()
-        functions = (*known.values(), *self.preserved)
-        points = np.concatenate([self.samples(2, seed, scale) for seed, scale in enumerate(SCALES)])
-        gradients = at_points(gradients_of, functions, points)  # shape (points, functions, n)
-        names, taken = list(known), {"energy", "entropy"}
-        for i, (fallback, L) in enumerate(self.preserved_by_name().items(), start=len(known)):
-            same = next((names[j] for j in range(i) if _proportional(gradients[:, i], gradients[:, j])), None)
-            given = getattr(getattr(L, "function", None), "__name__", "")
-            usable = given.isidentifier() and given not in {*names, *taken}
-            names.append(same or (given if usable else fallback))
-        return tuple(names[len(known) :])
+        functions = self.nameable()
+        gradients = at_points(gradients_of, functions, self.test_states(2))  # shape (points, functions, n)
+        return self.names_of_preserved(first_multiples(gradients, len(self.preserved)).tolist())
+
+    def nameable(self) -> tuple[Energy, ...]:
+        """Momentum maps and Casimirs, then what is preserved, which has the name of one of them if it is a multiple."""
+        return (*(self.momentum_maps | self.casimirs()).values(), *self.preserved)
+
+    def test_states(self, count: int) -> np.ndarray:
+        """Random states at which functions are compared, shape (states, n), ``count`` of each of :data:`SCALES`."""
+        return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(SCALES)])
+
+    def names_of_preserved(self, multiples: Sequence[int]) -> tuple[str, ...]:
+        """The name of each of :attr:`preserved`: that of the function of which it is a multiple, or one of its own.
+
+        Parameters
+        ----------
+        multiples : sequence of int
+            For each, the place among :meth:`nameable` of a function before it of which it is a multiple; or -1.
+        """
+        names, taken = list(self.momentum_maps | self.casimirs()), {"energy", "entropy"}
+        number = len(names)
+        for multiple, (fallback, L) in zip(multiples, self.preserved_by_name().items(), strict=True):
+            name = getattr(getattr(L, "function", None), "__name__", "")
+            usable = name.isidentifier() and name not in {*names, *taken}
+            names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
+        return tuple(names[number:])
 
     @by_own_settings
     def first_integrals(self) -> frozenset[str]:
@@ -395,21 +411,21 @@ class System(Kind):
         if self.decided is not None:
             return self.decided
         verdicts = _verdicts_anywhere(self) if near is None else self._verdicts(near)
-        if declared:
-            verdicts = verdicts | {name: True for name in self.preserved_names if verdicts.get(name, True) is None}
-        constant = {name for name, verdict in verdicts.items() if verdict}
-        return Decided(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
+        return Decided.of(verdicts, self.preserved_names if declared else ())
 
     def _verdicts(self, near=None) -> dict[str, bool | None]:
         """Whether it conserves each of its functions: by construction, or at random points."""
-        claimed = set(self.momentum_maps)
-        if not self.pushed_by and (self.dissipation is None or self.dissipation.keeps_casimirs):
-            claimed |= set(self.casimirs())
+        claimed = self.claimed()
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
             open_ = is_traced(self) or self.pushed_by  # a torque that is zero at some times tells nothing of others
             kept = [False] * len(others) if open_ else self.conserves(tuple(others.values()), near)
         return dict.fromkeys(claimed, True) | dict(zip(others, kept, strict=True))
+
+    def claimed(self) -> frozenset[str]:
+        """The names of the functions that it conserves by construction: nothing has to be tried out."""
+        by_form = not self.pushed_by and (self.dissipation is None or self.dissipation.keeps_casimirs)
+        return frozenset({*self.momentum_maps, *(self.casimirs() if by_form else ())})
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
         """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""
@@ -438,19 +454,19 @@ class System(Kind):
         if self.is_driven:
             found = [system.conserves(functions, near) for system in self.at_some_times()]
             return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
-        count = 4 if self.dim <= MANY else 1
-        points = np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(SCALES)])
+        points = self.test_states(self.tested)
         if near is not None:
-            points = np.concatenate([points, self._around(near)])
-        rates, sizes = at_points(_rates_of_change, (self, functions), points)  # shape (points, parts, functions)
-        inside = np.isfinite(rates).all(axis=1)
-        with np.errstate(invalid="ignore"):
-            each = (np.abs(rates) <= AXIOM_TOLERANCE * sizes).all(axis=1)
-            together = np.abs(rates.sum(axis=1)) <= AXIOM_TOLERANCE * np.abs(rates).max(axis=1)
-        verdicts = zip(inside.T, (each | together).T, strict=True)
-        return [bool(kept[use].all()) if use.any() else None for use, kept in verdicts]
+            points = np.concatenate([points, self.states_near(near)])
+        defined, conserved = judge(at_points(rates_of_change, (self, functions), points))  # shapes (points, functions)
+        pairs = zip(defined.T, conserved.T, strict=True)
+        return [bool(kept[inside].all()) if inside.any() else None for inside, kept in pairs]
 
-    def _around(self, x) -> np.ndarray:
+    @property
+    def tested(self) -> int:
+        """At how many random states of each scale it is judged whether a function is conserved."""
+        return 4 if self.dim <= MANY else 1
+
+    def states_near(self, x) -> np.ndarray:
         """Some of the states x, shape (m, n), and on R^n points around them, ever nearer: they lie in most domains."""
         x = np.reshape(np.asarray(x), (-1, self.dim))[:AROUND]
         if self.space is not None:
@@ -584,69 +600,29 @@ def _verdicts_anywhere(system: System) -> dict[str, bool | None]:
     return system._verdicts()
 
 
-def _rates_of_change(model: tuple[System, tuple[Energy, ...]], x):
-    """The rates of change of each function along the motion and along each dissipation, and their sizes.
-
-    Shapes (parts, functions). The size of a dissipation is that of its force, or of what it makes of other gradients
-    of the same size where that is more: the force itself may be the rounding of zero.
-    """
-    system, functions = model
-    gradients = jnp.stack([f.gradient(x) for f in functions])
-    dH = _seen(system, x, system.energy.gradient(x))
-    dS = jnp.zeros_like(x) if system.entropy is None else _seen(system, x, system.entropy.gradient(x))
-    others = np.random.default_rng(0).standard_normal((2, system.dim)) / np.sqrt(system.dim)
-    motion = system.poisson.sharp(x, dH)
-    parts = [motion]
-    speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.sharp(x, jnp.abs(dH)))]
-    for part in () if system.dissipation is None else system.dissipation.terms:
-        dL = tuple(_seen(system, x, L.gradient(x)) for L in part.preserve)
-        a, b = (_seen(system, x, other * jnp.linalg.norm(d)) for other, d in zip(others, (dH, dS), strict=True))
-        parts.append(part.force(system, x, dH, dS, dL))
-        speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
-    if (push := system.push(x)) is not None:
-        parts.append(push)
-        speeds.append(jnp.linalg.norm(push))
-    sizes = jnp.linalg.norm(gradients, axis=1)
-    rates = jnp.stack(parts) @ gradients.T
-    energy = system.energy.value(x)  # a derivative may be finite where the function is not defined
-    all_ = energy if system.entropy is None else energy + system.entropy.value(x)
-    defined = jnp.isfinite(jnp.stack([energy, *[all_] * (len(parts) - 1)]))
-    rates = jnp.where(defined[:, None], rates, jnp.nan)
-    for i, part in enumerate(() if system.dissipation is None else system.dissipation.terms, start=1):
-        if part.preserve:  # by construction, wherever it is defined
-            kept = _spanned(gradients, [L.gradient(x) for L in part.preserve])
-            rates = rates.at[i].set(jnp.where(kept, 0.0, rates[i]))
-    return rates, jnp.where(rates == 0.0, 1.0, jnp.stack(speeds)[:, None] * sizes)
-
-
-def _spanned(gradients, vectors) -> jax.Array:
-    """Which of some gradients, shape (m, n), are combinations of vectors, shape (m,)."""
-    off = frame(vectors).off
-    rest = jnp.stack([off(gradient) for gradient in gradients])
-    return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
-
-
 def gradients_of(functions: tuple[Energy, ...], x) -> jax.Array:
     """The gradients of several functions at a state, shape (functions, n)."""
     return jnp.stack([f.gradient(x) for f in functions])
 
 
-def _proportional(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether one of two gradients, shape (points, n), is a multiple of the other, the same one everywhere."""
-    inside = np.isfinite(one).all(axis=1) & np.isfinite(other).all(axis=1)
-    one, other = one[inside], other[inside]
-    lengths = np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)
-    if not (lengths[0] > 0.0).any() or not np.array_equal(lengths[0] > 0.0, lengths[1] > 0.0):
-        return False
-    at = int(np.argmax(lengths[1]))
-    i = int(np.argmax(np.abs(other[at])))
-    defect = np.linalg.norm(one - (one[at, i] / other[at, i]) * other, axis=1)
-    return bool((defect <= AXIOM_TOLERANCE * lengths[0]).all())  # at each point by itself: their scales differ
+def first_multiples(gradients: np.ndarray, count: int) -> np.ndarray:
+    """Return for each of the last ``count`` functions the first one before it of which it is a multiple, or -1.
 
+    Parameters
+    ----------
+    gradients : array, shape (..., points, functions, n)
 
-def _seen(system: System, x, alpha):
-    """What a covector is to tangent vectors: itself on R^n."""
-    return alpha if system.space is None else system.lowered(x, system.raised(x, alpha))
+    Returns
+    -------
+    array of int, shape (..., count)
+    """
+    total = gradients.shape[-2]
+    multiples = np.full((*gradients.shape[:-3], count), -1)
+    for k, i in enumerate(range(total - count, total)):
+        for j in reversed(range(i)):
+            alike = is_proportional(gradients[..., i, :], gradients[..., j, :])
+            multiples[..., k] = np.where(alike, j, multiples[..., k])
+    return multiples
 
 
 def named_maps(given) -> dict[str, Any]:

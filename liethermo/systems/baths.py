@@ -81,11 +81,13 @@ class HeatBaths(Module):
     @property
     def scale(self) -> np.ndarray | float:
         """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
-        energy = self.energy
-        if not isinstance(energy, Warmth) or is_traced(energy):  # of what keeps its temperature any will do
-            return 1.0
-        capacity = np.asarray(energy.capacity)
-        return np.where(np.isfinite(capacity), capacity, 1.0)
+        return 1.0 if is_traced(self.energy) else np.asarray(self.entropy_scales())
+
+    def entropy_scales(self) -> jax.Array:
+        """:attr:`scale` as an array that JAX can trace, shape (number,)."""
+        if not isinstance(self.energy, Warmth):  # of what keeps its temperature any will do
+            return jnp.ones(self.number)
+        return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
 def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:

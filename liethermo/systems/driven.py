@@ -103,6 +103,9 @@ class DrivenSystem(System):
     def outside(self, x) -> str:
         return self._now_of_all(x).outside(x[..., :-2])
 
+    def domain_margin(self, x):
+        return self._now(x).domain_margin(x[..., :-2])
+
     def singular(self, x) -> str:
         return self._now_of_all(x).singular(x[..., :-2])
 

@@ -156,6 +156,9 @@ class EulerPoincareClosedSystem(WithLedger):
         T = float(at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
 
+    def domain_margin(self, x):
+        return self.temperature(x)
+
     def own_residuals(self, x) -> dict[str, jax.Array]:
         xi, S, t = self.parts(x)
         force = self.friction_force(xi, S, t)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -22,6 +23,13 @@ class Decided(NamedTuple):
 
     constant: frozenset[str]
     unknown: frozenset[str]
+
+    @classmethod
+    def of(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> Decided:
+        """From a verdict on each function; one that is declared counts as conserved unless it is seen not to be."""
+        verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
+        constant = {name for name, verdict in verdicts.items() if verdict}
+        return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
 
 class Kind(Geometry):
@@ -104,6 +112,13 @@ class Kind(Geometry):
         For several states at one time, shape (..., n), the text is about one that does.
         """
         return ""
+
+    def domain_margin(self, x) -> jax.Array | None:
+        """A number that is positive where the parameters of the system allow a state x, shape (n,), and nowhere else.
+
+        It is traced, for many systems at a time; :meth:`outside` has the words. None if any parameters allow any state.
+        """
+        return None
 
     def singular(self, x) -> str:
         """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can.

@@ -199,6 +199,9 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         T = float(at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 
+    def domain_margin(self, x):
+        return self.temperature(x)
+
     def own_residuals(self, x) -> dict[str, jax.Array]:
         q, v, S, t = self.parts(x)
         force = self.friction_force(q, v, S, t)

@@ -15,6 +15,8 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from manifolds.testing import Report, Suite
@@ -29,7 +31,7 @@ from ..interop.scipy import solve_ivp
 from ..results.load import load
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
-from ..runs.ensemble import ensemble
+from ..runs.ensemble import Ensemble, ensemble
 from ..runs.integrate import integrate
 from ..studies.axes import replicas
 from ..studies.study import Study
@@ -347,6 +349,68 @@ def many(case: Case) -> Outcome:
     return None
 
 
+def company(case: Case) -> Outcome:
+    """What other members of a family are, and in which order they stand, is nothing to one of them: to the bit.
+
+    The others have the parameters of the system made equal, made zero in part, and of the other sign.
+    """
+    names = parameters_of(case.system)
+    if not names:
+        return "the system has no parameters"
+    rows = {name: np.stack([value, *companions(value)]) for name, value in names.items()}
+    (name, value), *_ = names.items()
+    entry = (0,) * value.ndim
+    path = name + "".join(f"[{i}]" for i in entry)
+    values = np.unique([value[entry], 0.0, -value[entry], 2.0 * value[entry] + 1.0])
+    place = int(np.flatnonzero(values == value[entry])[0])
+    span = (0.0, case.time)
+
+    def among(order: list[int]) -> np.ndarray:
+        members = {name: row[order] for name, row in rows.items()}
+        found = ensemble(case.system, case.x0, span, case.step, case.method, parameters=members, progress=False)
+        return place_of(found, order.index(0))
+
+    def in_study(order: np.ndarray) -> np.ndarray:
+        points = {path: values[order]}
+        described = Study(
+            case.system, points, x0=case.x0, t_span=span, step=case.step, method=case.method, measure={"x": "final"}
+        )
+        described.run(progress=False)
+        return described.results.x.values[int(np.flatnonzero(order == place)[0])]
+
+    alone = ensemble(case.system, case.x0[None], span, case.step, case.method, progress=False)
+    case.near("in company", among([0, 1, 2, 3]), place_of(alone, 0), case.rounding)
+    first = among([0, 1, 2, 3])
+    for order in ([1, 2, 3, 0], [3, 1, 0, 2], [2, 0]):
+        case.near(f"in the order {order}", among(order), first, 0.0)
+    forwards = np.arange(len(values))
+    first = in_study(forwards)
+    case.near("in a study", first, place_of(alone, 0), case.rounding)
+    case.near("in a study backwards", in_study(forwards[::-1]), first, 0.0)
+    return None
+
+
+def parameters_of(system: System) -> dict[str, np.ndarray]:
+    """The parameters of a system by name."""
+    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
+    named = {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
+    return {name: value for name, value in named.items() if value.size}
+
+
+def companions(value: np.ndarray) -> list[np.ndarray]:
+    """Parameters that are more symmetric, have zeros, and have the other sign."""
+    square = value.ndim == 2 and value.shape[0] == value.shape[1]
+    equal = np.eye(len(value)) * np.trace(value) / len(value) if square else np.full_like(value, value.mean())
+    zeros = np.where(np.arange(value.size).reshape(value.shape) % 2 == 0, 0.0, value)
+    return [equal, zeros, -value]
+
+
+def place_of(many: Ensemble, i: int) -> np.ndarray:
+    """The final state of a trajectory, shape (n,), as an array to compare; zeros if it was not started."""
+    assert many.x is not None
+    return np.nan_to_num(many.x[i]).ravel()
+
+
 def study(case: Case) -> Outcome:
     """A point of a study is a run, and its values outlive the study."""
     described = Study(
@@ -464,6 +528,7 @@ RELATIONS: dict[str, Callable[[Case], Outcome]] = {
     "split": split,
     "engines": engines,
     "ensemble": many,
+    "company": company,
     "study": study,
     "file": file,
     "scipy": scipy,
@@ -487,7 +552,7 @@ def check_relations(
     A constant in the energy; units of state and time by factors up to 1e20; components in another order and axes
     turned (another basis of the algebra); a rate shared by two dissipations; parameters closed over; an entropy that is
     known near the motion alone; a system beside itself; the motion backwards; a span in two parts; every engine; the
-    run in an ensemble, in a study, from a file, by SciPy's and by diffrax's call.
+    run in an ensemble, beside members of other symmetry, in a study, from a file, by SciPy's and by diffrax's call.
 
     Parameters
     ----------

@@ -161,7 +161,8 @@ def traced(function: Callable, *arguments) -> Traced:
     """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
     ours = _module(function).split(".")[0] in ("liethermo", "manifolds")
     with contextlib.nullcontext() if ours else users_settings():
-        closed, found = jax.make_jaxpr(function, return_shape=True)(*arguments)
+        # JAX keeps the trace of a function object; what the function reads may have changed since
+        closed, found = jax.make_jaxpr(lambda *values: function(*values), return_shape=True)(*arguments)
     lifting = Lifting()
     jaxpr, constants, numbers = lifting.whole(closed)
     structure = jax.tree_util.tree_structure(found)

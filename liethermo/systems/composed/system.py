@@ -196,6 +196,9 @@ class ComposedSystem(System):
             found.append(f"of {cold.size - MOST_NAMED} more likewise")
         return f"{' and '.join(found)}: it has to be positive"
 
+    def domain_margin(self, x):
+        return jnp.min(self.energy.gradient(x)[..., self._places.S])
+
     def sparsity(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None

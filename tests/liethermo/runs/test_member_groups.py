@@ -1,0 +1,245 @@
+"""What a member of a family conserves is a property of that member, whoever else is there and in whatever order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines.codes import Code
+from liethermo.runs import member_groups
+from liethermo.runs.family import Family
+
+START, SPAN, STEP = np.array([0.4, 0.5, -0.3]), (0.0, 2.0), 0.1
+ORDERS = ([0, 1, 2], [2, 0, 1], [1, 2, 0])
+METHODS = [
+    lt.MetriplecticMidpoint(),
+    lt.MetriplecticGauss(2),
+    lt.MetriplecticRungeKutta(4),
+    lt.MetriplecticTaylor(6),
+]
+
+
+def body(p):
+    """Isotropic for a = 1, where the energy is a function of the Casimir and friction conserves both."""
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m: 0.5 * (m[0] ** 2 + m[1] ** 2 + p["a"] * m[2] ** 2),
+        lambda m: jnp.log(1 + m @ m),
+        lt.KillingDissipation(0.3),
+    )
+
+
+A = np.array([1.0, 0.5, 2.0])
+
+
+def field(a):
+    """``mu' = mu x xi + F``, ``F = 0.6 xi x (dS x xi)``, in NumPy: minus the Killing form of so(3) is 2."""
+
+    def rate(t, mu):
+        xi, dS = np.array([1.0, 1.0, a]) * mu, 2.0 * mu / (1.0 + mu @ mu)
+        return np.cross(mu, xi) + 0.3 * 2.0 * np.cross(xi, np.cross(dS, xi))
+
+    return rate
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_members_are_as_if_alone(method):
+    alone = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP, method).x[-1] for a in A])
+    exact = [solve_ivp(field(a), SPAN, START, "DOP853", rtol=1e-12, atol=1e-14).y[:, -1] for a in A]
+    assert np.abs(alone - exact).max() < (2e-3 if method.order == 2 else 2e-5)
+    for order in ORDERS:
+        many = lt.ensemble(body, START, SPAN, STEP, method, parameters={"a": A[order]})
+        assert np.array_equal(many.status, np.zeros(3))
+        assert np.abs(many.x - alone[order]).max() < 1e-14, order
+        assert many.audit().passed, str(many.audit())
+        assert many.laws.energy == "conserved"
+    assert many[0].audit().passed
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
+def test_adaptive_steps_and_saved_times(method):
+    options = {"parameters": {"a": A}, "save_at": [0.5, 2.0]}
+    many = lt.ensemble(body, START, SPAN, lt.Adaptive(1e-6), method, **options)
+    for i, a in enumerate(A):
+        one = lt.integrate(body({"a": a}), START, SPAN, lt.Adaptive(1e-6), method, save_at=[0.5, 2.0])
+        assert np.abs(many.x[i] - one.x).max() < 1e-12
+
+
+def test_named_parameters():
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(np.eye(3)), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
+    )
+    quadratics = np.stack([np.diag([1.0, 1.0, a]) for a in A])
+    many = lt.ensemble(system, START, SPAN, STEP, parameters={"energy.A": quadratics})
+    alone = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A})
+    assert np.abs(many.x - alone.x).max() < 1e-14
+
+
+@pytest.mark.parametrize("method", METHODS[2:], ids=str)
+def test_an_isotropic_body_does_not_stop_the_others(method):
+    """The steps of the others cannot end on its levels: they were not converged."""
+    inertia = np.array([[1.0, 1.0, 1.0], [3.0, 2.0, 1.0], [1.0, 2.0, 3.0]])
+    many = lt.ensemble(lambda p: lt.models.rigid_body(p["I"]), START, SPAN, STEP, method, parameters={"I": inertia})
+    assert many.ok.all(), str(many)
+    assert many.audit().passed
+
+
+def test_a_point_of_a_study():
+    axes = {"a": [1.0, 0.5, 2.0]}
+    study = lt.Study(body, axes, x0=START, t_span=SPAN, step=STEP, measure={"x": "final"})
+    study.run(progress=False)
+    alone = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP).x[-1] for a in A])
+    assert np.abs(study.results.x.values - alone).max() < 1e-14
+
+
+@pytest.mark.parametrize("method", METHODS[1:3], ids=str)
+def test_a_flow_under_vmap(method):
+    def end(a):
+        return lt.flow(body({"a": a}), jnp.asarray(START), SPAN, STEP, method)
+
+    alone = np.array([end(a) for a in A])
+    assert np.abs(jax.vmap(end)(jnp.asarray(A)) - alone).max() < 1e-12
+    assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - alone).max() < 1e-12
+
+
+def test_a_control_one_verdict_for_all_is_found(monkeypatch):
+    """Control: with what the first member conserves held for all, the relation of company fails."""
+
+    def of_first(family, method, states):
+        decided = family.member(0)._found()
+        facts = member_groups.Facts(None, decided)
+        return [member_groups.Group(np.arange(len(states)), family.known(member_groups.with_facts, facts))], {}
+
+    system = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
+    )
+    assert lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"]).passed
+    monkeypatch.setattr("liethermo.runs.ensemble.groups_of", of_first)
+    with pytest.raises(lt.testing.PropertyError, match="company"):
+        lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"])
+
+
+# -- what a method is asked to preserve -------------------------------------------------------------------------------
+
+
+def lopsided(p):
+    """Conserves ``m[2]`` where the energy is symmetric about the axis 3."""
+    return lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + p["b"] * m[1] ** 2) + m[2] ** 2)
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss, lt.MetriplecticRungeKutta])
+def test_what_a_member_does_not_conserve_is_not_held(method):
+    holding = method(4, preserve=[lambda m: m[2]])
+    many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
+    assert many.status.tolist() == [Code.COMPLETED, Code.INADMISSIBLE, Code.COMPLETED]
+    assert "does not conserve the preserved function" in many.reasons[1]
+    assert np.abs(many.x[[0, 2], 2] - START[2]).max() < 1e-15
+    many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
+    assert many.status.tolist() == [Code.INADMISSIBLE, Code.COMPLETED]
+
+
+def test_a_preserved_function_that_is_a_casimir_of_one_member():
+    """``x A x`` is a multiple of the Casimir for A = 1 alone: each member names what its friction preserves."""
+
+    def build(p):
+        friction = lt.ProjectedMetric(preserve=(lt.Quadratic(p["A"]),), normalized=True, rate=0.3)
+        return lt.LiePoissonSystem(
+            mf.so(3), lt.Quadratic(jnp.array([1.0, 2.0, 3.0])), lambda m: jnp.log(1 + m @ m), friction
+        )
+
+    matrices = np.stack([np.eye(3), np.diag([1.0, 2.0, 4.0]), 2.0 * np.eye(3)])
+    method = lt.MetriplecticGauss(2)
+    for order in ORDERS:
+        many = lt.ensemble(build, START, SPAN, STEP, method, parameters={"A": matrices[order]})
+        for i, k in enumerate(order):
+            one = lt.integrate(build({"A": matrices[k]}), START, SPAN, STEP, method)
+            assert np.abs(many.x[i] - one.x[-1]).max() < 1e-14
+            assert many[i].casimirs.keys() == one.casimirs.keys()
+            assert set(many[i].laws.conserved) == set(one.laws.conserved)
+
+
+# -- domains and inertia ----------------------------------------------------------------------------------------------
+
+
+def test_a_member_outside_its_own_domain_is_not_started():
+    """The temperature ``2 a S`` at the same state is negative for one member, neither the first nor an extreme one."""
+
+    def gas(p):
+        return lt.SimpleClosedSystem(
+            lambda q, v, S: 0.5 * v @ v - 0.5 * q @ q - (p["a"] * (p["a"] - 2.0) + 0.5) * S, dim=3, validate=False
+        )
+
+    a = np.array([0.0, 1.0, 3.0])  # temperatures 0.5, -0.5, 3.5
+    many = lt.ensemble(gas, [0.3, 0.1, 1.0], (0.0, 1.0), 0.1, parameters={"a": a})
+    assert many.status.tolist() == [Code.COMPLETED, Code.INADMISSIBLE, Code.COMPLETED], str(many)
+    assert "temperature" in many.reasons[1]
+
+
+def test_one_inertia_only_if_all_have_it():
+    """The parameter that differs is the last of ten, and most are the same for all."""
+
+    def build(p):
+        shift = 1e-3 * jnp.sum(p["all"][:9])
+        return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(jnp.array([1.0, 2.0, 3.0]) + p["all"][9]), shift_of(shift))
+
+    def shift_of(shift):
+        return lambda m: shift + m @ m
+
+    rows = np.random.default_rng(0).standard_normal((12, 10))
+    rows[:, 9] = 0.0
+    family = Family.of(build, {"all": rows})
+    np.testing.assert_allclose(member_groups.common_inertia(family), np.diag([1.0, 1 / 2, 1 / 3]))
+    rows[5, 9] = 1e-3
+    assert member_groups.common_inertia(Family.of(build, {"all": rows})) is None
+
+
+# -- the rest of an ensemble ------------------------------------------------------------------------------------------
+
+
+def test_groups_are_few_and_in_order():
+    many = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
+    family = Family.of(body, {"a": many})
+    groups, refused = member_groups.groups_of(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
+    assert [group.places.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
+    assert refused == {}
+    names = [group.family.member(0).decided.constant for group in groups]
+    assert names[0] == frozenset()
+    assert len(names[1]) == 1
+
+
+def test_an_interruption_stops_all_groups(monkeypatch):
+    from liethermo.runs import ensemble as module
+
+    def interrupted(family, method, record, tally, paths=None):
+        calls.append(len(record.x0))
+
+    calls: list[int] = []
+    monkeypatch.setattr(module, "run_compiled", interrupted)
+    many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
+    assert calls == [1]
+    assert many.status.tolist() == [Code.INTERRUPTED] * 3
+
+
+@pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
+def test_files_of_mixed_groups(tmp_path, outputs):
+    many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, outputs=outputs)
+    loaded = lt.load(many.save(tmp_path / "many.nc"))
+    assert str(loaded.audit()) == str(many.audit())
+    assert np.array_equal(loaded.energy, many.energy)
+    if outputs != "summary":
+        assert np.array_equal(many[1].x[-1], many.x[1] if outputs == "final" else many.x[1, -1])
+
+
+def test_names_of_parameters_that_end_with_an_index():
+    """The numbers in a function are leaves called ``numbers[0]``; an entry of one is ``numbers[0][1]``."""
+    closed = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + 3.0 * m[1] ** 2) + jnp.cosh(0.7 * m[2]))
+    name = "energy.function.numbers[0][0]"
+    study = lt.Study(closed, {name: [3.0, 1.0]}, x0=START, t_span=(0.0, 1.0), step=STEP, measure={"x": "final"})
+    study.run(progress=False)
+    same = lt.integrate(closed, START, (0.0, 1.0), STEP).x[-1]
+    gaps = np.abs(study.results.x.values - same).max(axis=1)
+    assert gaps.min() < 1e-14
+    assert gaps.max() > 1e-3
