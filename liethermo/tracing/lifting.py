@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
+from manifolds._keys import key
 from manifolds.matrices.exponential import expm
-
-from .keys import key
 
 FEW = 64
 """Numbers that are no table yet: what they are made from may be shorter."""

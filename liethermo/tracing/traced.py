@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from manifolds._keys import key
 from manifolds._module import Module
 from manifolds._precision import users_settings
 
 from ..errors import FunctionError
-from .keys import key
 from .lifting import Lifting
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._frozen import FrozenFunction
 from .._sizes import checked_size
 from ..errors import DomainError, ParameterError, SpaceError
 from ..matrices.linear import solve_near_identity
@@ -72,16 +73,20 @@ class LevelSet(Space):
         functions = tuple(constraints) if isinstance(constraints, list | tuple) else (constraints,)
         sizes = tuple(shape) if isinstance(shape, list | tuple) else (shape,)
         sizes = tuple(checked_size(n, 1, "LevelSet(constraints, shape)", "a size") for n in sizes)
-        for field, value in (("constraints", functions), ("sizes", sizes), ("name", name)):
+        for field, value in (("sizes", sizes), ("name", name)):
             object.__setattr__(self, field, value)
+        try:
+            frozen = tuple(FrozenFunction(function, sizes) for function in functions)
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            raise SpaceError(f"{name}: its constraints take no array of shape {sizes}: {error}") from None
+        object.__setattr__(self, "constraints", frozen)
+        if callable(metric):
+            metric = FrozenFunction(metric, sizes)
         object.__setattr__(self, "form", metric if metric is None or callable(metric) else _Constant.of(metric, self))
         self._check()
 
     def _check(self) -> None:
-        try:
-            count = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            raise SpaceError(f"{self.name}: its constraints take no array of shape {self.shape}: {error}") from None
+        count = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
         if not 0 < count < self.size:
             raise SpaceError(f"{self.name}: {count} constraints on {self.size} numbers leave no manifold")
         x = jax.random.normal(jax.random.key(0), (TRIED, *self.shape))

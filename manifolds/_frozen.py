@@ -1,0 +1,48 @@
+"""A function as it is when it is given: what it reads may change later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from ._keys import key
+
+
+class FrozenFunction:
+    """A function of one array, traced for a shape; equal to others of the same operations and numbers.
+
+    Programs are kept by the spaces that they belong to. A space must therefore not equal another one whose function
+    read other numbers when it was given, though both were given the same function object.
+
+    Parameters
+    ----------
+    function : function from an array of the shape to an array
+    shape : tuple of int
+
+    Attributes
+    ----------
+    closed : ClosedJaxpr
+    """
+
+    def __init__(self, function: Callable, shape: tuple[int, ...]):
+        self.function, self.shape = function, shape
+        x = jax.ShapeDtypeStruct(shape, jnp.float64)
+        self.closed: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(
+            x
+        )  # JAX keeps the trace of a function
+        self._key = key(self.closed)
+
+    def __call__(self, x):
+        return jaxpr_as_fun(self.closed)(jnp.asarray(x, dtype=jnp.float64))[0]
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, FrozenFunction) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __reduce__(self):
+        return FrozenFunction, (self.function, self.shape)
