@@ -19,7 +19,7 @@ require = @command -v "$(PYTHON)" >/dev/null || { echo "$(PYTHON) was not found;
 help:
 	@echo "make demo       run a tumbling body with friction inside; results go to demo_output/"
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
-	@echo "make test-slow  the slow tests"
+	@echo "make test-slow  the slow tests; with PART=3/8 the third of eight parts of them"
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
@@ -66,7 +66,7 @@ test: .venv/test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: .venv/test
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow $(if $(PART),--part $(PART))
 
 docs: .venv/docs
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html

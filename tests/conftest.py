@@ -30,8 +30,33 @@ gc.set_threshold(200_000, 20, 100)
 """Tracing makes many small objects that live: looking through them ever again costs a tenth of the time."""
 
 
+def pytest_addoption(parser):
+    parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the selected tests")
+
+
+class Part:
+    """One of several parts of the selected tests: every N-th, so that the cases of a test are spread over all parts."""
+
+    def __init__(self, text: str):
+        try:
+            number, count = map(int, text.split("/"))
+        except ValueError:
+            raise pytest.UsageError(f"--part must be K/N, such as 3/8, got {text!r}") from None
+        if not 1 <= number <= count:
+            raise pytest.UsageError(f"--part must be from 1/{count} to {count}/{count}, got {text!r}")
+        self.number, self.count = number, count
+
+    @pytest.hookimpl(trylast=True)  # after tests are deselected by their marks
+    def pytest_collection_modifyitems(self, config, items):
+        parts = [items[k :: self.count] for k in range(self.count)]
+        items[:] = parts.pop(self.number - 1)
+        config.hook.pytest_deselected(items=[item for part in parts for item in part])
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config):
+    if config.option.part:
+        config.pluginmanager.register(Part(config.option.part))
     slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
     hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
     if not slow:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
+from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import converted
 from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
 
@@ -54,14 +55,12 @@ def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> En
         )
     try:
         energy, result = converted(energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ())
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
+    except TRACE_ERRORS as error:
         for term in energy.terms:
             term.check_places(dim, role)  # says which term, where the fault is in its coordinates
-        message = f"{type(error).__name__}: {error}".rstrip(".")
-        raise FunctionError(
-            f"{role} could not be evaluated on a state of shape ({dim},): {message}. "
-            "It must be written with jax.numpy and accept one array"
-        ) from error
+        cure = "It must be written with jax.numpy and accept one array"
+        message = explain(f"{role} could not be evaluated on a state of shape ({dim},)", error, cure)
+        raise FunctionError(message) from error
     for term in energy.terms:
         term.check_places(dim, role)
     if result.shape != ():
@@ -107,8 +106,8 @@ def check_shape(
     """
     try:
         function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
-        raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
+    except TRACE_ERRORS as error:
+        raise FunctionError(explain(f"{what} could not be evaluated at {at}", error)) from error
     if found.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
         raise FunctionError(f"{what} has shape {wanted}, not {found.shape}")

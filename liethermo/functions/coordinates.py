@@ -15,6 +15,7 @@ from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import at_points
+from ..tracing.trace_errors import TRACE_ERRORS, explain
 from .indices import Indices
 
 COORDINATE_TOLERANCE = 1e-10
@@ -54,8 +55,8 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         return
     try:
         start, end, step = at_points(_chord, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim)))
-    except (TypeError, ValueError, IndexError) as error:
-        raise FunctionError(f"the coordinates of a term of {role} could not be evaluated: {error}") from error
+    except TRACE_ERRORS as error:
+        raise FunctionError(explain(f"the coordinates of a term of {role} could not be evaluated", error)) from error
     if start.ndim != 2:
         raise FunctionError(
             f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"

@@ -15,6 +15,7 @@ import manifolds as mf
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
 from ..systems import AttitudeSystem, System
+from ..tracing.trace_errors import TRACE_ERRORS, explain
 from .quickly import quickly
 
 ITERATIONS = 30
@@ -106,9 +107,9 @@ def observation(system: System, observed: Sequence[int] | None, observe: Callabl
     parts = [jnp.zeros(system.dim)] if group is None else [jnp.zeros(system.dim), group.identity]
     try:
         found = jax.eval_shape(lambda *parts: jnp.asarray(observe(*parts)), *parts)
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
-        why = str(error).splitlines()[0][:200]
-        raise FunctionError(f"observe could not be evaluated on a state of shape ({system.dim},): {why}") from error
+    except TRACE_ERRORS as error:
+        what = f"observe could not be evaluated on a state of shape ({system.dim},)"
+        raise FunctionError(explain(what, error)) from error
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise FunctionError(f"observe must return real numbers, not {found.dtype}")
     return Observation(observe, found.shape, np.zeros(0, int), group, False)

@@ -36,7 +36,7 @@ SENTENCES = {
     Code.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
     "below what rounding allows, or the functions not smooth there",
     Code.STEP_LIMIT: "as many steps were tried as are allowed, and t = {t:.15g} is reached: Adaptive(most_steps=...) "
-    "allows more, and a larger tolerance takes fewer",
+    "allows more, and a larger tolerance or a method of higher order takes fewer",
     Code.INADMISSIBLE: "{reason}",
 }
 """How a trajectory ended, by its time t, its steps n, its residual r."""

@@ -10,6 +10,7 @@ from ..engines.choice import Chosen
 from ..engines.codes import Code
 from ..engines.rules import RULES
 from ..engines.stepping import State
+from ..integrators import OneStepMethod
 from ..results.looking import field_at
 from ..results.status import Stats, Status
 from ..systems import System
@@ -50,7 +51,21 @@ def stats_of(state: State) -> Stats:
     )
 
 
-def given_up(system: System, x0, outcome, step: Adaptive, span: tuple[float, float], now: float) -> Status:
+HIGH_ORDER = 6
+"""Order of a method from which no higher one is recommended."""
+
+
+def higher_order(method: OneStepMethod, step: Adaptive) -> str:
+    """Advice to take a method of higher order, if that of a run is low; otherwise an empty text."""
+    if method.order >= HIGH_ORDER:
+        return ""
+    better = "lt.MetriplecticRungeKutta(8)" if method.explicit else "lt.MetriplecticGauss(4)"
+    return f". {method} has order {method.order}; {better}, of order 8, takes far fewer at rtol={step.rtol:g}"
+
+
+def given_up(
+    system: System, method: OneStepMethod, x0, outcome, step: Adaptive, span: tuple[float, float], now: float
+) -> Status:
     """How adaptive steps ended before the end, where none of them failed for good."""
     (start, end), steps, residual = span, int(outcome.state.step), float(outcome.state.residual)
     x = np.asarray(outcome.state.x)
@@ -59,7 +74,7 @@ def given_up(system: System, x0, outcome, step: Adaptive, span: tuple[float, flo
         return Status(code, f"after {steps} steps {text}", steps, now, residual)
     if outcome.limit == "steps":
         text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
-        text += "Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer"
+        text += f"Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer{higher_order(method, step)}"
         return Status(Code.STEP_LIMIT, text, steps, now, residual)
     if outcome.limit:
         text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "

@@ -26,7 +26,7 @@ from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .member_groups import common_inertia, groups_of, outside_own_domain
 from .paced import Many
-from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start
+from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start, refuse_tracers
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
@@ -42,6 +42,7 @@ FOLLOWED = 256
 
 
 @by_own_settings
+@refuse_tracers
 def ensemble(
     system: System | Callable[[Any], System] | Family,
     x0s,

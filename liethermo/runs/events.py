@@ -15,6 +15,7 @@ from manifolds._module import Module
 
 from ..errors import FunctionError, InputError
 from ..systems import System
+from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import settled
 
 
@@ -80,13 +81,21 @@ class Event:
             self.function: Any = Excess(jnp.asarray(until.tol), rate)
         elif callable(until):
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
-            self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+            try:
+                self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+            except TRACE_ERRORS as error:
+                what = f"the event function could not be evaluated on a state of shape {seen.shape}"
+                raise FunctionError(explain(what, error)) from error
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
         x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
         found = jax.eval_shape(lambda x: self.function(system, x), x)
         if getattr(found, "shape", None) != ():
-            raise FunctionError("the event function must return one number")
+            shape = getattr(found, "shape", type(found).__name__)
+            raise FunctionError(
+                f"the event function must return one number, got shape {shape}. For several events, return the "
+                "smallest one, jnp.min, or the product"
+            )
 
 
 class Excess(Module):

@@ -16,7 +16,7 @@ from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import as_run, check_choice, decided, prepared, started
+from .preparation import as_run, check_choice, decided, prepared, refuse_tracers, started
 from .progress import Progress
 from .run import Run
 from .timetable import course_of
@@ -26,6 +26,7 @@ UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW,
 
 
 @by_own_settings
+@refuse_tracers
 def integrate(
     system: System,
     x0,

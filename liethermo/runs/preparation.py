@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -20,7 +22,27 @@ from ..tracing.remembered import remembered
 from .family import Family
 from .fluctuations import Fluctuations
 
+Result = TypeVar("Result")
+
 NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+
+
+def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Decorator: say that a run takes numbers, and what to take instead, where JAX traces its arguments."""
+
+    @functools.wraps(function)
+    def call(*arguments, **named) -> Result:
+        try:
+            return function(*arguments, **named)
+        except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+            if not is_traced(arguments, named):
+                raise
+            raise InputError(
+                f"{function.__name__} runs on numbers, and jax.jit, jax.grad or jax.vmap traces its arguments. Use "
+                "lt.flow(system, x0, t_span, step, method), which JAX compiles and differentiates"
+            ) from error
+
+    return call
 
 
 def check_choice(what: str, given, choices: tuple[str, ...]) -> None:

@@ -144,7 +144,9 @@ class Run:
         self.stats = dataclasses.replace(stats_of(state), rejected=outcome.rejected)
         steps = int(state.step)
         if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit in ("steps", "memory")):
-            self.status = given_up(self.system, np.asarray(self.states[0][0]), outcome, step, (start, end), now)
+            self.status = given_up(
+                self.system, self.method, np.asarray(self.states[0][0]), outcome, step, (start, end), now
+            )
         elif event is not None and outcome.limit:
             text = f"{event.name} is not a number at some states near t = {now:g}, and has other signs before and "
             text += "after: whether it is zero there is not known, so extend the function"

@@ -12,6 +12,7 @@ import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
+from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import Traced, converted
 
 
@@ -44,10 +45,9 @@ def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | N
     given = parts if isinstance(given, list) else given
     try:
         torque, found = converted(given, use, *shapes)
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
-        raise FunctionError(
-            f"the torque could not be evaluated on a momentum of shape {algebra.shape}: {type(error).__name__}: {error}"
-        ) from error
+    except TRACE_ERRORS as error:
+        what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
+        raise FunctionError(explain(what, error)) from error
     for part, result in zip(parts, found, strict=True):
         if result.shape != algebra.shape or not jnp.issubdtype(result.dtype, jnp.floating):
             raise FunctionError(

@@ -452,6 +452,11 @@ def origin(eqn) -> str:
     """The innermost line of a user's that led to an equation, in a function or in a call."""
     for frame in getattr(eqn.source_info.traceback, "frames", ()):
         path = Path(frame.file_name)
-        if not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, OURS)):
+        if is_foreign(path):
             return f"{path.name}:{frame.line_num}, in {frame.function_name}"
     return UNKNOWN
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file belongs to a user, and not to this library, to JAX or to equinox."""
+    return not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, OURS))

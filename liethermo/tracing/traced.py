@@ -26,6 +26,7 @@ from manifolds._precision import users_settings
 
 from ..errors import FunctionError
 from .lifting import Lifting
+from .trace_errors import check_precision, check_result
 
 
 class Content:
@@ -160,9 +161,17 @@ def _forwards(function: Callable) -> Callable:
 def traced(function: Callable, *arguments) -> Traced:
     """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
     ours = _module(function).split(".")[0] in ("liethermo", "manifolds")
+    name = getattr(function, "__name__", type(function).__name__)
+
+    def called(*values):  # anew: JAX keeps the trace of a function object, and what the function reads may change
+        result = function(*values)
+        check_result(result, name)
+        return result
+
     with contextlib.nullcontext() if ours else users_settings():
-        # JAX keeps the trace of a function object; what the function reads may have changed since
-        closed, found = jax.make_jaxpr(lambda *values: function(*values), return_shape=True)(*arguments)
+        closed, found = jax.make_jaxpr(called, return_shape=True)(*arguments)
+    if not ours:
+        check_precision(closed.jaxpr, name)
     lifting = Lifting()
     jaxpr, constants, numbers = lifting.whole(closed)
     structure = jax.tree_util.tree_structure(found)
@@ -172,7 +181,7 @@ def traced(function: Callable, *arguments) -> Traced:
         content = _contents.get(found_by)
         if content is None:
             content = _contents[found_by] = Content(ClosedJaxpr(jaxpr, constants), structure, avals, lifting.loops)
-    return Traced(numbers, content, _Label(getattr(function, "__name__", type(function).__name__)))
+    return Traced(numbers, content, _Label(name))
 
 
 def _module(function: Callable) -> str:

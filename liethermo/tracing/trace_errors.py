@@ -1,0 +1,96 @@
+"""Why a function of a user could not be traced: the cause and the cure first, JAX's own words last."""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import Jaxpr, jaxprs_in_params
+from jax.extend.core.primitives import convert_element_type_p
+
+from ..errors import FunctionError
+from .scalarize import is_foreign, origin
+
+TRACE_ERRORS = (TypeError, ValueError, IndexError, AttributeError)
+"""What the call of a function with traced arrays may raise."""
+
+REFUSED_IN_JAX = {
+    jax.errors.TracerBoolConversionError: (
+        "it uses a traced value in `if`, `while`, `and`, `or`, `min` or `max`",
+        "Replace `if` by jnp.where or jax.lax.cond, and max(a, b) by jnp.maximum(a, b)",
+    ),
+    jax.errors.TracerArrayConversionError: (
+        "it passes a traced value to NumPy",
+        "Replace np by jnp, such as np.sin by jnp.sin",
+    ),
+    jax.errors.TracerIntegerConversionError: (
+        "it uses a traced value as a Python integer",
+        "Index arrays of jax.numpy with it, and take loops of fixed length or jax.lax.fori_loop",
+    ),
+    jax.errors.NonConcreteBooleanIndexError: (
+        "it selects entries by a traced condition, so their number is unknown",
+        "Replace x[condition] by jnp.where(condition, x, 0.0)",
+    ),
+    jax.errors.ConcretizationTypeError: (
+        "it converts a traced value to a Python number, as float and the functions of math do",
+        "Leave out float, and replace math by jnp, such as math.sin by jnp.sin",
+    ),
+}
+"""The errors that JAX raises if a traced value is used as a number: what the function does, and what to do instead."""
+
+
+def explain(what: str, error: BaseException, cure: str = "") -> str:
+    """Return a message that says why a function could not be evaluated, and what to do.
+
+    Parameters
+    ----------
+    what : str
+        Names the function and its arguments, such as "the energy could not be evaluated on a state of shape (3,)".
+    error : exception
+        What its call with traced arrays has raised.
+    cure : str
+        What to do if nothing is known of the error.
+    """
+    for kind, (cause, known_cure) in REFUSED_IN_JAX.items():
+        if isinstance(error, kind):
+            reported = str(error).splitlines()[0].rstrip(".")
+            return f"{what}: {cause}{_place(error)}. {known_cure}. JAX reports: {reported}"
+    if isinstance(error, FunctionError):
+        return f"{what}: {error}"
+    message = f"{what}: {type(error).__name__}: {error}".rstrip(".")
+    return f"{message}. {cure}" if cure else message
+
+
+def _place(error: BaseException) -> str:
+    """Where the user's function raised."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if is_foreign(Path(frame.filename)):
+            return f" ({Path(frame.filename).name}:{frame.lineno}, in {frame.name})"
+    return ""
+
+
+def check_result(value, name: str) -> None:
+    """Raise FunctionError if a function returned nothing."""
+    if value is None:
+        raise FunctionError(f"{name} returns None. Add the missing `return`")
+
+
+def check_precision(jaxpr: Jaxpr, name: str) -> None:
+    """Raise FunctionError if a function rounds a traced number to single precision.
+
+    Steps hold the laws to the rounding of double precision, so no step of such a function could be solved.
+    """
+    for eqn in jaxpr.eqns:
+        for inner in jaxprs_in_params(eqn.params):
+            check_precision(inner, name)
+        if eqn.primitive is convert_element_type_p:
+            operand: Any = eqn.invars[0].aval
+            dtype = np.dtype(eqn.params["new_dtype"])
+            if operand.dtype == np.float64 and dtype.kind == "f" and dtype.itemsize < 8:
+                raise FunctionError(
+                    f"{name} rounds numbers to {dtype} ({origin(eqn)}), but the laws hold to the rounding of float64. "
+                    f"Leave out {dtype}, such as astype(jnp.{dtype})"
+                )

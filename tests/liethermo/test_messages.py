@@ -1,0 +1,165 @@
+"""A message names the cause and the cure, and the cure works: each test follows the advice that it is given."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+
+START, SPAN, STEP = np.array([0.1, 0.2, 1.0]), (0.0, 1.0), 0.1
+
+
+def body(energy, **options):
+    return lt.LiePoissonSystem(mf.so(3), energy, **options)
+
+
+def run(system, x0=START, span=SPAN, step=STEP, method=None, **options):
+    return lt.integrate(system, x0, span, step, method, **options)
+
+
+def torque_of(f):
+    return body(lambda m: m @ m, torque=f)
+
+
+def friction_of(f):
+    return body(lambda m: m @ m, entropy=lambda m: m @ m, dissipation=lt.FrictionOperator(f, rate=0.1), validate=False)
+
+
+def event_of(f):
+    return run(body(lambda m: m @ m + m[0] ** 2), until=f)
+
+
+def tensor_of(f):
+    return lt.MetriplecticSystem(f, lambda x: x @ x, dim=2, validate=False)
+
+
+# -- functions --------------------------------------------------------------------------------------------------------
+
+
+def with_if(m):
+    if m[0] > 0.0:
+        return m[0] ** 2
+    return m[1] ** 2
+
+
+def without_return(m):
+    m[0] ** 2
+
+
+FUNCTIONS = {
+    # what is wrong: (how it is used, the function, what the message says, what it recommends)
+    "numpy": (body, lambda m: np.sin(m[0]) + m @ m, "NumPy.*np.sin by jnp.sin", lambda m: jnp.sin(m[0]) + m @ m),
+    "math": (body, lambda m: math.sin(m[0]) + m @ m, "math.sin by jnp.sin", lambda m: jnp.sin(m[0]) + m @ m),
+    "if": (body, with_if, "`if`.*jnp.where or jax.lax.cond", lambda m: jnp.where(m[0] > 0.0, m[0] ** 2, m[1] ** 2)),
+    "if, by cond": (
+        body,
+        with_if,
+        "jax.lax.cond",
+        lambda m: jax.lax.cond(m[0] > 0.0, lambda m: m[0] ** 2, lambda m: m[1] ** 2, m),
+    ),
+    "max": (body, lambda m: max(m[0], m[1]) ** 2, "jnp.maximum", lambda m: jnp.maximum(m[0], m[1]) ** 2),
+    "index": (
+        body,
+        lambda m: [1.0, 2.0, 3.0][jnp.argmax(m)] * m @ m,
+        "Python integer.*jax.numpy",
+        lambda m: jnp.array([1.0, 2.0, 3.0])[jnp.argmax(m)] * m @ m,
+    ),
+    "mask": (body, lambda m: jnp.sum(m[m > 0] ** 2), "jnp.where", lambda m: jnp.sum(jnp.where(m > 0, m, 0.0) ** 2)),
+    "return": (body, without_return, "returns None. Add the missing `return`", lambda m: m[0] ** 2),
+    "float32": (
+        body,
+        lambda m: jnp.sum(m.astype(jnp.float32) ** 2 * jnp.array([1.0, 2.0, 3.0])),
+        r"float32.*Leave out float32, such as astype\(jnp.float32\)",
+        lambda m: jnp.sum(m**2 * jnp.array([1.0, 2.0, 3.0])),
+    ),
+    "torque": (
+        torque_of,
+        lambda t, m: np.array([np.sin(t), 0.0, 0.0]),
+        "the torque.*np.sin by jnp.sin",
+        lambda t, m: jnp.array([jnp.sin(t), 0.0, 0.0]),
+    ),
+    "torque without return": (torque_of, lambda t, m: None, "the torque.*returns None", lambda t, m: 0.1 * m),
+    "friction": (friction_of, lambda m: np.outer(m, m), "friction operator K.*NumPy", lambda m: jnp.outer(m, m)),
+    "event": (event_of, with_if, "the event function.*`if`", lambda m: jnp.where(m[0] > 0.0, m[0], m[1])),
+    "event without return": (event_of, without_return, "the event function.*returns None", lambda m: m[0]),
+    "several events": (event_of, lambda m: m, r"one number, got shape \(3,\).*jnp.min", lambda m: jnp.min(m)),
+    "several events, their product": (event_of, lambda m: m - 0.15, "or the product", lambda m: jnp.prod(m - 0.15)),
+    "Poisson tensor": (
+        tensor_of,
+        lambda x: np.array([[0.0, x[0]], [-x[0], 0.0]]),
+        "the Poisson tensor.*NumPy",
+        lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]) * x[0],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_that_cannot_be_traced(name):
+    use, wrong, message, right = FUNCTIONS[name]
+    with pytest.raises(lt.FunctionError, match=message) as caught:
+        use(wrong)
+    first, _, reported = str(caught.value).partition(" JAX reports: ")
+    assert "Tracer" not in first
+    assert "\n" not in reported
+    use(right)
+
+
+def test_the_line_is_named():
+    with pytest.raises(lt.FunctionError, match=r"\(test_messages.py:\d+, in with_if\)"):
+        body(with_if)
+
+
+def test_numbers_in_single_precision_are_no_fault():
+    """Arrays of float32 in a closure are exact numbers; so is a mean of truth values."""
+    weights = jnp.array([1.0, 2.0, 3.0], dtype=jnp.float32)
+    system = body(lambda m: jnp.sum(weights * m**2) + 0.5 * jnp.mean(m > -99.0))
+    assert run(system).audit().passed
+
+
+# -- calls ------------------------------------------------------------------------------------------------------------
+
+
+def end_of(call, **options):
+    return lambda x: call(lt.models.rigid_body((3.0, 2.0, 1.0)), x, SPAN, STEP, **options)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, lambda f: jax.grad(lambda x: f(x)[0]), jax.jacfwd], ids=str)
+def test_a_run_inside_of_jax(transform):
+    """The message names lt.flow, which works in the place of integrate."""
+    with pytest.raises(lt.InputError, match=r"integrate runs on numbers.*lt\.flow\(system, x0, t_span, step, method\)"):
+        transform(lambda x: end_of(lt.integrate)(x).x[-1])(jnp.asarray(START))
+    assert np.isfinite(transform(end_of(lt.flow))(jnp.asarray(START))).all()
+
+
+def test_an_ensemble_inside_of_jax():
+    starts = jnp.asarray(np.random.default_rng(0).standard_normal((2, 3)))
+    with pytest.raises(lt.InputError, match=r"ensemble runs on numbers.*lt\.flow"):
+        jax.jit(lambda x: end_of(lt.ensemble)(x).x)(starts)
+    assert jax.jit(jax.vmap(end_of(lt.flow)))(starts).shape == (2, 3)
+
+
+def test_a_parameter_that_is_differentiated():
+    def end(call, rate):
+        return call(lt.models.rigid_body((3.0, 2.0, 1.0), rate=rate), START, SPAN, STEP)
+
+    with pytest.raises(lt.InputError, match=r"lt\.flow"):
+        jax.grad(lambda rate: end(lt.integrate, rate).x[-1][0])(0.2)
+    assert np.isfinite(jax.grad(lambda rate: end(lt.flow, rate)[0])(0.2))
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)], ids=str)
+def test_a_small_tolerance_with_a_low_order(method):
+    """The message names a method of high order, which reaches the end with as many steps as are allowed."""
+    system, step = lt.models.rigid_body((3.0, 2.0, 1.0)), lt.Adaptive(1e-10, most_steps=300)
+    with pytest.raises(
+        lt.ConvergenceError, match=rf"has order {method.order}; lt\.Metriplectic\w+\(\d\), of order 8"
+    ) as caught:
+        run(system, span=(0.0, 20.0), step=step, method=method)
+    words = str(caught.value)
+    better = lt.MetriplecticRungeKutta(8) if "lt.MetriplecticRungeKutta(8)" in words else lt.MetriplecticGauss(4)
+    assert better.order == 8
+    assert run(system, span=(0.0, 20.0), step=step, method=better).status.ok
