@@ -146,7 +146,7 @@ def ensemble(
             raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
         kept = np.setdiff1d(np.arange(len(run)), list(off))
         run, family, states = run[kept], family.select(kept), states[kept]
-    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
+    paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run, course)
     record = Record(family, member, states, course, outputs, np.nan if isinstance(step, Adaptive) else course.h)
     event = None if until is None else Event(until, member)
     pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
