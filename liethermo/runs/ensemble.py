@@ -88,7 +88,7 @@ def ensemble(
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
     noise : Fluctuations, optional
-        As for :func:`integrate`. Every trajectory has noise of its own, which depends on its number alone.
+        As for :func:`integrate`. Every trajectory has noise of its own, by its number and the times of its steps.
 
     Returns
     -------
