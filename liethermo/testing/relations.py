@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -333,7 +334,7 @@ def cuts(case: Case) -> list[float]:
 def in_parts(case: Case, ends: list[float], **options) -> Solution:
     """The last part of a run that is cut at some times: each part goes on from the state and attitude before it."""
     run: Solution | None = None
-    attitude: dict[str, np.ndarray] = {}
+    attitude: dict[str, Any] = {}
     for span in itertools.pairwise([0.0, *ends, case.time]):
         run = case.run(x0=case.x0 if run is None else run.x[-1], span=span, **attitude, **options)
         attitude = {} if run.attitude is None else {"attitude": run.attitude[-1]}
