@@ -108,6 +108,21 @@ class OneStepMethod(Module):
         """Those w for which ``h sum_i w_i k_i`` displaces the state by a share theta of a step, shape (..., stages)."""
         return integrated(self.stages, theta)
 
+    @property
+    def carries_rounding(self) -> bool:
+        """Whether a step hands on what rounding has kept from its end; otherwise the next step depends on x alone."""
+        return True
+
+    @property
+    def held_names(self) -> frozenset[str]:
+        """The names of the functions of its system that a method without such a memory holds besides the energy."""
+        return frozenset()
+
+    def resumed(self, system: System, x) -> jax.Array:
+        """Return the compensation of a step from x, shape (n,), that leads back to the surface of the system."""
+        nothing = jnp.zeros_like(x)
+        return nothing if system.surface is None else system.surface.settled(x, nothing)[1]
+
     def start(self, system: System, x) -> jax.Array:
         """Slopes to begin the iteration of a first step with."""
         return jnp.tile(system.vector_field(x), (self.stages, 1))
@@ -183,6 +198,9 @@ class Wrapping(OneStepMethod):
     weights = forwarded("method")
     predict = forwarded("method")
     check = forwarded("method")
+    carries_rounding = forwarded("method")
+    held_names = forwarded("method")
+    resumed = forwarded("method")
 
 
 class TransportingMethod(OneStepMethod):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,6 +38,9 @@ class Fluctuating(Wrapping, TransportingMethod):
     energy is exact on every path, and what noise and friction keep by construction is too. A summand of the dissipation
     that lowers the energy fluctuates with ``k T`` instead of k, T the temperature of the bath that takes it.
 
+    A step is a function of the state, the increments and the time alone: it hands on nothing of what rounding has kept
+    from the state. So a run in two parts is the run in one, to the bit.
+
     Mean-square order 1/2 (1 where the noise commutes), weak order 1 or better. It keeps no entropy law on paths. Made
     by :func:`liethermo.integrate` from the method that it is given and the ``noise``.
 
@@ -49,6 +54,8 @@ class Fluctuating(Wrapping, TransportingMethod):
         Logarithm of the density of the measure that the motion keeps.
     dW : array, shape (noise_dimension,)
         The increments of the noise in a step.
+    held_names : frozenset of str
+        The functions of the system that steps conserve, whatever the noise.
     """
 
     method: MetriplecticMidpoint
@@ -56,8 +63,11 @@ class Fluctuating(Wrapping, TransportingMethod):
     temperature: jax.Array
     density: Energy | None
     dW: jax.Array
+    held_names: frozenset[str] = eqx.field(static=True, default=frozenset())
 
     order = 1
+
+    carries_rounding = False
 
     @property
     def preserves(self) -> frozenset[str]:
@@ -66,7 +76,9 @@ class Fluctuating(Wrapping, TransportingMethod):
     retraction = forwarded("method")
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        return in_charts(self, system, self.method.retraction, "midpoint")
+        kept = frozenset(name for name in system.first_integrals() if self.keeps(system, name))
+        own = dataclasses.replace(self, held_names=kept)
+        return in_charts(own, system, self.method.retraction, "midpoint")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.at_midpoint(system, x, compensation, h, k)

@@ -116,6 +116,12 @@ class WithAttitude(Wrapping):
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(system.body_at(x), system.points(x), system.points(compensation), h, system.points(k))
 
+    def resumed(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
+        mu, g = system.split(x)
+        off = _missing(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        momentum = jnp.zeros_like(system.in_space(x)) if system.pushed_by else None
+        return system.join(self.method.resumed(system.body, mu), off, momentum)
+
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
     def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]

@@ -92,7 +92,7 @@ def ensemble(
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
     noise : Fluctuations, optional
-        As for :func:`integrate`. Every trajectory has noise of its own, which depends on its number alone.
+        As for :func:`integrate`. Every trajectory has noise of its own, by its number and the times of its steps.
 
     Returns
     -------
@@ -223,7 +223,9 @@ class _Plan(NamedTuple):
             run, family, states = run[left], family.select(left), states[left]
             if not len(run):
                 return None, reasons
-        paths = None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run)
+        paths = (
+            None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run, course)
+        )
         record = Record(family, member, states, course, self.outputs, np.nan if tolerance is not None else course.h)
         event = None if self.until is None else Event(self.until, member)
         own_ends = tolerance is not None or event is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +19,8 @@ from ..integrators.fluctuating import with_noise
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import at_points
-from .threefry import folded, normal
+from .threefry import derived, folded, normal, split_words
+from .timetable import Course
 
 BOUND = 6.0
 """Standard deviations that no random number exceeds, so that the equation of a step keeps a solution: one in 5e8 would,
@@ -34,9 +37,16 @@ class Fluctuations:
     for dissipations that lower the energy (:class:`DoubleBracket`, :class:`Friction`), it is ``exp(-H / (k T))``: that
     of a body in a bath, Langevin's equation.
 
-    The random numbers of a step are functions of the seed, the number of the trajectory and the number of the step
-    alone: they do not depend on the engine, nor on how a run or an ensemble is divided up. A normal number is cut off
-    at six standard deviations.
+    The random numbers of a step are functions of the seed, the number of the trajectory, the time at which the step
+    starts, and its length. They do not depend on the engine, on what is saved, or on how a run or an ensemble is
+    divided up. A normal number is cut off at six standard deviations.
+
+    A run may go on in parts: ``integrate(system, run.x[-1], (run.t[-1], t2), step, noise=noise)``, with the same noise
+    and the same step. Where the parts end at ends of steps of the whole run, they are the whole run. That is so to the
+    bit where nothing depends on time, and to rounding where an energy or a torque does. The times may be rounded in
+    different ways, as ``0.1 * 13`` and ``1.3`` are, if they are large by no more than 1e12 steps. Parts that end within
+    a step, or have another step, are another path, with random numbers that are independent of those before. Two runs
+    of the same seed, trajectory, step and times have the same noise: independent ones need different seeds.
 
     Parameters
     ----------
@@ -124,12 +134,81 @@ class Fluctuations:
         return with_noise(system, method, self.boltzmann, self.temperature, density)
 
     def rows(self, increments: int, members: np.ndarray, first: int, steps: int, h: float) -> np.ndarray:
-        """Increments of consecutive steps of size h of some trajectories, shape (trajectories, steps, increments)."""
+        """Return increments of consecutive steps of size h of a run that begins at time 0, from step ``first`` on.
+
+        Shape (trajectories, steps, increments).
+        """
+        return self.increments(increments, members, (first + np.arange(steps)) * h, h, h)
+
+    def increments(
+        self, count: int, trajectories: np.ndarray, starts: np.ndarray, length: float, step: float
+    ) -> np.ndarray:
+        """Return increments of the Wiener processes in steps of one length, shape (trajectories, steps, count).
+
+        They depend on the seed, the trajectory, the start and the length of each step alone: see :func:`step_cells`.
+
+        Parameters
+        ----------
+        count : int
+            Wiener processes.
+        trajectories : array of int, shape (trajectories,)
+            Numbers of trajectories.
+        starts : array, shape (steps,)
+            The times at which the steps start.
+        length : float, > 0
+            The length of these steps (time).
+        step : float, > 0
+            The step of the run (time): the length of all steps but those that are shortened to end at a given time.
+        """
         if len(self.seeds) == 1:
-            seeds, numbers = np.full(len(members), self.seeds[0]), members + self.first
+            seeds, numbers = np.array(self.seeds), trajectories + self.first
         else:
-            seeds, numbers = np.asarray(self.seeds)[members], np.full(len(members), self.first)
-        return np.sqrt(h) * np.clip(normal(seeds, numbers, first, steps, increments), -BOUND, BOUND)
+            seeds, numbers = np.asarray(self.seeds)[trajectories], np.full(len(trajectories), self.first)
+        halvings, cells = step_cells(starts, length, step)
+        highs, lows = split_words(cells)
+        values = np.empty((len(trajectories), len(cells), count))
+        for high in np.unique(highs):
+            key = derived(_key_of_steps(step_code(step), halvings, int(high)), split_words(seeds), (numbers, 0))
+            values[:, highs == high] = normal(key, lows[highs == high], count)
+        return np.sqrt(length) * np.clip(values, -BOUND, BOUND)
+
+
+CELLS = 64
+"""Cells of time in a step: steps that start in the same cell are the same step."""
+
+CELL_EDGE = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Where in its cell a multiple of the cell's length lies, as a share of that: the golden section, which is as far as
+possible from all simple fractions. In a run that starts at a simple fraction of a step, no step starts near the edge of
+a cell, where rounding would decide between two cells."""
+
+
+def step_cells(starts, length: float, step: float) -> tuple[int, np.ndarray]:
+    """Return integers that name steps by their times: one for their length, and one for each start, shape (steps,).
+
+    Times are counted in units of the ``step`` of the run, so that in a run that starts at a multiple of it the starts
+    are integers, but for their rounding. Each is put into a cell, 64 cells a step, whose edges are far from integers
+    and simple fractions. So a start that is rounded in another way, such as ``0.1 * 13`` for ``1.0 + 0.1 * 3``, is in
+    the same cell, as long as the rounding of times is less than a two hundredth of a step. In shorter steps cells are
+    shorter, by as many halvings as the first integer says: no two steps of a path have the same integers.
+    """
+    halvings = 1 - math.frexp(2.0 * CELL_EDGE * length / step)[1]
+    cells = np.floor(np.asarray(starts) / step * (CELLS * 2.0**halvings) + CELL_EDGE)
+    return halvings, cells.astype(np.int64)
+
+
+def step_code(step: float) -> int:
+    """Return an integer that names the step of a run by its first 32 bits, rounded where few numbers lie halfway.
+
+    Steps such as ``(t1 - t0) / 10``, which differ in their last bits, have the same one.
+    """
+    mantissa, exponent = math.frexp(step)
+    return (exponent << 31) + math.floor((mantissa - 0.5) * 2.0**32 + CELL_EDGE)
+
+
+@functools.lru_cache(256)
+def _key_of_steps(code: int, halvings: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """The key of all steps whose cells have these high words, shape (1,): found once for many calls."""
+    return derived(split_words([0]), split_words([code]), ([halvings], [high]))
 
 
 MEASURE = "the motion keeps the measure"
@@ -152,14 +231,17 @@ def _residuals(model: tuple[System, Energy | None], x):
 
 @dataclass(frozen=True)
 class Paths:
-    """The noise of trajectories with the given numbers, shape (B,)."""
+    """The noise of trajectories with the given numbers, shape (B,), along the course of a run."""
 
     noise: Fluctuations
     increments: int
     numbers: np.ndarray
+    course: Course
 
     def rows(self, chosen: slice | np.ndarray, first: int, steps: int, h) -> np.ndarray:
-        return self.noise.rows(self.increments, self.numbers[chosen], first, steps, float(h))
+        """Return the increments of steps of size h, from the one after ``first`` steps of the run on."""
+        starts = self.course.reached(first + np.arange(steps))
+        return self.noise.increments(self.increments, self.numbers[chosen], starts, float(h), self.course.h)
 
 
 def check_noise(noise, members: int = 1) -> None:

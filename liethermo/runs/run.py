@@ -66,7 +66,7 @@ class Run:
         self.noise = noise
         path: Callable | None = None
         if noise is not None and (increments := noise_dimension(method)):
-            only = Paths(noise, increments, np.zeros(1, dtype=int))
+            only = Paths(noise, increments, np.zeros(1, dtype=int), course)
             path = lambda first, steps, h: only.rows(slice(None), first, steps, h)[0]  # noqa: E731
         self.engine = Chosen(system, method, engine, course.steps, path)
 

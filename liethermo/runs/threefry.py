@@ -39,29 +39,39 @@ def folded(seed: int, places: Sequence[np.ndarray]) -> np.ndarray:
     return (key[0].astype(np.int64) & 0x7FFFFFFF) << 32 | key[1].astype(np.int64)
 
 
-def normal(seeds: np.ndarray, members: np.ndarray, first: int, steps: int, count: int) -> np.ndarray:
-    """Normal numbers, shape (members, steps, count): those with the counters (member, step, place) under each seed.
+def derived(key, *counters) -> tuple[np.ndarray, np.ndarray]:
+    """The key that a chain of counters leads to from a key: each is encrypted with the words that the last one gave."""
+    for counter in counters:
+        key = threefry(key, tuple(np.asarray(word).astype(np.uint32) for word in counter))
+    return key
+
+
+def split_words(numbers) -> tuple[np.ndarray, np.ndarray]:
+    """The high and the low 32 bits of integers of 64 bits; negative ones in two's complement."""
+    numbers = np.asarray(numbers).astype(np.int64).view(np.uint64)
+    return (numbers >> np.uint64(32)).astype(np.uint32), numbers.astype(np.uint32)
+
+
+def normal(key, steps: np.ndarray, count: int) -> np.ndarray:
+    """Normal numbers with the counters (step, place) under each key, shape (keys, steps, count).
 
     Parameters
     ----------
-    seeds, members : array of int, shape (members,)
-        Seeds below 2^64, numbers below 2^32.
-    first : int
-        Number of the first step.
+    key : two arrays of uint32, shape (keys,)
+    steps : array of uint32, shape (steps,)
+        The counters of the steps.
+    count : int
+        Normal numbers of a step.
     """
-    seeds = seeds.astype(np.uint64)
-    words = (seeds >> np.uint64(32)).astype(np.uint32), seeds.astype(np.uint32)
-    keys = threefry(words, (members.astype(np.uint32), np.zeros(len(members), np.uint32)))
-    found = np.empty((len(members), steps, count))
+    numbers = np.empty((len(key[0]), len(steps), count))
     places = np.arange(count, dtype=np.uint32)
     portion = max(1, BLOCK // max(count, 1))
-    together = max(1, portion // max(steps, 1))
-    for i in range(0, len(members), together):
-        own = keys[0][i : i + together, None, None], keys[1][i : i + together, None, None]
-        for start in range(0, steps, portion):
-            numbers = np.arange(first + start, first + min(start + portion, steps), dtype=np.uint32)[:, None]
-            high, low = threefry(own, (numbers, places))
+    together = max(1, portion // max(len(steps), 1))
+    for i in range(0, len(numbers), together):
+        keys = key[0][i : i + together, None, None], key[1][i : i + together, None, None]
+        for start in range(0, len(steps), portion):
+            high, low = threefry(keys, (steps[start : start + portion, None], places))
             bits = high.astype(np.uint64) << np.uint64(32) | low
             values = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
-            found[i : i + together, start : start + portion] = values
-    return found
+            numbers[i : i + together, start : start + portion] = values
+    return numbers

@@ -12,10 +12,15 @@ import numpy as np
 
 from ..engines.array import KEPT_STATES
 from ..errors import InputError
+from ..functions.gradients import EPS
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
 """Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
+
+
+ROUNDINGS_OF_TIME = 4.0
+"""Roundings of the larger end of a span that its length may be off by, where the ends are multiples of a step."""
 
 
 class Part(NamedTuple):
@@ -28,10 +33,13 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, start: float, end: float, h: float) -> Part:
-        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14.
-        full = math.floor((end - start) / h * (1 + 1e-12))
+        # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14, and 1024.9 - 1024.8 from
+        # asking for a second one: the times themselves are rounded.
+        rounding = min(ROUNDINGS_OF_TIME * EPS * max(abs(start), abs(end)), 0.01 * h)
+        tolerance = max(1e-12 * (end - start), rounding)
+        full = math.floor((end - start + tolerance) / h)
         last = end - (start + full * h)
-        return cls(start, end, full, last if last > 1e-12 * (end - start) else 0.0)
+        return cls(start, end, full, last if last > tolerance else 0.0)
 
     @property
     def steps(self) -> int:

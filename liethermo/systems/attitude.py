@@ -94,6 +94,10 @@ class AttitudeSystem(System):
         rest = [] if p is None else [p]
         return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1), *rest], axis=-1)
 
+    def of_clock(self, v):
+        mu, g = self.split(v)
+        return self.join(self.body.of_clock(mu), jnp.zeros_like(g), self.in_space(v) if self.pushed_by else None)
+
     def body_at(self, x) -> LiePoissonSystem | DrivenSystem:
         """The body, for use at the attitude of a state."""
         return self.body.turned(self.split(x)[1]) if isinstance(self.body, DrivenSystem) else self.body

@@ -303,6 +303,10 @@ class System(Kind):
         """This system with its components in another order, in which programs for large states are faster, if any."""
         return None
 
+    def of_clock(self, v) -> jax.Array:
+        """Return v, shape (n,), with zeros in all components but those that only count: a clock, and the work done."""
+        return jnp.zeros_like(v)
+
     def presented(self, solution: Any) -> Any:
         """A solution of this system, as its user is to see it."""
         return self.on_sites(solution)

@@ -85,6 +85,9 @@ class DrivenSystem(System):
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
 
+    def of_clock(self, v):
+        return jnp.concatenate([jnp.zeros_like(v[:-2]), v[-2:]])
+
     def seen(self, x):
         return self.body.points(x[..., :-2])
 

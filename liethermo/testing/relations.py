@@ -10,10 +10,12 @@ from __future__ import annotations
 import functools
 import gc
 import importlib.util
+import itertools
 import tempfile
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,13 +27,14 @@ from ..engines.choice import is_small
 from ..errors import InputError
 from ..functions.energy import Pullback
 from ..functions.gradients import EPS
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators import DEFAULT_METHOD, MetriplecticMidpoint, OneStepMethod
 from ..integrators.base import estimates_error, orderless
 from ..interop.scipy import solve_ivp
 from ..results.load import load
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.ensemble import Ensemble, ensemble
+from ..runs.fluctuations import Fluctuations
 from ..runs.integrate import integrate
 from ..studies.axes import replicas
 from ..studies.study import Study
@@ -310,19 +313,65 @@ def reversal(case: Case) -> Outcome:
 
 
 def split(case: Case) -> Outcome:
-    """A span may be cut in two, and states be kept seldom."""
+    """A span may be cut into parts, and states be kept seldom."""
     seldom = case.run(save_every=5)
     case.near("every fifth state kept", seldom.x[-1], case.base.x[-1], 0.0)
-    middle = len(case.base.t) // 2
-    if isinstance(case.step, Adaptive) or case.system.is_driven or middle == 0:
-        return None
-    t, x = case.base.t[middle], case.base.x[middle]
-    attitude = {} if case.base.attitude is None else {"attitude": case.base.attitude[middle]}
-    rest = case.run(x0=x, span=(t, case.time), **attitude)
-    case.near("the second half by itself", rest.x[-1], case.base.x[-1], case.rounding)
-    if rest.attitude is not None and case.base.attitude is not None:
-        case.suite.equal(f"{case.name}: its attitude", rest.attitude[-1], case.base.attitude[-1], case.rounding)
+    ends = cuts(case)
+    if not ends:
+        return "there are too few steps"
+    allowed = case.resolved if isinstance(case.step, Adaptive) else case.rounding
+    last = in_parts(case, ends)
+    case.near(f"in {len(ends) + 1} parts", last.x[-1], case.base.x[-1], allowed)
+    if last.attitude is not None and case.base.attitude is not None:
+        case.suite.equal(f"{case.name}: their attitude", last.attitude[-1], case.base.attitude[-1], allowed)
     return None
+
+
+def cuts(case: Case) -> list[float]:
+    """Times at which a run is cut: ends of its steps, at an eighth and at a half of it."""
+    count = len(case.base.t) - 1
+    return [float(case.base.t[i]) for i in sorted({count // 8, count // 2}) if 0 < i < count]
+
+
+def in_parts(case: Case, ends: list[float], **options) -> Solution:
+    """The last part of a run that is cut at some times: each part goes on from the state and attitude before it."""
+    run: Solution | None = None
+    attitude: dict[str, Any] = {}
+    for span in itertools.pairwise([0.0, *ends, case.time]):
+        run = case.run(x0=case.x0 if run is None else run.x[-1], span=span, **attitude, **options)
+        attitude = {} if run.attitude is None else {"attitude": run.attitude[-1]}
+    assert run is not None
+    return run
+
+
+def noise(case: Case) -> Outcome:
+    """A run with noise in parts is the run, to the bit where nothing depends on time; other times have other noise."""
+    if isinstance(case.step, Adaptive) or not isinstance(case.method, MetriplecticMidpoint):
+        return "steps with noise are those of MetriplecticMidpoint, of one size"
+    ends = cuts(case)
+    if not ends:
+        return "there are too few steps"
+    lowers = case.system.dissipation is not None and any(
+        part.energy_law != "conserved" for part in case.system.dissipation.terms
+    )
+    own = Fluctuations(NOISE_LEVEL, seed=case.seed, temperature=1.0 if lowers else None)
+    try:
+        whole = case.run(noise=own)
+    except InputError as error:
+        return str(error)
+    if not whole.status.ok:
+        return f"the run with noise ends: {whole.status.message}"
+    last = in_parts(case, ends, noise=own)
+    tail = whole.x[-len(last.x) :]
+    case.near("in parts", last.x, tail, case.rounding if case.system.is_driven else 0.0)
+    later = case.run(x0=case.x0, span=(case.time, 2.0 * case.time), noise=own)
+    other = not np.array_equal(later.x[-1], whole.x[-1])
+    case.suite.true(f"{case.name}: another time has other noise", other)
+    return None
+
+
+NOISE_LEVEL = 1e-6
+"""Boltzmann's constant of runs with noise, in the units of the entropy."""
 
 
 # -- by other ways --------------------------------------------------------------------------------------------------
@@ -440,6 +489,17 @@ def file(case: Case) -> Outcome:
     case.suite.true(f"{case.name}: loaded to the bit", alike and found.status == case.base.status)
     same = str(found.audit()) == str(case.base.audit())
     case.suite.true(f"{case.name}: the audit is that of the run", same)
+    if ends := cuts(case)[-1:]:
+        middle = int(np.searchsorted(found.t, ends[0]))
+        rests = [
+            case.run(
+                x0=run.x[middle],
+                span=(run.t[middle], case.time),
+                **({} if run.attitude is None else {"attitude": run.attitude[middle]}),
+            )
+            for run in (case.base, found)
+        ]
+        case.suite.true(f"{case.name}: goes on to the bit", np.array_equal(rests[0].x, rests[1].x))
     return None
 
 
@@ -526,6 +586,7 @@ RELATIONS: dict[str, Callable[[Case], Outcome]] = {
     "side by side": side_by_side,
     "reversal": reversal,
     "split": split,
+    "noise": noise,
     "engines": engines,
     "ensemble": many,
     "company": company,
@@ -551,8 +612,9 @@ def check_relations(
 
     A constant in the energy; units of state and time by factors up to 1e20; components in another order and axes
     turned (another basis of the algebra); a rate shared by two dissipations; parameters closed over; an entropy that is
-    known near the motion alone; a system beside itself; the motion backwards; a span in two parts; every engine; the
-    run in an ensemble, beside members of other symmetry, in a study, from a file, by SciPy's and by diffrax's call.
+    known near the motion alone; a system beside itself; the motion backwards; a span in parts, with noise too; every
+    engine; the run in an ensemble, beside members of other symmetry, in a study, from a file, by SciPy's and by
+    diffrax's call.
 
     Parameters
     ----------
@@ -587,12 +649,10 @@ def check_relations(
     if unknown := set(wanted) - set(RELATIONS):
         raise InputError(f"there is no relation {unknown.pop()!r}; there are {', '.join(RELATIONS)}")
     start = start_of(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
-    h = step_of(system, start)
-    step = h if step is None else step
-    length = STEPS * (h if isinstance(step, Adaptive) else step)
-    case = Case(
-        system, DEFAULT_METHOD if method is None else method, start, step, length if time is None else time, seed
-    )
+    step = step_of(system, start) if step is None else step
+    if time is None:
+        time = STEPS * (step_of(system, start) if isinstance(step, Adaptive) else step)
+    case = Case(system, DEFAULT_METHOD if method is None else method, start, step, time, seed)
     completes(case.suite, "the run", case.base)
     for name in wanted:
         case.name = name

@@ -33,15 +33,20 @@ def rebuilt(tree):
 def start_of(system: System, seed: int) -> np.ndarray:
     """A random state inside the domain of the system."""
     for x in system.samples(20, seed):
-        if not system.outside(jnp.asarray(x)) and np.isfinite(np.asarray(system.vector_field(x))).all():
+        if not system.outside(jnp.asarray(x)) and np.isfinite(_field_at_start(system, x)).all():
             return np.asarray(x)
     raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
 
 
 def step_of(system: System, x0) -> float:
     """A step in which the state moves by a hundredth of its size."""
-    speed, size = (float(np.linalg.norm(np.asarray(v))) for v in (system.vector_field(x0), x0))
+    speed, size = (float(np.linalg.norm(np.asarray(v))) for v in (_field_at_start(system, x0), x0))
     return 0.01 * max(size, 1e-3) / speed if speed > 0.0 else 0.01
+
+
+def _field_at_start(system: System, x) -> np.ndarray:
+    """The vector field at a state, at the time 0 where it depends on time."""
+    return np.asarray(system.vector_field(x, 0.0) if system.is_driven else system.vector_field(x))
 
 
 def completes(suite: Suite, what: str, run: Solution) -> None:

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 import liethermo as lt
 import manifolds as mf
 from liethermo import testing
+from liethermo.integrators import fluctuating
 from liethermo.integrators.base import estimates_error
+from liethermo.runs.timetable import Course
 from liethermo.testing.changed import Change, changed, in_basis
 from tests.cases import DISSIPATIONS, REPRESENTATIVE, build, state_of
 
@@ -179,6 +181,44 @@ def test_a_fault_is_found(relation):
     assert testing.check_relations(body, METHODS["midpoint"], [0.5, 0.8, 0.3], 0.02, relations=[relation]).passed
     with pytest.raises(testing.PropertyError, match=f"{relation}: .*FAILS"):
         testing.check_relations(body, method, [0.5, 0.8, 0.3], 0.02, relations=[relation])
+
+
+class Remembering(fluctuating.Fluctuating):
+    """Control: steps with noise that hand on what rounding has kept from the state."""
+
+    carries_rounding = True
+
+
+def test_noise_that_repeats_is_found(monkeypatch):
+    """Controls: noise that is counted from the start of each call, and steps that depend on more than the state."""
+    body = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 3.0])), lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.2)
+    )
+
+    def check(seed):  # one of its own for each method, which is remembered
+        options = {"relations": ["noise"], "time": 4.0, "seed": seed}
+        testing.check_relations(body, METHODS["midpoint"], [0.5, 0.8, 0.3], 0.02, **options)
+
+    check(0)
+    with monkeypatch.context() as patched:
+        patched.setattr(Course, "reached", lambda self, steps: np.asarray(steps) * self.h)
+        with pytest.raises(testing.PropertyError, match=r"noise: .*FAILS"):
+            check(1)
+    with monkeypatch.context() as patched:
+        patched.setattr(fluctuating, "Fluctuating", Remembering)
+        with pytest.raises(testing.PropertyError, match=r"noise: in parts .*FAILS"):
+            check(2)
+
+
+@pytest.mark.parametrize("method", ["midpoint", "explicit 4"])
+def test_parts_of_what_depends_on_time(method):
+    """Parts start at their own times; a torque knows time and attitude."""
+    driven = lt.LiePoissonSystem(mf.so(3), lambda s, t: -jnp.cos(t) * s[2], None, lt.DoubleBracket(0.5))
+    assert testing.check_relations(driven, METHODS[method], [1.0, 0.3, 0.2], relations=["split", "noise"]).passed
+    pushed = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), torque=lambda t, mu, g: 0.3 * jnp.sin(t) * g[0], group=mf.SO(3)
+    )
+    assert testing.check_relations(pushed, METHODS[method], [1.0, 0.3, 0.2], 0.05, relations=["split", "file"]).passed
 
 
 def test_a_name_that_is_none():
