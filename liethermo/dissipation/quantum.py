@@ -409,9 +409,8 @@ GENERIC = (1.0, 0.7548776662466927, 0.5698402909980532)
 def _eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
     """The eigenvectors that Hamiltonians have in common, if they have any; those of diagonal matrices are the axes."""
     sizes = [np.abs(H).max() for H in hamiltonians]
-    H = sum(
-        w * H / (size or 1.0) for w, H, size in zip(GENERIC, map(_without_common, hamiltonians), sizes, strict=False)
-    )
+    parts = zip(GENERIC, map(_without_common, hamiltonians), sizes, strict=False)  # there may be fewer than weights
+    H = sum((w * H / (size or 1.0) for w, H, size in parts), np.zeros_like(hamiltonians[0]))
     return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
 
 

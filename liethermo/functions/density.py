@@ -218,7 +218,7 @@ class MeanEnergy(Linear):
     b : array, shape (N^2,)
         The coordinates of H.
     common : array, shape ()
-        e: see :func:`common_energy`. No value of it makes a difference but by rounding.
+        e: see :func:`common_energy`. It makes no difference but by rounding.
     """
 
     common: jax.Array
@@ -233,13 +233,11 @@ class MeanEnergy(Linear):
         return MeanEnergy(-self.b, -self.common)
 
 
-def common_energy(levels) -> jax.Array | float:
+def common_energy(levels: np.ndarray) -> float:
     """The lower one of the two levels that are nearest to each other: their differences then lose no digit.
 
-    It grows by c where all levels, shape (N,), do. Of levels that are traced it is the lowest.
+    It grows by c where all levels, shape (N,), do.
     """
-    if isinstance(levels, jax.core.Tracer):
-        return jnp.min(levels)
     ordered = np.sort(levels)
     return float(ordered[0 if len(ordered) == 1 else np.argmin(np.diff(ordered))])
 
@@ -250,7 +248,11 @@ def without_energy(b, common) -> jax.Array:
 
 
 class Expectation(Module):
-    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``common`` is as in :class:`MeanEnergy`."""
+    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``common`` is as in :class:`MeanEnergy`.
+
+    It is the lowest level at the time zero, so that it grows by c where H does: a discrete gradient weights the state
+    and the time by the gradients of the energy by both.
+    """
 
     hamiltonian: Callable
     structure: mf.DensityMatrices

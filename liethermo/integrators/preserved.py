@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, as_energy, function_name
 from ..systems import System
 
 
@@ -29,7 +29,7 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
     """
     for C, kept in zip(functions, system.conserves(tuple(functions)), strict=True):
         if kept is False:
-            name = getattr(getattr(C, "function", None), "__name__", str(C))
+            name = function_name(C) or str(C)
             raise InputError(
                 f"the system does not conserve the preserved function {name}: holding it would change the "
                 "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"

@@ -21,7 +21,7 @@ from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
 from ..errors import AxiomError, CasimirError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, as_energy, function_name
 from ..functions.frames import frame
 from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
@@ -311,7 +311,7 @@ class System(Kind):
         """A solution, or an ensemble, with its states, shape (..., n), as they are shown on sites."""
         if not self.sites:
             return found
-        states = {name: value for name in ("x", "x0") if (value := getattr(found, name, None)) is not None}
+        states = {name: value for name in found.state_fields if (value := getattr(found, name)) is not None}
         shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
         return dataclasses.replace(found, **shown)
 
@@ -352,7 +352,7 @@ class System(Kind):
         names, taken = list(known), {"energy", "entropy"}
         for i, (fallback, L) in enumerate(self.preserved_by_name().items(), start=len(known)):
             same = next((names[j] for j in range(i) if _proportional(gradients[:, i], gradients[:, j])), None)
-            given = getattr(getattr(L, "function", None), "__name__", "")
+            given = function_name(L)
             usable = given.isidentifier() and given not in {*names, *taken}
             names.append(same or (given if usable else fallback))
         return tuple(names[len(known) :])

@@ -461,18 +461,16 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
             checked_hermitian(_at(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}") for t in TIMES
         ]
         structure = mf.DensityMatrices(len(matrices[0]))
-        with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-            common = jnp.asarray(common_energy(np.diag(matrices[0]).real))
-        return structure.size, TimeDependent(Expectation(hamiltonian, structure, common))
+        with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
+            lowest = jnp.asarray(np.diag(matrices[0]).real.min())
+        return structure.size, TimeDependent(Expectation(hamiltonian, structure, lowest))
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
-        return structure.size, MeanEnergy(
-            structure.vector(hamiltonian), jnp.asarray(common_energy(jnp.diag(hamiltonian).real))
-        )
+        return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
-    with jax.ensure_compile_time_eval():
-        common = jnp.asarray(common_energy(np.diag(H).real))
-        return len(H), MeanEnergy(jnp.asarray(mf.DensityMatrices(len(H)).vector(H)), common)
+    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+        b, common = jnp.asarray(mf.DensityMatrices(len(H)).vector(H)), jnp.asarray(common_energy(np.diag(H).real))
+    return len(H), MeanEnergy(b, common)
 
 
 def _at(function, t: float, what: str):
@@ -517,12 +515,12 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         still, *rows = (jnp.asarray(structure.vector(a)) for a in (sum(constant, np.zeros_like(H)), *moved))
-    levels = still + sum((f(TIMES[0]) * row for f, row in zip(functions, rows, strict=True)), 0.0)
-    common = common_energy(levels[: structure.size] if is_traced(levels) else np.asarray(levels)[: structure.size])
-    common = common if is_traced(common) else jnp.asarray(np.float64(common))
-    if moved:
-        return structure.size, TimeDependent(Modulated(still, tuple(rows), tuple(functions), common))
-    return structure.size, MeanEnergy(still, common)
+        common = jnp.asarray(common_energy(np.asarray(still)[: structure.size]))
+    if not moved:
+        return structure.size, MeanEnergy(still, common)
+    first = sum((f(TIMES[0]) * row for f, row in zip(functions, rows, strict=True)), still)
+    lowest = jnp.min(first[: structure.size])  # in the same way where a function is traced
+    return structure.size, TimeDependent(Modulated(still, tuple(rows), tuple(functions), lowest))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:
