@@ -161,9 +161,9 @@ def directions(system: System, x, gradients: Sequence[jax.Array], leaf: bool = F
 
 def _along_leaf(system: System, x, gradient) -> jax.Array:
     """``Pi(x) gradient``, shape (n,); zero where it is the rounding of zero, as at a state of rest on its leaf."""
-    found = system.poisson.sharp(x, gradient)
-    at_rest = jnp.linalg.norm(found) <= AT_REST * jnp.linalg.norm(x) * jnp.linalg.norm(gradient)
-    return jnp.where(at_rest, 0.0, found)
+    found, n = system.poisson.sharp(x, gradient), system.body_dim  # behind which a clock and work have other units
+    at_rest = jnp.linalg.norm(found[:n]) <= AT_REST * jnp.linalg.norm(x[:n]) * jnp.linalg.norm(gradient[:n])
+    return jnp.where(at_rest & (jnp.arange(found.size) < n), 0.0, found)
 
 
 def correction(system: System, along: Sequence[jax.Array], changes: jax.Array) -> jax.Array:

@@ -518,10 +518,10 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
         common = jnp.asarray(common_energy(np.asarray(still)[: structure.size]))
     if not moved:
         return structure.size, MeanEnergy(still, common)
-    first = still
+    at_start = still
     for f, row in zip(functions, rows, strict=True):
-        first = first + f(TIMES[0]) * row
-    lowest = jnp.min(first[: structure.size])  # in the same way where a function is traced
+        at_start = at_start + f(TIMES[0]) * row
+    lowest = jnp.min(at_start[: structure.size])  # in the same way where a function is traced
     return structure.size, TimeDependent(Modulated(still, tuple(rows), tuple(functions), lowest))
 
 
