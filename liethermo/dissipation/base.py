@@ -22,7 +22,7 @@ from manifolds._module import Module, forwarded
 
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.indices import union
+from ..functions.indices import Indices, union
 from .factor import Factor, beside
 from .geometry import Geometry
 
@@ -105,6 +105,11 @@ class Dissipation(Module):
         dL : tuple of array, shape (n,)
             Gradients of the functions in :attr:`preserve`, in their order.
         """
+
+    @property
+    def heated_bath(self) -> Indices | None:
+        """The number of the bath that takes its heat, or of that of each site; None for the first one."""
+        return None
 
     @property
     def has_generator(self) -> bool:

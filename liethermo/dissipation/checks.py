@@ -118,7 +118,7 @@ def check_matrix(form, dim: int, what: str) -> None:
 
 def needed_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:
     """The algebra of a system; InputError where it has none, or where a form is not one of it."""
-    algebra = getattr(system, "algebra", None)
+    algebra = system.lie_algebra
     if algebra is None:
         raise InputError(f"{name} lives on a Lie algebra: use it in a LiePoissonSystem, or take ProjectedMetric()")
     dim = algebra.dim if form is None or isinstance(form, BlockDiagonal) else form.shape[0]

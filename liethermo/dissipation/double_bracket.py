@@ -66,6 +66,10 @@ class DoubleBracket(Dissipation):
         check_matrix(metric, system.dim, "the metric")
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
+    @property
+    def heated_bath(self):
+        return self.bath
+
     def force(self, system, x, dH, dS, dL):
         return self.rate * system.poisson.sharp(x, self._lowered(system, x, dH))
 

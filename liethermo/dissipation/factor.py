@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 from manifolds.matrices.symmetric import semidefinite_factor
@@ -60,7 +61,7 @@ def root_of(form) -> Any:
         return eqx.tree_at(lambda f: f.blocks, form, roots) if known else None
     if isinstance(form, Diagonal):
         return Diagonal(jnp.sqrt(form.entries))
-    return semidefinite_factor(form) if hasattr(form, "shape") else None
+    return semidefinite_factor(form) if isinstance(form, jax.Array | np.ndarray) else None
 
 
 def beside(factors: Sequence[Factor]) -> Factor:

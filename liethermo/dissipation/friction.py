@@ -57,6 +57,10 @@ class Friction(Dissipation):
             check_matrix(self.D, system.dim, "the friction D")
         return self
 
+    @property
+    def heated_bath(self):
+        return self.bath
+
     def force(self, system, x, dH, dS, dL):
         if self.D is None:
             return -self.rate * system.raised(x, dH)

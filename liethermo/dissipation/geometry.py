@@ -19,8 +19,7 @@ from ..tracing.programs import part
 class Geometry(Module):
     """What a dissipation may ask of the system that it acts in. Every system has it, whatever its class.
 
-    One on the dual of a Lie algebra has the attribute ``algebra`` besides, and ``poisson.places`` says where the bodies
-    are in the state of a system of several.
+    ``poisson.places`` says where the bodies are in the state of a system of several.
 
     Attributes
     ----------
@@ -37,6 +36,16 @@ class Geometry(Module):
     energy: Energy
     dim: int = eqx.field(static=True)
     space: mf.Space | None = eqx.field(static=True)
+
+    @property
+    def lie_algebra(self) -> mf.LieAlgebra | None:
+        """The Lie algebra whose dual states are in; None where the system is not on one."""
+        return None
+
+    @property
+    def matrix_group(self) -> mf.MatrixGroup | None:
+        """The group of the attitudes; None where there are none."""
+        return None
 
     @property
     def sites(self) -> tuple[int, ...]:

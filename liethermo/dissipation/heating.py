@@ -172,8 +172,7 @@ def _carried(
     functions = tuple(map(pulled, part.preserve))
     if part.energy_law != "nonincreasing":
         return BesideBaths(part, functions)
-    given = getattr(part, "bath", None)
-    bath = Indices(0) if given is None else given
+    bath = Indices(0) if part.heated_bath is None else part.heated_bath
     numbers = np.asarray(bath)
     if numbers.shape not in ((), body.heating_sites):
         there = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""

@@ -71,6 +71,10 @@ class LandauLifshitz(Dissipation):
             )
         return self
 
+    @property
+    def heated_bath(self):
+        return self.bath
+
     def force(self, system, x, dH, dS, dL):
         force, _ = self.damped(system.poisson, x, dH)
         return system.poisson.joined(force, jnp.zeros(0))

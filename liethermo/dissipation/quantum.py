@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -18,17 +19,24 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
-from ..functions.density import OfMatrix
+from ..functions.density import OfMatrix, common_energy, logarithm, positive_part
 from ..functions.energy import Energy, Function
-from ..functions.frames import frame
+from ..functions.frames import Frame, frame
 from ..functions.gradients import EPS
 from ..functions.indices import Fixed
 from ..functions.with_baths import WithBaths
 from .base import Dissipation
 from .checks import checked_rate
 
-EIGEN = 1e-9
-"""Residual of ``[H, V] = -omega V``, and difference of frequencies, relative to the sizes of H and V, that is zero."""
+ROUNDINGS = 8.0 * EPS
+"""Error of an energy, relative to the largest one; times the number of levels, where energies are eigenvalues."""
+
+
+@runtime_checkable
+class HasMatrix(Protocol):
+    """An operator that is not an array and gives its matrix, as a ``Qobj`` of QuTiP does."""
+
+    def full(self) -> np.ndarray: ...
 
 
 class Operator(Fixed):
@@ -99,6 +107,8 @@ class ThermalJumps(Dissipation):
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True)
     frame: Operator | None = eqx.field(static=True)
+    order: tuple[int, ...] = eqx.field(static=True)
+    driven: bool = eqx.field(static=True)
     isolated: bool = eqx.field(static=True)
     keeps_energy: bool = eqx.field(static=True)
 
@@ -115,7 +125,8 @@ class ThermalJumps(Dissipation):
         self.rates = tuple(
             _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(given)
         )
-        self.bath, self.jumps, self.frame, self.isolated, self.keeps_energy = bath, (), None, False, True
+        self.bath, self.jumps, self.frame, self.order, self.driven = bath, (), None, (), False
+        self.isolated, self.keeps_energy = False, True
 
     @property
     def energy_law(self):
@@ -139,22 +150,23 @@ class ThermalJumps(Dissipation):
         hamiltonians = system.hamiltonians()
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if _hermitian(V) else 1.0) for i, V in enumerate(self.operators))
-            kept = all(_small(_commutator(H, V), H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
+            kept = all(_commute(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
             return self._replaced(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
-        vectors = _eigenvectors(hamiltonians[0])
-        inside = [adjoint(vectors) @ H @ vectors for H in hamiltonians]
-        parts = [_split(V, i, inside, vectors) for i, V in enumerate(self.operators)]
+        vectors = _eigenvectors(hamiltonians)
+        parts = [_split(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
         jumps = tuple(itertools.chain.from_iterable(parts))
-        found = self._replaced(jumps=jumps, frame=frame, isolated=False, keeps_energy=True)
+        levels = np.diag(adjoint(vectors) @ _without_common(hamiltonians[0]) @ vectors).real
+        order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
+        found = self._replaced(jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True)
         if not is_traced((self.rates, baths)):
             found._check_rates(system.at_some_times()[0] if system.is_driven else system)
         return found
 
     def _replaced(self, **fields) -> ThermalJumps:
         found = object.__new__(ThermalJumps)
-        for name in ("operators", "rates", "bath", "jumps", "frame", "isolated", "keeps_energy"):
-            object.__setattr__(found, name, fields.get(name, getattr(self, name)))
+        for field in dataclasses.fields(self):
+            object.__setattr__(found, field.name, fields.get(field.name, getattr(self, field.name)))
         return found
 
     def with_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
@@ -162,18 +174,26 @@ class ThermalJumps(Dissipation):
         return self._replaced(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
+        """The force, of which Lindblad's equation is the part that is exact: no logarithm of rho is in it.
+
+        ``L B(dS)`` is ``e^(-omega / 2T) rho V - e^(omega / 2T) V rho`` at the gradient of the entropy. L has to be
+        applied to what a discrete gradient differs by. So eigenvalues that are zero to rounding stay so.
+        """
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._inside(structure.matrix(a[:n])) for a in (x, dH, dS))
-        fixed = _stacked(self.jumps)
+        fixed, logs = _stacked(self.jumps), logarithm(rho)
         V, back, omega = jnp.asarray(fixed), jnp.asarray(adjoint(fixed)), self._frequencies(structure, dH[:n])
-        if self.isolated:
-            T, shift = jnp.asarray(jnp.inf), jnp.zeros(len(self.jumps))
-        else:
-            T = dH[n + self.bath]
-            shift, A = omega / (2.0 * T), A - (dS[n + self.bath] / T) * H
-        image = log_mean(mf.spectral(jnp.log, rho), shift, _commutator(V, A)) * self._strengths(omega, T)[:, None, None]
-        moved = jnp.sum(_commutator(back, image), axis=0)  # the adjoints add the adjoint
-        return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
+        T = jnp.asarray(jnp.inf) if self.isolated else dH[n + self.bath]
+        shift, rest = omega / (2.0 * T), _commutator(V, A + logs)
+        if not self.isolated:
+            # [V, H] by differences of levels, which lose no digits, and by what H has beside them, which is mostly zero
+            levels, apart = self._levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
+            taken = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * apart)
+            rest = rest - (dS[n + self.bath] * taken - omega[:, None, None] * V) / T
+        grown = jnp.exp(shift)[:, None, None]
+        image = rho @ V / grown - grown * (V @ rho) + log_mean(logs, shift, rest)
+        moved = jnp.sum(_commutator(back, image * self._strengths(omega, T)[:, None, None]), axis=0)
+        return self._with_heat(system, dH, T, moved)  # the adjoints add the adjoint
 
     has_generator = True
 
@@ -186,7 +206,7 @@ class ThermalJumps(Dissipation):
         rates = jnp.concatenate([strengths * grown, strengths / grown])
         # the Hermitian part has both terms of what is lost
         moved = _jumped(self.jumps, rates, rho) - jnp.tensordot(rates, _left(self.jumps), 1) @ rho
-        return self._with_heat(system, dH, T, structure.vector(self._outside(moved)))
+        return self._with_heat(system, dH, T, moved)
 
     def _check_rates(self, system) -> None:
         """Raise InputError where rates at the first temperature of the bath cannot be computed with."""
@@ -210,17 +230,50 @@ class ThermalJumps(Dissipation):
         return matrix if self.frame is None else np.asarray(self.frame) @ matrix @ adjoint(np.asarray(self.frame))
 
     def _frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
-        """The energies that the jumps take: linear in H, by a table that is known when programs are written."""
-        fixed = _stacked(self.jumps)
-        along = _commutator(adjoint(fixed), fixed) / np.sum(np.abs(fixed) ** 2, axis=(-2, -1))[:, None, None]
-        return structure.vector(self._outside(along)) @ dH
+        """The energies that the jumps take: linear in H, by tables that are known when programs are written.
 
-    def _with_heat(self, system, dH, T, force) -> jax.Array:
-        """The force with the entropy that the bath takes."""
+        ``tr(H [V^H, V]) / tr(V^H V)``, the diagonal of H by differences of levels, which lose no digits.
+        """
+        fixed, apart, levels = _stacked(self.jumps), 1.0 - np.eye(structure.size), self._levels(structure, dH)
+        weights = np.abs(fixed) ** 2
+        squares = np.sum(weights, axis=(-2, -1))
+        k, j = np.nonzero(np.sum(weights * apart, axis=0))
+        omega = (weights[:, k, j] / squares[:, None]) @ (levels[j] - levels[k])
+        rest = apart * _commutator(adjoint(fixed), fixed) / squares[:, None, None]
+        return omega + structure.vector(self._outside(rest)) @ dH if rest.any() else omega
+
+    def _levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
+        """The diagonal of H in the frame, shape (N,)."""
+        if self.frame is None:
+            return dH[: structure.size]
+        vectors = np.asarray(self.frame).T
+        return structure.vector(vectors[:, :, None] * vectors[:, None, :].conj()) @ dH
+
+    def _with_heat(self, system, dH, T, moved) -> jax.Array:
+        """The coordinates of what the jumps do to rho, in the frame, and the entropy that the bath takes."""
+        structure, n = system.structure, system.body_dim
+        force = structure.vector(self._outside(moved))
         if self.isolated:
             return force
-        taken = -jnp.dot(dH[: system.body_dim], force) / T
-        return jnp.concatenate([force, np.eye(system.dim - system.body_dim)[self.bath] * taken])
+        taken = -self._energy_rate(structure, dH[:n], moved, force) / T
+        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * taken])
+
+    def _energy_rate(self, structure: mf.DensityMatrices, dH, moved, force) -> jax.Array:
+        """``tr(H moved)``, shape (), of a matrix of trace zero in the frame, and of its coordinates outside.
+
+        It is summed by parts, from differences of neighbouring levels and the populations that cross between them. So
+        levels that no jump connects do not matter, however large their energies are.
+        """
+        order, size = np.array(self.order), structure.size
+        levels = self._levels(structure, dH)[order]
+        populations = force[:size] if self.frame is None else jnp.diagonal(moved).real
+        rate = jnp.dot(levels[:-1] - levels[1:], np.tri(size - 1, size) @ populations[order])
+        if self.frame is None:
+            return rate + jnp.dot(dH[size:], force[size:])
+        if not self.driven:  # H is diagonal in the frame
+            return rate
+        H = self._inside(structure.matrix(dH))
+        return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * moved).real)
 
     def _strengths(self, omega, T) -> jax.Array:
         rates = [self.rates[jump.source] for jump in self.jumps]
@@ -285,16 +338,25 @@ class SteepestEntropyAscent(Dissipation):
         return found
 
     def force(self, system, x, dH, dS, dL):
+        held, raised = self._frame(system, x, dH, dL)
+        force = held.off_images(raised(held.off(dS[: system.body_dim])))
+        return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
+
+    def direction(self, system, x, dH, dS, dL) -> jax.Array:
+        """``P dS``, shape (N^2,): the gradient of the entropy, less the part along what is preserved."""
+        held, _ = self._frame(system, x, dH, dL)
+        return held.off(dS[: system.body_dim])
+
+    def _frame(self, system, x, dH, dL) -> tuple[Frame, Callable]:
+        """The gradients of what is preserved, orthogonal for L, and L."""
         structure, n = system.structure, system.body_dim
-        rho = structure.matrix(x[:n])
+        rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
         def raised(alpha):  # the Hermitian part of rho A has both terms
             return structure.vector(rho @ structure.matrix(alpha))
 
         one = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
-        held = frame((one, dH[:n], *(L[:n] for L in dL)), form=raised)
-        force = held.off_images(raised(held.off(dS[:n])))
-        return jnp.pad(self.rate * force, (0, system.dim - n))
+        return frame((one, dH[:n], *(L[:n] for L in dL)), form=raised), raised
 
 
 class _Observable(eqx.Module):
@@ -316,8 +378,7 @@ def needed_density(system, name: str) -> mf.DensityMatrices:
 
 def checked_matrix(matrix, what: str) -> np.ndarray:
     """A square complex matrix; that of a ``Qobj`` too, which is read by its ``full()``."""
-    full: Callable | None = getattr(matrix, "full", None)
-    found = np.asarray(full() if callable(full) else matrix)
+    found = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
     if found.dtype.kind not in "fiuc" or found.ndim != 2 or found.shape[0] != found.shape[1] or not found.size:
         raise InputError(f"{what} is a square matrix of numbers, not an array of {found.dtype}, shape {found.shape}")
     if not np.isfinite(found).all():
@@ -341,9 +402,20 @@ def _commutator(a, b):
     return a @ b - b @ a
 
 
-def _eigenvectors(H: np.ndarray) -> np.ndarray:
-    """Those of a matrix that is diagonal are the axes."""
-    return np.eye(len(H)) if not (H - np.diag(np.diag(H))).any() else np.linalg.eigh(H)[1]
+GENERIC = (1.0, 0.7548776662466927, 0.5698402909980532)
+"""Weights of Hamiltonians in a sum whose eigenvectors are those of each, if they commute."""
+
+
+def _eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
+    """The eigenvectors that Hamiltonians have in common, if they have any; those of diagonal matrices are the axes."""
+    sizes = [np.abs(H).max() for H in hamiltonians]
+    parts = zip(GENERIC, map(_without_common, hamiltonians), sizes, strict=False)  # there may be fewer than weights
+    H = sum((w * H / (size or 1.0) for w, H, size in parts), np.zeros_like(hamiltonians[0]))
+    return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
+
+
+def _is_diagonal(H: np.ndarray) -> bool:
+    return not (H - np.diag(np.diag(H))).any()
 
 
 def _stacked(jumps: tuple[Jump, ...]) -> np.ndarray:
@@ -418,38 +490,79 @@ def _hermitian(V) -> bool:
     return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
 
 
-def _small(residual, H, V) -> bool:
-    return bool(np.abs(residual).max() <= EIGEN * np.abs(H).max() * np.abs(V).max())
+def _without_common(H: np.ndarray) -> np.ndarray:
+    """A Hamiltonian less the energy that all levels have in common."""
+    return H - common_energy(np.diag(H).real) * np.eye(len(H))
+
+
+def energy_rounding(H: np.ndarray) -> float:
+    """Largest difference between two differences of levels that are equal but for rounding."""
+    return ROUNDINGS * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
+
+
+def _commute(H: np.ndarray, V: np.ndarray) -> bool:
+    """Whether two matrices commute but for rounding; a constant that is added to H makes no difference."""
+    H = _without_common(H)
+    products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
+    return bool(np.abs(_commutator(H, V)).max() <= ROUNDINGS * len(H) * products.max())
 
 
 def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray) -> list[Jump]:
-    """The eigenoperators of ``[H, .]`` that a coupling is the sum of; those of a Hermitian one up to adjoints.
+    """The eigenoperators of ``[H, .]`` at all times that a coupling is the sum of; of a Hermitian one up to adjoints.
 
-    The Hamiltonians are those in the frame, in which the first one is diagonal.
+    The entries of one have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
-    energies, inside = np.diag(hamiltonians[0]).real, adjoint(frame) @ V @ frame
-    gaps = energies[None, :] - energies[:, None]
-    present = np.abs(inside) > 1e-14 * np.abs(V).max()
-    spread = EIGEN * max(float(np.abs(energies).max()), 1e-300)
-    frequencies: list[float] = []
-    for gap in np.sort(gaps[present]):
-        if not frequencies or gap > frequencies[-1] + spread:
-            frequencies.append(float(gap))
+    inside = adjoint(frame) @ V @ frame
+    framed = [adjoint(frame) @ _without_common(H) @ frame for H in hamiltonians]
+    spreads = [energy_rounding(H) for H in hamiltonians]
+    places = np.nonzero(np.abs(inside) > _noise(inside, frame, framed, spreads))
+    gaps = np.stack([np.diag(H).real[places[1]] - np.diag(H).real[places[0]] for H in framed])
+    labels = np.stack([_clusters(*one) for one in zip(gaps, spreads, strict=True)])
     own_adjoint, parts = _hermitian(V), []
-    for omega in frequencies:
-        if own_adjoint and omega < -spread:
+    for label in np.unique(labels, axis=1).T:
+        chosen = (labels == label[:, None]).all(axis=0)
+        omegas = gaps[:, chosen].mean(axis=1)
+        sign = next((np.sign(w) for w, spread in zip(omegas, spreads, strict=True) if abs(w) > spread), 0.0)
+        if own_adjoint and sign < 0.0:
             continue
-        still = own_adjoint and abs(omega) <= spread
-        part = np.where(present & (np.abs(gaps - omega) <= spread), inside, 0.0)
-        for other in hamiltonians[1:]:
-            turned = _commutator(other, part)
-            along = np.vdot(part, turned) / np.vdot(part, part)
-            if not _small(turned - along * part, other, part):
+        part = np.zeros_like(inside)
+        part[places[0][chosen], places[1][chosen]] = inside[places][chosen]
+        for H, omega, spread in zip(framed, omegas, spreads, strict=True):
+            if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * spread * np.abs(part).max():
                 raise InputError(
                     f"the coupling V[{source}] has no parts with [H, V] = -omega V at all times: the eigenvectors of "
                     "the Hamiltonian turn. Jumps are for Hamiltonians whose eigenvalues alone depend on time"
                 )
-        part = part if omega >= -spread else adjoint(part)  # both act, and a rate is asked at a positive omega
-        parts.append(Jump(Operator(part), source, 0.5 if still else 1.0))
+        part = part if sign >= 0.0 else adjoint(part)  # both act, and a rate is asked at a positive omega
+        parts.append(Jump(Operator(part), source, 0.5 if own_adjoint and sign == 0.0 else 1.0))
     return parts
+
+
+def _noise(
+    inside: np.ndarray, frame: np.ndarray, framed: Sequence[np.ndarray], spreads: Sequence[float]
+) -> np.ndarray | float:
+    """The size up to which entries of a matrix in the frame may be rounding, shape (N, N), or zero in that of the axes.
+
+    An eigenvector contains another one by the rounding of the energies, relative to their difference.
+    """
+    if _is_diagonal(frame):
+        return 0.0
+    sizes = np.abs(inside)
+    turned = np.ones_like(sizes)
+    for H, spread in zip(framed, spreads, strict=True):
+        levels = np.diag(H).real
+        apart = np.abs(levels[:, None] - levels)
+        turned = np.minimum(turned, spread / np.maximum(apart, spread or 1.0))
+    turned = np.where(turned < 1.0, turned, 0.0)  # those of one level may be any
+    return ROUNDINGS * len(sizes) * sizes.max() + turned @ sizes + sizes @ turned
+
+
+def _clusters(numbers: np.ndarray, spread: float) -> np.ndarray:
+    """The number of the cluster that each of some numbers belongs to: one begins beyond ``spread`` from the last."""
+    found, begin, label = np.empty(len(numbers), int), -np.inf, -1
+    for i in np.argsort(numbers):
+        if numbers[i] > begin + spread:
+            begin, label = numbers[i], label + 1
+        found[i] = label
+    return found

@@ -5,23 +5,32 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 from manifolds._module import Module
 
 from ..errors import InputError
-from .energy import Energy
+from .energy import Energy, Linear
+
+NEGATIVE_EIGENVALUE_LIMIT = 1e-12
+"""Largest size of a negative eigenvalue of a density matrix that is rounding: up to it the matrix is positive."""
+
+SMALLEST_EIGENVALUE = 1e-40
+"""Eigenvalue below which the entropy is continued by its tangent, so that its gradient is finite (at most 92)."""
 
 
 class VonNeumann(Energy):
     """The entropy ``-tr(rho ln rho)`` of a density matrix; its gradient is ``-ln rho - 1`` (k_B = 1).
 
     The derivatives of it are by divided differences, so that they are finite where eigenvalues meet
-    (``manifolds.spectral``). Where an eigenvalue vanishes, as in a pure state, the gradient is infinite.
+    (``manifolds.spectral``). Where an eigenvalue vanishes, as in a pure state, the gradient is infinite: the entropy is
+    continued by its tangent there, from eigenvalues of 1e-40 down to -1e-12, which are zero to rounding.
 
     Parameters
     ----------
@@ -31,6 +40,7 @@ class VonNeumann(Energy):
     """
 
     floor: float = eqx.field(static=True)
+    limit: ClassVar[float] = NEGATIVE_EIGENVALUE_LIMIT
 
     def __init__(self, floor: float = 0.0):
         self.floor = float(floor)
@@ -39,11 +49,17 @@ class VonNeumann(Energy):
 
     def value(self, x) -> jax.Array:
         matrix = mf.DensityMatrices(math.isqrt(x.shape[-1])).matrix(x)
-        return -mf.spectral_trace(Information(self.floor), matrix)
+        return -mf.spectral_trace(Information(self.floor, self.limit), matrix)
 
     def gradient(self, x) -> jax.Array:
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
-        return -structure.vector(mf.spectral(LogPlusOne(self.floor), structure.matrix(x)))
+        return -structure.vector(mf.spectral(LogPlusOne(self.floor, self.limit), structure.matrix(x)))
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, VonNeumann) and self.floor == other.floor
+
+    def __hash__(self) -> int:
+        return hash(self.floor)
 
     def hidden(self, x) -> jax.Array:
         return jnp.zeros(())
@@ -52,7 +68,7 @@ class VonNeumann(Energy):
         """By divided differences between the eigenvalues at both ends, in place of any other: its rounding vanishes."""
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
         ends = structure.matrix(x + compensation), structure.matrix(x + (compensation + d))
-        return -structure.vector(mf.spectral_difference(Information(self.floor), *ends))
+        return -structure.vector(mf.spectral_difference(Information(self.floor, self.limit), *ends))
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         """The gradients, corrected along the slopes by what is missed of the change in closed form."""
@@ -64,67 +80,117 @@ class VonNeumann(Energy):
         return gradients + jnp.where(still, 0.0, defect / jnp.where(still, 1.0, square)) * k
 
 
+class OfIsolated(VonNeumann):
+    """The entropy of a system without dissipation, in whose motion it has no part; finite for every Hermitian matrix.
+
+    Steps that conserve eigenvalues to their order alone, as those of the midpoint scheme do, leave the cone of positive
+    matrices by their error where an eigenvalue is zero.
+    """
+
+    limit = math.inf
+
+
 @dataclass(frozen=True)
 class LogPlusOne(mf.ScalarFunction):
-    """``ln p + 1``; zero up to the floor, where that is not zero."""
+    """``ln p + 1``, constant below :data:`SMALLEST_EIGENVALUE`; zero up to the floor, where that is not zero.
+
+    It is NaN where p is negative beyond a limit, outside the cone of positive matrices.
+    """
 
     floor: float = 0.0
+    limit: float = NEGATIVE_EIGENVALUE_LIMIT
 
     def derivative(self, x, order):
         if order:
-            return -math.factorial(order - 1) * (-1.0 / x) ** order
-        found = jnp.log(self._inside(x)) + 1.0
-        return jnp.where(x > self.floor, found, 0.0) if self.floor else found
+            above = x > self._cut
+            return jnp.where(above, -math.factorial(order - 1) * (-1.0 / jnp.where(above, x, 1.0)) ** order, 0.0)
+        value = jnp.log(jnp.maximum(x, self._cut)) + 1.0
+        return _in_cone(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
 
     def width(self, x):
-        return x
+        return jnp.abs(x - self._cut)
 
     def quotient(self, x, y):
-        least, gap = jnp.minimum(x, y), jnp.abs(x - y)
-        same = gap == 0.0
-        below = least <= self.floor
-        safe = jnp.where(below, 1.0, least) if self.floor else least
-        found = jnp.where(same, 1.0 / safe, jnp.log1p(gap / safe) / jnp.where(same, 1.0, gap))
-        if not self.floor:
-            return found
-        across = (self.derivative(x, 0) - self.derivative(y, 0)) * jnp.sign(x - y) / jnp.where(same, 1.0, gap)
-        return jnp.where(below, across, found)
+        least, most = jnp.minimum(x, y), jnp.maximum(x, y)
+        gap, above = most - least, least > self._cut
+        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(above, least, 1.0)
+        logarithm = jnp.where(gap == 0.0, 1.0 / safe, jnp.log1p(gap / safe) / safe_gap)
+        return jnp.where(above, logarithm, (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap)
 
-    def _inside(self, x):
-        return jnp.where(x > self.floor, x, 1.0) if self.floor else x
+    @property
+    def _cut(self) -> float:
+        return max(self.floor, SMALLEST_EIGENVALUE)
 
 
 @dataclass(frozen=True)
 class Information(mf.ScalarFunction):
-    """``p ln p``; zero up to the floor, and where p is zero."""
+    """``p ln p``, continued by its tangent below :data:`SMALLEST_EIGENVALUE`; zero up to a floor that is not zero.
+
+    Its derivative is :class:`LogPlusOne`, and it is NaN where that is.
+    """
 
     floor: float = 0.0
+    limit: float = NEGATIVE_EIGENVALUE_LIMIT
 
     def derivative(self, x, order):
         if order:
-            return LogPlusOne(self.floor).derivative(x, order - 1)
-        outside = (x == 0.0) if not self.floor else (x <= self.floor)
-        return jnp.where(outside, 0.0, x * jnp.log(jnp.where(outside, 1.0, x)))
+            return LogPlusOne(self.floor, self.limit).derivative(x, order - 1)
+        above = jnp.maximum(x, self._cut)
+        value = jnp.where(x > self.floor, x * jnp.log(above), 0.0) if self.floor else x * jnp.log(above) + (x - above)
+        return _in_cone(x, self, value)
 
     def width(self, x):
-        return x
+        return jnp.abs(x - self._cut)
 
     def quotient(self, x, y):
         """``ln u + l ln(u / l) / (u - l)``, of the larger one u and the smaller one l."""
         least, most = jnp.minimum(x, y), jnp.maximum(x, y)
         gap = most - least
-        same, inside = gap == 0.0, least > self.floor
-        safe = jnp.where(inside, least, 1.0) if self.floor else least
-        share = jnp.where(same, 1.0, safe * jnp.log1p(gap / safe) / jnp.where(same, 1.0, gap))
-        across = jnp.where(least == 0.0, 0.0, share)  # of the limit
-        if not self.floor:
-            return jnp.log(most) + across
-        outside = self.derivative(most, 0) / jnp.where(same, 1.0, gap)
-        return jnp.where(inside, jnp.log(jnp.where(inside, most, 1.0)) + share, outside)
+        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(least > self._cut, least, 1.0)
+        share = jnp.where(gap == 0.0, 1.0, safe * jnp.log1p(gap / safe) / safe_gap)
+        above = jnp.log(jnp.maximum(most, self._cut)) + share
+        across = (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap
+        below = _in_cone(least, self, self.differentiated.derivative(most, 0))  # constant, so the quotient is it
+        return jnp.where(least > self._cut, above, jnp.where(most > self._cut, across, below))
+
+    @property
+    def _cut(self) -> float:
+        return max(self.floor, SMALLEST_EIGENVALUE)
 
     @property
     def differentiated(self):
-        return LogPlusOne(self.floor)
+        return LogPlusOne(self.floor, self.limit)
+
+
+def _in_cone(p, function: LogPlusOne | Information, value) -> jax.Array:
+    """The value of a function of an eigenvalue p; NaN where p is negative beyond its limit, and beyond its floor."""
+    return jnp.where(p < -max(function.floor, function.limit), jnp.nan, value)
+
+
+@dataclass(frozen=True)
+class Positive(mf.ScalarFunction):
+    """``max(p, 0)``."""
+
+    def derivative(self, x, order):
+        return jnp.maximum(x, 0.0) if order == 0 else jnp.where((x > 0.0) & (order == 1), 1.0, 0.0)
+
+    def width(self, x):
+        return jnp.abs(x)
+
+    def quotient(self, x, y):
+        gap = x - y
+        across = (jnp.maximum(x, 0.0) - jnp.maximum(y, 0.0)) / jnp.where(gap == 0.0, 1.0, gap)
+        return jnp.where(gap == 0.0, self.derivative(x, 1), across)
+
+
+def positive_part(rho) -> jax.Array:
+    """Density matrices, shape (..., N, N), with zero instead of eigenvalues that are negative by rounding."""
+    return mf.spectral(Positive(), rho)
+
+
+def logarithm(rho) -> jax.Array:
+    """``ln rho`` of density matrices, shape (..., N, N), finite where eigenvalues are zero to rounding."""
+    return mf.spectral(LogPlusOne(), rho) - np.eye(rho.shape[-1])
 
 
 class OfMatrix(Module):
@@ -141,23 +207,70 @@ class OfMatrix(Module):
         return self.function(self.structure.matrix(x[: self.structure.dim]))
 
 
+class MeanEnergy(Linear):
+    """``tr(rho H)`` of the coordinates of rho, shape (N^2,), which has trace one, by those of H.
+
+    An energy e that the levels have in common is added as a constant, ``tr(rho (H - e)) + e``. The gradient is then
+    that of differences of levels: a constant that is added to H changes neither the motion nor its rounding.
+
+    Parameters
+    ----------
+    b : array, shape (N^2,)
+        The coordinates of H.
+    common : array, shape ()
+        e: see :func:`common_energy`. It makes no difference but by rounding.
+    """
+
+    common: jax.Array
+
+    def value(self, x) -> jax.Array:
+        return jnp.dot(self.gradient(x), x) + self.common
+
+    def gradient(self, x) -> jax.Array:
+        return without_energy(self.b, self.common)
+
+    def __neg__(self) -> Energy:
+        return MeanEnergy(-self.b, -self.common)
+
+
+def common_energy(levels: np.ndarray) -> float:
+    """The lower one of the two levels that are nearest to each other: their differences then lose no digit.
+
+    It grows by c where all levels, shape (N,), do.
+    """
+    ordered = np.sort(levels)
+    return float(ordered[0 if len(ordered) == 1 else np.argmin(np.diff(ordered))])
+
+
+def without_energy(b, common) -> jax.Array:
+    """The coordinates of H - e, of those of H, shape (N^2,), and a number e."""
+    return b - common * np.where(np.arange(b.shape[-1]) < math.isqrt(b.shape[-1]), 1.0, 0.0)
+
+
 class Expectation(Module):
-    """``tr(rho H(t))`` of the coordinates of rho, for a function of time."""
+    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``common`` is as in :class:`MeanEnergy`.
+
+    It is the lowest level at the time zero, so that it grows by c where H does: a discrete gradient weights the state
+    and the time by the gradients of the energy by both.
+    """
 
     hamiltonian: Callable
     structure: mf.DensityMatrices
+    common: jax.Array
 
     def __call__(self, x, t):
-        return jnp.dot(self.structure.vector(self.hamiltonian(t)), x)
+        b = self.structure.vector(self.hamiltonian(t))
+        return jnp.dot(without_energy(b, self.common), x) + self.common
 
 
 class Modulated(Module):
-    """``tr(rho (H_0 + f_1(t) H_1 + ...))`` of the coordinates of rho, by those of the matrices."""
+    """``tr(rho (H_0 + f_1(t) H_1 + ...))`` of the coordinates of rho, by those of the matrices; likewise."""
 
     constant: jax.Array
     terms: tuple[jax.Array, ...]
     functions: tuple[Callable, ...]
+    common: jax.Array
 
     def __call__(self, x, t):
         moved = [f(t) * term for f, term in zip(self.functions, self.terms, strict=True)]
-        return jnp.dot(sum(moved, self.constant), x)
+        return jnp.dot(sum(moved, without_energy(self.constant, self.common)), x) + self.common

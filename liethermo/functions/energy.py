@@ -510,6 +510,11 @@ class Sum(Energy):
         return sum((term.sensitivity(x) for term in self.summands[1:]), self.summands[0].sensitivity(x))
 
 
+def function_name(energy: Energy) -> str:
+    """The name of the plain function that an energy is given by; empty where there is none."""
+    return getattr(energy.function, "__name__", "") if isinstance(energy, Function | TimeDependent) else ""
+
+
 def as_energy(function, role: str) -> Energy:
     """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function.
 

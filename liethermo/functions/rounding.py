@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ..tracing.once import has_products
 
@@ -101,7 +101,7 @@ def _evaluated(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], share
         given = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
         name, parameters = equation.primitive.name, equation.params
         inner = next((parameters[key] for key in INNER if key in parameters), None)
-        if inner is not None and name not in LOOPS and hasattr(inner, "consts"):
+        if inner is not None and name not in LOOPS and isinstance(inner, ClosedJaxpr):
             if _is_called(equation):
                 whole = jax.jit(lambda given, shares, i=inner: _evaluated(i.jaxpr, i.consts, given, numbers, shares))
                 found = whole(given, shares)

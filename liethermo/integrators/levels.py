@@ -32,6 +32,9 @@ both."""
 
 VANISHED_LENGTH = math.sqrt(VANISHED)
 
+AT_REST = 8.0 * EPS
+"""Size of ``Pi(x) dH``, relative to those of x and dH, that is rounding: no step along the leaf changes H there."""
+
 ALONG = Gonzalez(NOISY)
 """The discrete gradient that gives the change of a function in a step."""
 
@@ -151,9 +154,16 @@ def directions(system: System, x, gradients: Sequence[jax.Array], leaf: bool = F
     With ``leaf`` they are those of the covectors that carry it along its leaf.
     """
     if leaf:
-        gradients = [system.poisson.sharp(x, gradient) for gradient in gradients]
+        gradients = [_along_leaf(system, x, gradient) for gradient in gradients]
     found, surface = [system.raised(x, gradient) for gradient in gradients], system.surface
     return found if surface is None else [surface.along(x, v) for v in found]
+
+
+def _along_leaf(system: System, x, gradient) -> jax.Array:
+    """``Pi(x) gradient``, shape (n,); zero where it is the rounding of zero, as at a state of rest on its leaf."""
+    found, n = system.poisson.sharp(x, gradient), system.body_dim  # behind which a clock and work have other units
+    at_rest = jnp.linalg.norm(found[:n]) <= AT_REST * jnp.linalg.norm(x[:n]) * jnp.linalg.norm(gradient[:n])
+    return jnp.where(at_rest & (jnp.arange(found.size) < n), 0.0, found)
 
 
 def correction(system: System, along: Sequence[jax.Array], changes: jax.Array) -> jax.Array:

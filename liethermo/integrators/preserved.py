@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, as_energy, function_name
 from ..systems import System
 
 
@@ -38,7 +38,7 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
 
 def why_not_preserved(C: Energy) -> str:
     """Return the message for a function that a system does not conserve."""
-    name = getattr(getattr(C, "function", None), "__name__", str(C))
+    name = function_name(C) or str(C)
     return (
         f"the system does not conserve the preserved function {name}: holding it would change the "
         "dynamics. Give a dissipation that preserves it too, such as ProjectedMetric(preserve=...)"

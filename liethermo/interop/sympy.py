@@ -116,8 +116,9 @@ def expressions(system: System, names: Sequence[str] | None = None) -> Expressio
     """
     if system.is_driven:
         raise InputError("the energy depends on time: take system.at_time(t), a system at one time")
-    algebra = getattr(system, "algebra", None)
-    names = names or getattr(algebra, "basis_names", None) or [f"x{i + 1}" for i in range(system.dim)]
+    algebra = system.lie_algebra
+    basis_names = None if algebra is None else algebra.basis_names
+    names = names or basis_names or [f"x{i + 1}" for i in range(system.dim)]
     variables = mf.sympy.symbols(system.dim, names)
 
     def of(function: Callable) -> list[sympy.Expr]:

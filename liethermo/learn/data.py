@@ -9,6 +9,7 @@ import numpy as np
 import scipy.interpolate
 
 from ..errors import InputError
+from ..results.solution import Solution
 from ..systems import System
 from .observation import Observation
 
@@ -43,7 +44,7 @@ def trajectories(data: Any, system: System, own: Observation) -> list[Trajectory
 
 
 def _pairs(data: Any, own: Observation) -> list[tuple[Any, Any]]:
-    if hasattr(data, "stats") and hasattr(data, "t"):
+    if isinstance(data, Solution):
         return [(data.t, own.of_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim(data[0]) == 1:
         t, x = data

@@ -19,6 +19,7 @@ from .data import Scales, Trajectory, Windows, smoothed
 from .model import tied
 from .networks import learned
 from .observation import Observation
+from .parts import Poisson
 
 SLOW = 0.1
 """Mean square of the rates of change, in units of their usual size, below which they count as slow."""
@@ -44,7 +45,7 @@ class Weights(NamedTuple):
 def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:
     """What is learned of a system: the arrays inside of marks, and those that two functions choose."""
     mask = learned(system)
-    if getattr(system.poisson, "entropy", None) is not None:
+    if isinstance(system.poisson, Poisson) and system.poisson.entropy is not None:
         mask = eqx.tree_at(lambda m: m.poisson.entropy, mask, False)  # the same weights as in the entropy
     for choose in (also, positive):
         if choose is not None:

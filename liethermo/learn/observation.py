@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
+from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from .quickly import quickly
@@ -64,7 +65,7 @@ class Observation(NamedTuple):
     def none(self) -> np.ndarray:
         return np.zeros((1, int(np.prod(self.shape))))
 
-    def of_solution(self, solution: Any) -> jax.Array:
+    def of_solution(self, solution: Solution) -> jax.Array:
         """What the states of a solution show, shape (m, ...).
 
         Raises
@@ -74,7 +75,7 @@ class Observation(NamedTuple):
         """
         if self.group is None:
             return jax.vmap(self.function)(jnp.asarray(solution.x))
-        if getattr(solution, "attitude", None) is None:
+        if solution.attitude is None:
             raise InputError("observe is a function of the attitude, and a solution in the data has none")
         return jax.vmap(self.function)(jnp.asarray(solution.x), jnp.asarray(solution.attitude))
 
@@ -101,7 +102,7 @@ def observation(system: System, observed: Sequence[int] | None, observe: Callabl
     number = needed_arguments(observe) if callable(observe) else 0
     if number not in (1, 2):
         raise InputError("observe is a function of the state, or of the state and the attitude, such as lambda x, R: R")
-    group = getattr(system, "group", None) if number == 2 else None
+    group = system.matrix_group if number == 2 else None
     if number == 2 and group is None:
         raise InputError("observe is a function of the attitude: give the system a group, such as group=mf.SO(3)")
     parts = [jnp.zeros(system.dim)] if group is None else [jnp.zeros(system.dim), group.identity]

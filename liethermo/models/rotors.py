@@ -41,6 +41,10 @@ class InBearing(Dissipation):
     entropy_law = None
     needs_entropy = False
 
+    @property
+    def heated_bath(self):
+        return self.bath
+
     def force(self, system, x, dH, dS, dL):
         return jnp.zeros_like(x).at[3].set(-self.friction * dH[3])
 
@@ -73,6 +77,10 @@ class InRotor(Dissipation):
     energy_law = "nonincreasing"
     entropy_law = None
     needs_entropy = False
+
+    @property
+    def heated_bath(self):
+        return self.bath
 
     def _moved(self, x, sigma) -> jax.Array:
         turned = jnp.cross(x[:3], sigma)

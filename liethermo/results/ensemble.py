@@ -106,6 +106,8 @@ class Ensemble(Recorded):
         Library version, method, step, system, date: JSON data.
     """
 
+    state_fields = ("x", "x0")
+
     t: np.ndarray
     x: np.ndarray | None
     energy: np.ndarray

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,6 +111,9 @@ def worst_evidence(parts: Sequence[Evidence]) -> Evidence:
 
 class Recorded(Saved):
     """A result with the evidence for its audit, or what finds that."""
+
+    state_fields: ClassVar[tuple[str, ...]] = ("x",)
+    """The fields that are states, shape (..., n)."""
 
     t: np.ndarray
     x: Any

@@ -75,7 +75,7 @@ def provenance_of(
     system: System, method: Any, step: float | Adaptive, span: tuple[float, float], every: int | None
 ) -> dict[str, Any]:
     """Where a run comes from: JSON data."""
-    algebra, group, inertia = getattr(system, "algebra", None), getattr(system, "group", None), system.inertia
+    algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
         "library": f"liethermo {_version()}",
         "jax": jax.__version__,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError, SpecError
 from ..runs.events import Relaxed
-from ..studies.axes import latin_hypercube, sobol, zipped
+from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
 from ..studies.measures import At
 from ..studies.study import Study
 from ..systems import System
@@ -87,7 +87,11 @@ def study_of(plan: Spec, store: str | os.PathLike) -> Study:
     problems: list[str] = []
     axes = {name: _axis(f"study.axes.{name}", axis, problems) for name, axis in section.axes.items()}
     measures = {name: _measure(f"study.measure.{name}", given, problems) for name, given in section.measure.items()}
-    names = [name for axis, values in axes.items() for name in (getattr(values, "columns", None) or [axis])]
+    names = [
+        name
+        for axis, values in axes.items()
+        for name in (values.columns if isinstance(values, Zipped) and values.columns else [axis])
+    ]
     for name in names:
         _check_name(name, plan, problems)
     if problems:

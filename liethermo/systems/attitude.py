@@ -53,6 +53,10 @@ class AttitudeSystem(System):
     reconstruction: str = eqx.field(static=True)
     group: mf.MatrixGroup = eqx.field(static=True)
 
+    @property
+    def matrix_group(self) -> mf.MatrixGroup:
+        return self.group
+
     def __init__(self, body: LiePoissonSystem | DrivenSystem, reconstruction: str):
         group = momenta_of(body).group
         assert group is not None

@@ -21,7 +21,7 @@ from ..dissipation.base import Dissipation, portions, total
 from ..dissipation.heating import heated
 from ..errors import AxiomError, CasimirError, InputError
 from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, as_energy, function_name
 from ..functions.on_spaces import on_points, on_sites
 from ..functions.with_baths import WithBaths
 from ..tracing.interpret import at_points
@@ -315,7 +315,7 @@ class System(Kind):
         """A solution, or an ensemble, with its states, shape (..., n), as they are shown on sites."""
         if not self.sites:
             return found
-        states = {name: value for name in ("x", "x0") if (value := getattr(found, name, None)) is not None}
+        states = {name: value for name in found.state_fields if (value := getattr(found, name)) is not None}
         shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
         return dataclasses.replace(found, **shown)
 
@@ -372,7 +372,7 @@ class System(Kind):
         names, taken = list(self.momentum_maps | self.casimirs()), {"energy", "entropy"}
         number = len(names)
         for multiple, (fallback, L) in zip(multiples, self.preserved_by_name().items(), strict=True):
-            name = getattr(getattr(L, "function", None), "__name__", "")
+            name = function_name(L)
             usable = name.isidentifier() and name not in {*names, *taken}
             names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
         return tuple(names[number:])

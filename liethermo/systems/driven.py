@@ -206,8 +206,8 @@ class DrivenSystem(System):
         dense = None if dense is None else dense.through(lambda x: x[..., :-2])
         x = np.ascontiguousarray(solution.x[:, :-2])
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
-        if hasattr(body, "algebra"):
-            entries["algebra"] = body.algebra.name
+        if body.lie_algebra is not None:
+            entries["algebra"] = body.lie_algebra.name
         entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
         energy = solution.energy + solution.casimirs["work"]
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)

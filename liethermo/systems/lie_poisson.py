@@ -101,6 +101,14 @@ class LiePoissonSystem(System):
     place: tuple[jax.Array, jax.Array | None] | None
     turned_parts: tuple[bool, ...] = eqx.field(static=True)
 
+    @property
+    def lie_algebra(self) -> mf.LieAlgebra:
+        return self.algebra
+
+    @property
+    def matrix_group(self) -> mf.MatrixGroup | None:
+        return self.group
+
     def __init__(
         self,
         algebra: mf.LieAlgebra,

@@ -16,10 +16,26 @@ from manifolds._arrays import is_traced
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.base import Dissipation, total
-from ..dissipation.quantum import SteepestEntropyAscent, ThermalJumps, checked_hermitian, checked_matrix
+from ..dissipation.quantum import (
+    HasMatrix,
+    SteepestEntropyAscent,
+    ThermalJumps,
+    checked_hermitian,
+    checked_matrix,
+    energy_rounding,
+)
 from ..errors import InputError
-from ..functions.density import Expectation, Modulated, VonNeumann
-from ..functions.energy import Energy, Linear, Quadratic, Sum, TimeDependent
+from ..functions.density import (
+    NEGATIVE_EIGENVALUE_LIMIT,
+    Expectation,
+    MeanEnergy,
+    Modulated,
+    OfIsolated,
+    VonNeumann,
+    common_energy,
+)
+from ..functions.energy import Energy, Quadratic, Sum, TimeDependent
+from ..functions.gradients import EPS
 from ..functions.warmth import Reservoir, Warmth
 from ..functions.with_baths import WithBaths
 from .base import TIMES, System
@@ -27,7 +43,10 @@ from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .kinds import Decided
 
 WITHIN = 1e-12
-"""How far a trace may be from one, and an eigenvalue below zero, in a density matrix that is given."""
+"""How far a trace may be from one, and a density matrix from its adjoint, where it is given."""
+
+ZERO_ROUNDINGS = 8.0 * EPS
+"""Size of an eigenvalue of a density matrix that is zero to rounding, times the number of levels."""
 
 
 class QuantumSystem(System):
@@ -63,6 +82,8 @@ class QuantumSystem(System):
     Attributes
     ----------
     structure : manifolds.DensityMatrices
+    floor : float
+        Eigenvalues of rho up to this have no part in the entropy.
 
     Examples
     --------
@@ -77,6 +98,7 @@ class QuantumSystem(System):
     structure: mf.DensityMatrices
     parts: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
+    floor: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -96,6 +118,8 @@ class QuantumSystem(System):
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
+        self.floor = entropy.floor
+        entropy = OfIsolated(self.floor) if total(dissipation) is None else entropy
         terms = [_on_density(part, structure) for part in _terms(dissipation)]
         if baths is not None and not any(isinstance(part, ThermalJumps) for part in terms):
             raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
@@ -118,7 +142,7 @@ class QuantumSystem(System):
         Parameters
         ----------
         rho : array, shape (..., N, N), or a state already
-            Hermitian, positive, of trace one. Or a vector of amplitudes, shape (N,), of a pure state.
+            Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1).
         batch : bool
             Whether states that are given as such may be several.
         entropies : array, shape (..., number of baths), optional
@@ -130,8 +154,7 @@ class QuantumSystem(System):
         ------
         InputError
         """
-        full = getattr(rho, "full", None)
-        rho = full() if callable(full) else rho
+        rho = rho.full() if isinstance(rho, HasMatrix) else rho
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
         matrices = self._checked(np.asarray(rho), mixed)
@@ -143,10 +166,16 @@ class QuantumSystem(System):
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
     def numbers(self, x, batch: bool = False):
-        """What :meth:`state` makes of x; a density matrix stands for the state with every bath at entropy zero."""
-        if not isinstance(x, jax.core.Tracer) and self._is_matrix(x, batch):
+        """What :meth:`state` makes of x; a matrix or a ket stands for the state with every bath at entropy zero."""
+        x = x.full() if isinstance(x, HasMatrix) else x
+        if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
         return super().numbers(x, batch)
+
+    def _is_ket(self, x) -> bool:
+        """Whether it is the amplitudes of one pure state; of one level they look like a state."""
+        size = self.structure.size
+        return size > 1 and np.shape(x) in ((size,), (size, 1))
 
     def _is_matrix(self, x, batch: bool) -> bool:
         """Whether it is one density matrix or, with ``batch``, several; of one level a row of states looks like one."""
@@ -206,13 +235,17 @@ class QuantumSystem(System):
 
     def _checked(self, rho: np.ndarray, mixed: float) -> np.ndarray:
         size = self.structure.size
-        if rho.shape == (size,):
-            norm = np.vdot(rho, rho).real
-            rho = np.outer(rho, rho.conj()) / (norm if abs(norm - 1.0) <= WITHIN else 1.0)
-        if rho.shape[-2:] != (size, size) or rho.dtype.kind not in "fiuc":
-            raise InputError(f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}")
+        if rho.dtype.kind not in "fiuc":
+            raise InputError(f"a density matrix is an array of numbers, not of {rho.dtype}")
         if not np.isfinite(rho).all():
             raise InputError("the density matrix is not finite")
+        if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
+            rho = self._of_ket(rho[:, None] if rho.ndim == 1 else rho)
+        if rho.shape[-2:] != (size, size):
+            raise InputError(
+                f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}; a ket has the shape "
+                f"({size},) or ({size}, 1)"
+            )
         asymmetry = float(np.abs(rho - adjoint(rho)).max())
         if asymmetry > WITHIN:
             raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
@@ -221,11 +254,20 @@ class QuantumSystem(System):
         if abs(worst - 1.0) > WITHIN:
             raise InputError(f"the density matrix has the trace {worst:.15g}, not 1: divide it by that")
         least = float(np.linalg.eigvalsh(rho)[..., 0].min())
-        if least < -WITHIN:
+        if least < -NEGATIVE_EIGENVALUE_LIMIT:
             raise InputError(f"the density matrix is not positive: its least eigenvalue is {least:.3g}")
         if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
             raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
         return (1.0 - mixed) * rho + mixed * np.eye(size) / size
+
+    def _of_ket(self, ket: np.ndarray) -> np.ndarray:
+        """The density matrices of pure states, shape (..., N, 1) to (..., N, N)."""
+        norms = np.linalg.norm(ket, axis=-2)
+        worst = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
+        if abs(worst - 1.0) > WITHIN:
+            raise InputError(f"the ket has the norm {worst:.15g}, not 1: divide it by that")
+        ket = ket / norms[..., None]
+        return ket @ adjoint(ket)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Random states, ``count`` of them: density matrices by Ginibre's ensemble, and entropies of baths."""
@@ -241,53 +283,106 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        rho = np.asarray(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
+        rho = self._matrices(x)
         traces = np.trace(rho, axis1=-2, axis2=-1).real
         trace = traces[np.abs(traces - 1.0).argmax()]
         if not abs(trace - 1.0) <= 1e-9:
             return f"the trace of its density matrix is {trace:.12g}, not 1"
-        p = np.linalg.eigvalsh(rho)
-        least = p[:, 0].min()
-        if least < -max(self._floor, 0.0):
+        least = np.linalg.eigvalsh(rho)[:, 0].min()
+        if self.dissipation is not None and least < -max(self.floor, NEGATIVE_EIGENVALUE_LIMIT):
             return (
                 f"its density matrix has the eigenvalue {least:.3g}, outside the cone of positive matrices: a shorter "
                 "step stays inside"
             )
-        if least <= 0.0 and self._floor == 0.0:
-            return (
-                f"its density matrix has the eigenvalue {least:.3g}, where the gradient of the entropy is infinite: "
-                "mix it, as in q.state(rho, mixed=1e-6), or with steepest ascent, which keeps the rank, give the "
-                "system entropy=lt.VonNeumann(floor=1e-12)"
-            )
-        if not self._has(SteepestEntropyAscent) or not (p <= self._floor).any():
+        return self._why_rank_grows(np.atleast_2d(x), rho) if self._has(SteepestEntropyAscent) else ""
+
+    def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
+        """Why eigenvalues that are zero would not stay zero under steepest ascent, in words; empty where they do."""
+        kernels = self._kernels(rho)
+        use = [i for i, kernel in enumerate(kernels) if kernel.size]
+        turned = [self._is_turned(rho[i], kernels[i]) for i in use]
+        mix = "mix it, as in q.state(rho, mixed=1e-6)"
+        if self.floor > 0.0:
+            text = "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends "
+            text += f"of steps have others, by the error of a step, which steepest ascent lets grow: {mix}"
+            return text if any(turned) else ""
+        grows = [self._population_at_rest(x[i], kernels[i]) > self._zero for i in use]
+        if not any(grows):
             return ""
-        p, vectors = np.linalg.eigh(rho)
-        gone = p <= self._floor
-        kernel, inside = (((vectors * some[:, None]) @ adjoint(vectors)) for some in (gone, ~gone))
-        if any(np.abs(kernel @ H @ inside).max() > WITHIN for H in self.hamiltonians()):
-            return (
-                "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends of "
-                "steps have others, by the error of a step, which steepest ascent lets grow: mix it, as in "
-                "q.state(rho, mixed=1e-6)"
-            )
-        return ""
+        first = grows.index(True)
+        floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which leaves this eigenvalue at zero"
+        return (
+            f"its density matrix has the eigenvalue {np.linalg.eigvalsh(rho[use[first]])[0]:.3g}, where the gradient "
+            f"of the entropy is infinite: {mix}{'' if turned[first] else floor}"
+        )
+
+    def _is_turned(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
+        """Whether the Hamiltonian turns a kernel, shape (N, r), which is as exact as the least eigenvalue outside."""
+        outside = np.eye(len(rho)) - kernel @ adjoint(kernel)
+        p = np.linalg.eigvalsh(rho)
+        blurred = p[p > self._zero].min()
+        return any(np.abs(outside @ H @ kernel).max() > energy_rounding(H) / blurred for H in self.hamiltonians())
+
+    def _population_at_rest(self, x: np.ndarray, kernel: np.ndarray) -> float:
+        """About the largest population that a state in the kernel, shape (N, r), has where steepest ascent ends.
+
+        There ``-ln rho - 1`` is a combination of the gradients of what is preserved: the one that fits best outside.
+        """
+        assert self.dissipation is not None
+        part = next(part for part in self.dissipation.terms if isinstance(part, SteepestEntropyAscent))
+        dS, dL = VonNeumann(self._zero).gradient(x[: self.body_dim]), tuple(L.gradient(x) for L in part.preserve)
+        affinity = np.asarray(self.structure.matrix(part.direction(self, x, self.energy.gradient(x), dS, dL)))
+        return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
     def singular(self, x) -> str:
         if is_traced(self) or not self._has(ThermalJumps):
             return ""
-        least = np.linalg.eigvalsh(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))[:, 0].min()
-        if least > self._floor:
+        x, rho = np.atleast_2d(x), self._matrices(x)
+        kernels = self._kernels(rho)
+        use = [i for i, kernel in enumerate(kernels) if kernel.size]
+        if not use:
             return ""
+        filled, emptied = self._rates_of_jumps(x[use], [kernels[i] for i in use])
+        grows = np.flatnonzero(filled > self._zero * emptied)  # beyond rounding of the population that is at rest
+        if not grows.size:
+            return ""
+        least = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
+        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if self.has_generator else ""
         return (
-            f"its density matrix has the eigenvalue {least:.3g}, which jumps make larger, and the gradient of the "
-            "entropy is infinite there: take lt.MetriplecticRungeKutta, whose stages are without it, or mix the state, "
-            "as in q.state(rho, mixed=1e-6)"
+            f"its density matrix has the eigenvalue {least:.3g}, which jumps make larger, where the gradient of the "
+            f"entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
         )
 
+    def _rates_of_jumps(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """How fast jumps fill kernels of states, and how fast they move all states and empty these; shapes (m,)."""
+        assert self.dissipation is not None
+        parts = [part for part in self.dissipation.terms if isinstance(part, ThermalJumps)]
+
+        def moved(x, rho):  # at the temperatures of x
+            y = jnp.concatenate([self.structure.vector(rho), x[self.body_dim :]])
+            return sum(part.generated(self, y, self.energy.gradient(x))[: self.body_dim] for part in parts)
+
+        projectors = np.stack([kernel @ adjoint(kernel) for kernel in kernels])
+        changes, of_kernels = (
+            np.asarray(self.structure.matrix(jax.vmap(moved)(jnp.asarray(x), jnp.asarray(matrices))))
+            for matrices in (self._matrices(x), projectors)
+        )
+        pairs = zip(changes, kernels, strict=True)
+        filled = np.array([np.linalg.eigvalsh(adjoint(kernel) @ change @ kernel)[-1] for change, kernel in pairs])
+        return filled, sum(np.linalg.norm(a, 2, axis=(-2, -1)) for a in (changes, of_kernels))
+
+    def _matrices(self, x) -> np.ndarray:
+        """The density matrices of a state or of several, shape (m, N, N)."""
+        return np.asarray(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
+
     @property
-    def _floor(self) -> float:
-        entropy = self.entropy.terms[0]  # type: ignore[union-attr]
-        return getattr(entropy, "floor", getattr(getattr(entropy, "energy", None), "floor", 0.0))
+    def _zero(self) -> float:
+        """The largest eigenvalue of a density matrix that is zero: up to rounding, or to the floor of the entropy."""
+        return max(self.floor, ZERO_ROUNDINGS * self.structure.size)
+
+    def _kernels(self, rho: np.ndarray) -> list[np.ndarray]:
+        """The eigenvectors whose eigenvalue is zero of matrices, shape (m, N, N), each of a shape (N, r)."""
+        return [vectors[:, p <= self._zero] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
     def _has(self, kind: type[Dissipation]) -> bool:
         return self.dissipation is not None and any(isinstance(part, kind) for part in self.dissipation.terms)
@@ -301,7 +396,8 @@ class QuantumSystem(System):
         n, energies = self.body_dim, [s.energy for s in (self.at_some_times() if self.is_driven else [self])]
         energies = [E.body if isinstance(E, WithBaths) else E for E in energies]  # temperatures may be traced
         with jax.ensure_compile_time_eval():
-            return [np.asarray(self.structure.matrix(E.gradient(jnp.zeros(n)))) for E in energies]
+            origin, one = jnp.zeros(n), np.eye(self.structure.size)
+            return [np.asarray(self.structure.matrix(E.gradient(origin)) + E.value(origin) * one) for E in energies]
 
     def casimirs(self) -> dict[str, Energy]:
         """The trace, and of a system without dissipation the purity: what relaxes keeps none but the trace."""
@@ -335,7 +431,7 @@ class QuantumSystem(System):
         parts = self.parts + other.parts
         names = self.names + other.names if len(self.names + other.names) == len(parts) else ()
         names = names if len(set(names)) == len(names) else ()
-        baths, floor = _joined(self.baths, other.baths), max(self._floor, other._floor)
+        baths, floor = _joined(self.baths, other.baths), max(self.floor, other.floor)
         return QuantumSystem(whole, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
@@ -348,7 +444,7 @@ class QuantumSystem(System):
             )
         terms = () if self.dissipation is None else self.dissipation.terms
         H = self._constant_hamiltonian() + interaction
-        return QuantumSystem(H, list(terms) or None, self.baths, VonNeumann(self._floor), self.parts, self.names)
+        return QuantumSystem(H, list(terms) or None, self.baths, VonNeumann(self.floor), self.parts, self.names)
 
     def _constant_hamiltonian(self) -> np.ndarray:
         if self.is_driven:
@@ -360,17 +456,21 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
     """The size of a Hamiltonian, and ``tr(rho H)`` of coordinates."""
     if isinstance(hamiltonian, list | tuple) and any(map(_is_term, hamiltonian)):
         return _sum_of_terms(hamiltonian)
-    if callable(hamiltonian) and not callable(getattr(hamiltonian, "full", None)):
-        for t in TIMES:
-            found = checked_hermitian(_at(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}")
-        structure = mf.DensityMatrices(len(found))
-        return len(found), TimeDependent(Expectation(hamiltonian, structure))
+    if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
+        matrices = [
+            checked_hermitian(_at(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}") for t in TIMES
+        ]
+        structure = mf.DensityMatrices(len(matrices[0]))
+        with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
+            lowest = jnp.asarray(np.diag(matrices[0]).real.min())
+        return structure.size, TimeDependent(Expectation(hamiltonian, structure, lowest))
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
-        return structure.size, Linear(structure.vector(hamiltonian))
+        return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        return len(H), Linear(jnp.asarray(mf.DensityMatrices(len(H)).vector(H)))
+        b, common = jnp.asarray(mf.DensityMatrices(len(H)).vector(H)), jnp.asarray(common_energy(np.diag(H).real))
+    return len(H), MeanEnergy(b, common)
 
 
 def _at(function, t: float, what: str):
@@ -388,7 +488,7 @@ def _is_term(part) -> bool:
     """Whether it is a matrix, or begins with one, and not a row of numbers."""
     if isinstance(part, list | tuple):
         return bool(part) and (isinstance(part[0], list | tuple) or _is_term(part[0]))
-    return hasattr(part, "full") or np.ndim(part) == 2
+    return isinstance(part, HasMatrix) or np.ndim(part) == 2
 
 
 def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
@@ -415,8 +515,14 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         still, *rows = (jnp.asarray(structure.vector(a)) for a in (sum(constant, np.zeros_like(H)), *moved))
-    energy = TimeDependent(Modulated(still, tuple(rows), tuple(functions))) if moved else Linear(still)
-    return structure.size, energy
+        common = jnp.asarray(common_energy(np.asarray(still)[: structure.size]))
+    if not moved:
+        return structure.size, MeanEnergy(still, common)
+    at_start = still
+    for f, row in zip(functions, rows, strict=True):
+        at_start = at_start + f(TIMES[0]) * row
+    lowest = jnp.min(at_start[: structure.size])  # in the same way where a function is traced
+    return structure.size, TimeDependent(Modulated(still, tuple(rows), tuple(functions), lowest))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:

@@ -262,7 +262,7 @@ def axes(case: Case) -> Outcome:
 def _turned(case: Case, what: str, matrix: np.ndarray, same_steps: bool) -> Outcome:
     if reason := flat(case):
         return reason
-    if getattr(case.system, "group", None) is not None:
+    if case.system.matrix_group is not None:
         return "the attitude is of a group with a basis of its own"
     change, system = Change(matrix), case.system
     run = case.run(changed(system, change), change.there(case.x0))

@@ -30,6 +30,8 @@ class Block:
 
     name: str
     kinds: tuple[str, ...]
+    inner: tuple = ()
+    """The programs that it runs again and again."""
 
     def __call__(self, *args) -> list:
         """Its results, for numbers or for NumPy arrays of them."""

@@ -64,5 +64,5 @@ def _of(equation, found: list[float]) -> list[float]:
         return [max(found[1:])]
     if name in CALLS:
         inner = parameters.get("jaxpr", parameters.get("call_jaxpr"))
-        return _degrees(getattr(inner, "jaxpr", inner), found)
+        return _degrees(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner, found)
     return [math.inf]

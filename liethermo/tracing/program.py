@@ -42,9 +42,9 @@ class Program:
     @functools.cached_property
     def size(self) -> int:
         """How many instructions compute something, those inside loops among them: what is moved alone costs little."""
-        inner = (getattr(i.op, name, None) for i in self.instructions for name in ("test", "body"))
         own = sum(i.op not in ("item", "column", "table") for i in self.instructions)
-        return own + sum(program.size for program in inner if isinstance(program, Program))
+        blocks = (i.op for i in self.instructions if isinstance(i.op, Block))
+        return own + sum(program.size for block in blocks for program in block.inner)
 
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
         """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
@@ -188,6 +188,10 @@ class While(Block):
     kinds: tuple[str, ...]
     name: str = field(default="while", repr=False)
 
+    @property
+    def inner(self) -> tuple[Program, ...]:  # type: ignore[override]
+        return self.test, self.body
+
     def __call__(self, *args) -> list:
         fixed = len(self.test.inputs[0])
         constants, carried = args[:fixed], list(args[fixed:])
@@ -223,6 +227,10 @@ class Scan(Block):
     carried: tuple[str, ...]
     stacked: tuple[str, ...]
     name: str = field(default="scan", repr=False)
+
+    @property
+    def inner(self) -> tuple[Program, ...]:  # type: ignore[override]
+        return (self.body,)
 
     @property
     def kinds(self) -> tuple[str, ...]:  # type: ignore[override]

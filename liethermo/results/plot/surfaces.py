@@ -101,7 +101,8 @@ def momentum_sphere(
     _draw_path(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
-    names = getattr(getattr(system, "algebra", None), "basis_names", None)
+    algebra = None if system is None else system.lie_algebra
+    names = None if algebra is None else algebra.basis_names
     x, y, z = names or (f"${name}_{i}$" for i in (1, 2, 3))
     ax.set(xlabel=x, ylabel=y, zlabel=z)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):

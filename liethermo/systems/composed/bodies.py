@@ -139,7 +139,8 @@ def named(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
         bodies = tuple(subsystems) if isinstance(subsystems, Iterable) else (subsystems,)
         starts = np.cumsum([0, *(body.count if isinstance(body, Subsystem | Copies) else 1 for body in bodies)])
         names = tuple(
-            getattr(body, "name", None) or ("body" if isinstance(body, Copies) else f"body {i}")
+            (body.name if isinstance(body, Subsystem | Copies) else None)
+            or ("body" if isinstance(body, Copies) else f"body {i}")
             for body, i in zip(bodies, starts[:-1], strict=True)
         )
     for name, body in zip(names, bodies, strict=True):

@@ -741,6 +741,296 @@ def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
     assert abs(many.event_time[0] - alone.event_time) <= 1e-12
 
 
+# -- constants of the energy, zero eigenvalues, kets ------------------------------------------------------------------
+
+SHIFTED_METHODS = [lt.MetriplecticRungeKutta(4), lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)]
+
+
+@pytest.mark.parametrize("coupling", [LOWER, X], ids=["lowering", "Hermitian"])
+@pytest.mark.parametrize("method", SHIFTED_METHODS, ids=str)
+def test_two_levels_relax_beside_a_third_one_far_below(method, coupling):
+    """Levels at 0, 5e9 and 5e9 + 1: the frequency 1 is not zero beside the largest energy."""
+    H, V = np.diag([0.0, 5e9, 5e9 + 1.0]), np.zeros((3, 3), complex)
+    V[1:, 1:] = coupling
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.5)]), infinite(0.8))
+    run = lt.integrate(q, q.state(np.diag([0.2, 0.5, 0.3])), (0.0, 30.0), 0.25, method)
+    p = np.diag(q.density(run.x[-1])).real
+    assert p[2] / p[1] == pytest.approx(np.exp(-1.0 / 0.8), rel=1e-8)
+    assert p[0] == pytest.approx(0.2, abs=1e-15)
+    assert run.audit().passed
+
+
+def test_a_bath_takes_the_heat_of_a_small_gap_between_large_energies():
+    """Its temperature is that beside the two levels alone: heat is summed from differences of levels."""
+    ends = []
+    for far in (0.0, 5e12):
+        H, V = np.diag([0.0, far, far + 1.0]), np.zeros((3, 3), complex)
+        V[1:, 1:] = X
+        q = lt.QuantumSystem(H, lt.ThermalJumps([(V, 0.5)]), lt.HeatBaths(capacity=2.0, temperature=0.8))
+        run = lt.integrate(q, q.state(np.diag([0.2, 0.5, 0.3])), (0.0, 5.0), 0.1, lt.MetriplecticGauss(2))
+        assert run.audit().passed
+        ends.append(float(q.temperatures(run.x[-1])[0]))
+    assert ends[1] == pytest.approx(ends[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("shift", [1e6, 1e10, 1e13])
+@pytest.mark.parametrize("kind", ["isolated", "noise", "bath", "driven", "terms", "steepest ascent"])
+def test_a_constant_added_to_the_hamiltonian_changes_no_state(kind, shift):
+    """The shift is a power of two, so H + c is exact; but for a function of time, which is rounded beside it."""
+    shift, H = 2.0 ** np.round(np.log2(shift)), np.diag([0.0, 1.25]) + 0.5 * X
+    built = {
+        "isolated": lambda H: lt.QuantumSystem(H),
+        "noise": lambda H: lt.QuantumSystem(H, lt.ThermalJumps([(X + Z, 0.3)])),
+        "bath": lambda H: lt.QuantumSystem(H, lt.ThermalJumps([(X, 0.3)]), lt.HeatBaths(2.0, T)),
+        "driven": lambda H: lt.QuantumSystem(lambda t: H + 0.25 * jnp.cos(t) * Z),
+        "terms": lambda H: lt.QuantumSystem([H, (0.25 * Z, jnp.cos)]),
+        "steepest ascent": lambda H: lt.QuantumSystem(H, lt.SteepestEntropyAscent(0.4)),
+    }[kind]
+    plain, moved = (built(H + c * np.eye(2)) for c in (0.0, shift))
+    assert plain.energy_law == moved.energy_law
+    method, within = lt.MetriplecticGauss(2), 1e-12
+    if kind == "driven":
+        within = max(1e-9, 4.0 * EPS * shift)
+    runs = [lt.integrate(q, q.state(RHO), (0.0, 2.0), 0.1, method) for q in (plain, moved)]
+    assert np.abs(runs[0].x - runs[1].x).max() <= within
+    assert np.abs(runs[0].entropy - runs[1].entropy).max() <= within
+    assert runs[1].energy[0] - shift == pytest.approx(runs[0].energy[0], abs=8.0 * EPS * shift)
+    assert runs[1].audit().passed
+
+
+def test_a_coupling_that_does_not_commute_exchanges_energy_whatever_the_constant_is():
+    for c in (0.0, 1e10, 1e13):
+        noisy = lt.QuantumSystem(np.diag([c, 1.0 + c]), lt.ThermalJumps([(X, 0.3)]))
+        assert noisy.energy_law is None
+        run = lt.integrate(noisy, noisy.state(np.diag([0.9, 0.1])), (0.0, 1.0), 0.05)
+        assert np.diag(noisy.density(run.x[-1])).real[0] == pytest.approx(0.5 + 0.4 * np.exp(-0.6), abs=1e-4)
+        dephasing = lt.QuantumSystem(np.diag([c, 1.0 + c]), lt.ThermalJumps([(Z, 0.3)]))
+        assert dephasing.energy_law == "conserved"
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.1])
+def test_equal_differences_of_levels_are_one_frequency(spacing):
+    """Those of 0.1 n differ by rounding, by more so beside a constant; the coupling stays in one piece."""
+    for c in (0.0, 1e8):
+        H, V = np.diag(spacing * np.arange(12.0) + c), np.diag(np.sqrt(np.arange(1.0, 12.0)), 1)
+        turned = np.linalg.qr(random_hermitian(12))[0]
+        for U in (np.eye(12), turned):
+            H1, V1 = U @ H @ U.conj().T, U @ V @ U.conj().T
+            q = lt.QuantumSystem((H1 + H1.conj().T) / 2, lt.ThermalJumps([(V1, 0.1)]), infinite())
+            assert len(q.dissipation.terms[0].jumps) == 1
+    near = lt.QuantumSystem(np.diag([0.0, 1.0, 2.0 + 1e-9]), lt.ThermalJumps([(np.diag([1, 1], 1), 0.1)]), infinite())
+    assert len(near.dissipation.terms[0].jumps) == 2  # these differ
+
+
+def test_frequencies_that_are_equal_at_one_time_are_apart_at_others():
+    H = lambda t: jnp.diag(jnp.array([0.0, 1.0, 2.0 + t], dtype=complex))  # noqa: E731
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(np.diag([1.0, 1.0], 1), RATE)]), infinite())
+    rho, wanted, energies = random_density(3), [], np.array([0.0, 1.0, 2.5])
+    for k in range(2):
+        V, omega = np.zeros((3, 3), complex), energies[k + 1] - energies[k]
+        V[k, k + 1] = 1.0
+        wanted += [(V, RATE * np.exp(omega / (2 * T))), (V.T, RATE * np.exp(-omega / (2 * T)))]
+    found = q.structure.matrix(q.vector_field(q.state(rho), t=0.5)[:9])
+    assert np.abs(found - lindblad(rho, np.diag(energies), wanted)).max() <= 1e-14
+    off = lt.QuantumSystem(lambda t: jnp.sin(t) * X, lt.ThermalJumps([(Z, RATE)]), infinite())  # zero at t = 0
+    assert len(off.dissipation.terms[0].jumps) == 1
+
+
+def ladder(temperature, U=None, size=8):
+    """A ladder of levels in a cold bath, in a frame U, and its generator as a matrix."""
+    U = np.eye(size) if U is None else U
+    H, V = (U @ M @ U.conj().T for M in (np.diag(np.arange(float(size))), np.diag(np.sqrt(np.arange(1.0, size)), 1)))
+    H = (H + H.conj().T) / 2
+    rate = lambda omega, T: 0.1 * jnp.exp(-omega / (2.0 * T))  # noqa: E731
+    q = lt.QuantumSystem(H, lt.ThermalJumps([(V, rate)]), infinite(temperature))
+    jumps, basis = [(V, 0.1), (V.conj().T, 0.1 * np.exp(-1.0 / temperature))], np.eye(size**2).reshape(-1, size, size)
+    return q, np.stack([lindblad(E, H, jumps).ravel() for E in basis], axis=1), H
+
+
+COLD = {
+    "explicit": (lt.MetriplecticRungeKutta(8), 0.25, 1e-10),
+    "midpoint": (lt.MetriplecticMidpoint(), 0.1, 1e-3),
+    "Taylor": (lt.MetriplecticTaylor(12), 0.5, 1e-11),
+    "Gauss": (lt.MetriplecticGauss(2), 0.5, 1e-4),
+}
+
+
+@pytest.mark.parametrize(
+    "by", ["explicit", "midpoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Taylor", "Gauss"))]
+)
+@pytest.mark.parametrize("temperature", [0.1, pytest.param(1 / 30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_ladder_relaxes_to_a_cold_state(by, temperature, turned):
+    """Populations of Gibbs' state fall to exp(-70) and exp(-210): to eigenvalues that are zero to rounding."""
+    (method, step, within), size = COLD[by], 8
+    q, generator, _ = ladder(temperature, np.linalg.qr(random_hermitian(size))[0] if turned else None)
+    rho = random_density(size)
+    run = lt.integrate(q, q.state(rho), (0.0, 150.0), step, method)
+    assert run.status.ok
+    exact = (scipy.linalg.expm(150.0 * generator) @ rho.ravel()).reshape(size, size)
+    assert np.abs(q.density(run.x[-1]) - exact).max() <= within
+    audit = run.audit()
+    assert audit.passed, audit
+    assert np.linalg.eigvalsh(q.density(run.x)).min() >= -1e-14
+    again = lt.integrate(q, run.x[-1], (0.0, 1.0), step, method)  # the state is one that a run can start from
+    assert again.status.ok
+
+
+@pytest.mark.sampled("explicit", "midpoint")
+@pytest.mark.parametrize("by", COLD)
+def test_a_cold_state_of_gibbs_is_at_rest(by):
+    q, _, H = ladder(0.1, np.linalg.qr(random_hermitian(8))[0])
+    gibbs = scipy.linalg.expm(-H / 0.1)
+    gibbs = gibbs / np.trace(gibbs).real
+    run = lt.integrate(q, q.state((gibbs + gibbs.conj().T) / 2), (0.0, 1.0), 0.25, COLD[by][0])
+    assert run.status.ok
+    assert np.abs(run.x - run.x[0]).max() <= 1e-14
+    assert run.audit().passed
+
+
+def test_the_entropy_and_its_gradient_are_finite_at_eigenvalues_that_are_zero_to_rounding():
+    S, structure = lt.VonNeumann(), mf.DensityMatrices(2)
+    for p in (0.0, 1e-300, -1e-22, -1e-13):
+        x = structure.vector(np.diag([1.0 - p, p]).astype(complex))
+        assert abs(float(S.value(x))) <= 1e-10
+        assert np.isfinite(S.gradient(x)).all()
+        assert np.isfinite(S.discrete_gradient(None, x, 0.1 - x, 0.0 * x)).all()
+    for floor in (0.0, 1e-12):
+        x = structure.vector(np.diag([1.001, -0.001]).astype(complex))
+        assert np.isnan(lt.VonNeumann(floor).value(x))  # no state: a step that ends there is not accepted
+        assert not np.isfinite(lt.VonNeumann(floor).gradient(x)).all()
+
+
+@pytest.mark.parametrize("p", [1e-3, 1e-41, 0.0, -1e-14])
+@pytest.mark.parametrize("other", [0.5, 1e-20, -1e-18])
+def test_the_entropy_changes_by_its_discrete_gradient_at_zero_eigenvalues(p, other):
+    S, structure = lt.VonNeumann(), mf.DensityMatrices(2)
+    x, y = (structure.vector(np.diag([1.0 - a, a]).astype(complex)) for a in (p, other))
+    change = float(S.discrete_gradient(None, x, y - x, 0.0 * x) @ (y - x))
+    assert change == pytest.approx(float(S.value(y) - S.value(x)), rel=1e-9, abs=1e-15)
+
+
+BATHS = {
+    "no bath": lambda: None,
+    "an infinite bath": infinite,
+    "a finite bath": lambda: lt.HeatBaths(capacity=2.0, temperature=T),
+}
+
+
+@pytest.mark.parametrize("baths", BATHS)
+def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
+    """With and without a floor of the entropy: the one that is asked for is the one that is seen."""
+    for floor in (0.0, 1e-12):
+        q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(X, RATE)]), BATHS[baths](), lt.VonNeumann(floor))
+        assert q.floor == floor
+        run = lt.integrate(q, [0.0, 1.0], (0.0, 2.0), 0.05, lt.MetriplecticRungeKutta(8))
+        assert run.audit().passed
+        fast, rest = (
+            (2 * RATE, 0.0) if baths == "no bath" else (2 * RATE * np.cosh(1.3 / (2 * T)), np.tanh(1.3 / (2 * T)))
+        )
+        z = float(q.expectation(run.x[-1], Z))
+        if baths == "a finite bath":
+            rho, _ = by_scipy(np.diag([0.0, 1.0]).astype(complex), 2.0, 2.0)
+            assert z == pytest.approx((rho[0, 0] - rho[1, 1]).real, abs=1e-11)
+        else:
+            assert z == pytest.approx(rest - (1.0 + rest) * np.exp(-2.0 * fast), abs=1e-11)
+        with pytest.raises(lt.InputError, match=r"mix it.*take lt\.MetriplecticRungeKutta"):
+            lt.integrate(q, [0.0, 1.0], (0.0, 2.0), 0.05, lt.MetriplecticMidpoint())
+
+
+@pytest.mark.parametrize(
+    "method",
+    [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(12)],
+    ids=str,
+)
+def test_an_isolated_system_runs_from_pure_states(method):
+    q, H = levels(3, None), random_hermitian(3)
+    for ket in ([1.0, 0.0, 0.0], np.array([0.6, 0.0, 0.8j]), np.linalg.eigh(H)[1][:, 1]):
+        run = lt.integrate(q, ket, (0.0, 1.0), 0.01, method)
+        exact = scipy.linalg.expm(-1j * H) @ np.asarray(ket)
+        assert np.abs(q.density(run.x[-1]) - np.outer(exact, exact.conj())).max() <= 1e-3
+        if isinstance(method, lt.MetriplecticMidpoint):  # which keeps eigenvalues to its order alone
+            continue
+        assert run.audit().passed
+        assert np.abs(np.linalg.eigvalsh(q.density(run.x[-1]))[:2]).max() <= 1e-14
+
+
+def test_products_keep_the_floor_of_parts_with_baths():
+    floor = lt.VonNeumann(1e-10)
+    one = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite(), entropy=floor)
+    both = one * qubit()
+    assert (one.floor, both.floor, both.coupled(np.kron(X, X)).floor) == (1e-10, 1e-10, 1e-10)
+    assert float(both.entropy(both.state(np.diag([1.0, 0.0, 0.0, 0.0])))) == 0.0
+    run = lt.integrate(both, both.state([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(6))
+    assert run.audit().passed
+
+
+def test_the_advice_for_a_pure_state_under_steepest_ascent_works():
+    """A floor where the state stays as pure as it is; to mix it where the Hamiltonian turns it."""
+    q = lt.QuantumSystem(np.diag([0.0, 1.0, 2.5]), lt.SteepestEntropyAscent(0.4))
+    state = np.diag([0.3, 0.7, 0.0]).astype(complex)
+    with pytest.raises(
+        lt.InputError, match=r"infinite: mix it, .* or give the system entropy=lt\.VonNeumann\(floor=1e-12\)"
+    ):
+        lt.integrate(q, state, (0.0, 1.0), 0.1)
+    floor = lt.QuantumSystem(np.diag([0.0, 1.0, 2.5]), lt.SteepestEntropyAscent(0.4), entropy=lt.VonNeumann(1e-12))
+    for system, start in ((floor, state), (q, q.state(state, mixed=1e-6))):
+        assert lt.integrate(system, start, (0.0, 1.0), 0.1).audit().passed
+    turned = lt.QuantumSystem(random_hermitian(3), lt.SteepestEntropyAscent(0.4))
+    with pytest.raises(lt.InputError, match=r"mix it, as in q\.state\(rho, mixed=1e-6\)$"):
+        lt.integrate(turned, state, (0.0, 1.0), 0.1)
+    assert lt.integrate(turned, turned.state(state, mixed=1e-6), (0.0, 1.0), 0.1).audit().passed
+
+
+@pytest.mark.slow
+def test_steepest_ascent_ends_in_a_cold_state():
+    """Of little energy: eight levels, at a temperature of a fourteenth of their distance; and a run goes on there."""
+    q = lt.QuantumSystem(np.diag(np.arange(8.0)), lt.SteepestEntropyAscent(1.0))
+    start = np.diag([1.0 - 1e-6 - 6e-9, 1e-6, *[1e-9] * 6])
+    for method in (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)):
+        run = lt.integrate(q, start, (0.0, 10.0), 0.02, method)
+        assert run.audit().passed
+        p = np.diag(q.density(run.x[-1])).real
+        assert p[1:4] / p[0] == pytest.approx((p[1] / p[0]) ** np.arange(1.0, 4.0), rel=1e-2)  # of Gibbs
+        assert lt.integrate(q, run.x[-1], (0.0, 0.2), 0.02, method).audit().passed
+
+
+def test_a_ket_may_be_a_column():
+    """As of QuTiP, and many of them; with a message of its own where its norm is not one."""
+    q, ket = qubit(), np.array([0.6, 0.8j])
+    wanted = q.state(np.outer(ket, ket.conj()))
+    for given in (ket, ket[:, None], HasFull(ket[:, None])):
+        assert np.abs(q.state(given) - wanted).max() <= 1e-16
+        assert np.abs(q.numbers(given) - wanted).max() <= 1e-16
+    many = q.state(np.stack([ket[:, None], [[1.0], [0.0]]]))
+    assert np.abs(many - np.stack([wanted, q.state([1.0, 0.0])])).max() <= 1e-16
+    with pytest.raises(lt.InputError, match=r"the ket has the norm 2, not 1: divide it by that"):
+        q.state([[2.0], [0.0]])
+    with pytest.raises(
+        lt.InputError, match=r"has shape \(2, 2\), not \(3, 1\); a ket has the shape \(2,\) or \(2, 1\)"
+    ):
+        q.state(np.ones((3, 1)))
+
+
+class HasFull:
+    """What QuTiP's operators have: their matrix by a method, a call, and no array."""
+
+    def __init__(self, matrix):
+        self.matrix = matrix
+
+    def full(self):
+        return self.matrix
+
+    def __call__(self, *arguments):
+        raise AssertionError
+
+
+def test_operators_of_other_libraries_are_read_by_their_matrices():
+    q = lt.QuantumSystem([HasFull(QUBIT), (HasFull(X), jnp.cos)], lt.ThermalJumps([(HasFull(Z), 0.1)]))
+    assert q.is_driven
+    assert np.abs(lt.QuantumSystem(HasFull(QUBIT)).hamiltonians()[0] - QUBIT).max() <= 1e-15
+
+
 BAD = {
     "term 1 of the Hamiltonian is not Hermitian": lambda q: lt.QuantumSystem([QUBIT, (LOWER, jnp.cos)]),
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),

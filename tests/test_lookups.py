@@ -1,0 +1,74 @@
+"""Attributes that are looked up by a string, with a silent default: of what others define alone, never of our own.
+
+A member of a class of ours that is looked up so fails without a word when it gets another name: the entropy of a
+quantum system lost its floor in this way. A member exists, or the type says that it does not.
+"""
+
+import ast
+import pathlib
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+FOREIGN = {
+    "__name__": "of a user's function; classes and partial functions have none",
+    "__qualname__": "of a user's function",
+    "__module__": "of a user's function",
+    "__file__": "of a module; built-in ones have none",
+    "__closure__": "of a function of JAX; built-in ones have none",
+    "__array__": "of any array",
+    "terminal": "of an event, as SciPy reads it",
+    "direction": "of an event, as SciPy reads it; of a term of diffrax, which wraps others",
+    "term": "of a term of diffrax, which wraps others",
+    "dtype": "of an abstract value of JAX; tokens have none",
+    "kind": "of a type of an abstract value of JAX",
+    "weak_type": "of an array of JAX; those of NumPy have none",
+    "shape": "of what a user's function returns",
+    "val": "of a parameter of a rule of JAX",
+    "frames": "of a traceback of JAX, which may be None",
+    "name": "of axes of matplotlib; of a group, in a message about another one",
+    "model_fields": "of a model of pydantic; typed dictionaries have none",
+    "metric": "of a manifold of geomstats",
+    "submersion": "of a manifold of geomstats",
+    "geteuid": "of the operating system",
+    "sched_getaffinity": "of the operating system",
+    "register_at_fork": "of the operating system",
+    "O_NOFOLLOW": "of the operating system",
+    "O_NONBLOCK": "of the operating system",
+    "O_CLOEXEC": "of the operating system",
+}
+
+OURS = {
+    (
+        "liethermo/integrators/base.py",
+        "retraction",
+    ): "a field of some methods; a class cannot declare it for all of them",
+    ("liethermo/learn/files.py", "training"): "what a fit has put beside a system",
+    ("liethermo/testing/changed.py", "rate"): "of any dissipation that a case has; another way is taken without it",
+    ("liethermo/functions/on_spaces.py", "dim"): "of a Casimir, which may be any function that knows its dimension",
+    ("liethermo/dissipation/quantum.py", "structure"): "refused, with a message, where there is none",
+    ("manifolds/algebras/killing.py", "killing_form"): "refused, with a message, where there is none",
+}
+
+
+def lookups():
+    """The file, the line and the name of each lookup with a silent default."""
+    for package in ("liethermo", "manifolds"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+                    continue
+                silent = node.func.id == "hasattr" or (node.func.id == "getattr" and len(node.args) == 3)
+                if silent and isinstance(node.args[1], ast.Constant):
+                    yield str(path.relative_to(ROOT)), node.lineno, node.args[1].value
+
+
+def test_no_member_of_ours_is_looked_up_with_a_silent_default():
+    unknown = [found for found in lookups() if found[2] not in FOREIGN and (found[0], found[2]) not in OURS]
+    assert not unknown, unknown
+
+
+@pytest.mark.parametrize("known", OURS)
+def test_what_is_excused_is_still_there(known):
+    assert known in {(file, name) for file, _, name in lookups()}
