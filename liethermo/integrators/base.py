@@ -179,6 +179,7 @@ class Wrapping(OneStepMethod):
     weights = forwarded("method")
     predict = forwarded("method")
     check = forwarded("method")
+    explain = forwarded("method")
 
 
 class TransportingMethod(OneStepMethod):
