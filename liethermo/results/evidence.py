@@ -236,9 +236,9 @@ class Witness:
     def _inconsistency(self, steps: list[_Step]) -> float | None:
         """The largest over a few states of what short steps miss of the field: the least over the steps from one.
 
-        At rest the field of a block may vanish, as the heat of friction does, and grow like a power of time: then a step
-        of any size misses the same share of the field at its ends. So where short steps from a state miss it, others
-        begin where a first one ends.
+        At rest the field of a block may vanish, as the heat of friction does, and grow like a power of time: then a
+        step of any size misses the same share of the field at its ends. So where short steps from a state miss it,
+        others begin where a first one ends.
         """
         fastest = max(step.length / step.h for step in steps)
         moving = [step for step in steps if step.length > 1e-6 * fastest * step.h]
@@ -252,7 +252,7 @@ class Witness:
         return float(np.nanmax(missed)) if np.isfinite(missed).any() else None
 
     def _missed_by_short_steps(self, x: list[np.ndarray], steps: list[_Step], sizes: list[float]) -> np.ndarray:
-        """The least that ever shorter steps from states miss of the field, shape (states,); NaN where none can be taken.
+        """The least that ever shorter steps from states miss of the field, shape (states,); NaN where none is known.
 
         The first step from each state has the given size, and what is rounding is that of ``steps``.
         """

@@ -152,7 +152,7 @@ def status_of(engine: Chosen, state, now: float, h: float, stopped: str) -> Stat
     if code == Code.NOT_CONVERGED and engine.method.explicit:
         message = (
             f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
-            f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e}). "
+            f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e} of the step). "
             + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)

@@ -79,8 +79,9 @@ def untouched_components(
 
 
 def _torque(model: tuple, t, mu, *attitude) -> jax.Array:
+    torque, needs = model
     g = attitude[0] if len(attitude) == 1 else attitude[0] + 1j * attitude[1]
-    return torque_at(*model, t, mu, g)
+    return torque_at(torque, needs, t, mu, g)
 
 
 def name_of(torque: Any) -> str:
