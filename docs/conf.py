@@ -128,14 +128,15 @@ html_context = {"default_mode": "auto"}  # else the theme complains to a first v
 
 INTERNALS = frozenset(
     """
-    acted_on along_at arranged at_midpoint at_sites at_some_times balance begin blocks body_at body_dim by_constants
-    check_places constants couplings decided decided_near displaced entries evaluated explain first_velocity general
-    heating_sites here hidden impulses in_chart inertia_at isotropic isotropic_size kind leaves ledger left_alone
+    acted_on across along_at arranged at_midpoint at_sites at_some_times balance begin blocks body_at body_dim
+    by_constants casimirs_of_torque check_places constants couplings decided decided_near displaced entries evaluated
+    explain first_velocity general has_impulse heating_sites here hidden impulses in_chart inertia_at isotropic
+    isotropic_size kind leaves ledger left_alone
     linearised local lowered needs_attitude noiseless noisy numbers on on_density on_sites on_states orderless outside
     over_sites own_energy own_residuals own_size place predict prepared presented preserved_as preserved_by_name
     preserved_names production_name pulled push pushed pushed_by quotient raised receives rounded samples seen
     sizes smooth solved_for sparsity spectral surface surrounded tangent time_of torque_free transport transports
-    turned turned_parts uncorrected undecided unrollable
+    turned turned_parts uncorrected undecided unrollable untouched
     """.split()
 )
 """Members that the rooms of the library ask of each other: no user calls them, so the reference leaves them out."""

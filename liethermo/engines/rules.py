@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..functions.gradients import EPS
+from ..integrators.levels import MAX_MISS
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,9 @@ class Rules:
         vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the slopes
         are rounded.
     corrected : float
-        What an explicit step may miss of the levels that it ends on.
+        What an explicit step may miss of the levels that it ends on, relative to its length. A step that leaves more
+        has not been corrected, even where that is less than rounding of the state: near an equilibrium, where gradients
+        depend on each other, all that is left has one sign, and adds up.
     vanished : float
         Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
     steered : float
@@ -79,7 +82,7 @@ class Rules:
     shrinking: float = 0.8
     floor: float = 1e-5 * EPS
     plateau: float = 1e3 * EPS
-    corrected: float = 64 * EPS
+    corrected: float = MAX_MISS
     vanished: float = 1e-280
     steered: float = 4 * EPS
     constant: float = 100.0

@@ -241,8 +241,9 @@ def explicit(system: System, method: OneStepMethod, x, compensation, h, k, rules
     """The slopes of an explicit method, which there is nothing to solve for."""
     k = method.slopes(system, x, compensation, h, k)
     x, none = system.solved_for(x)[1], jnp.zeros((), dtype=jnp.int64)
-    missed = rules.size(x.size)(jnp.zeros_like(x).at[0].set(defect(k)))  # it is the length of a vector
-    converged = missed <= rules.corrected * scale_of(x, h, k[0], rules)
+    size = rules.size(x.size)
+    missed = size(jnp.zeros_like(x).at[0].set(defect(k)))  # it is the length of a vector
+    converged = missed <= rules.corrected * size(k[0]) + rules.floor * scale_of(x, h, k[0], rules)
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
 
 

@@ -94,12 +94,20 @@ def frame(vectors: Sequence[jax.Array], like: Sequence[jax.Array] | None = None,
     return found
 
 
-def towards(directions: Sequence[jax.Array], products: jax.Array, passes: int = 1) -> jax.Array:
+def towards(
+    directions: Sequence[jax.Array],
+    products: jax.Array,
+    passes: int = 1,
+    is_usable: Callable[[jax.Array], jax.Array] | None = None,
+) -> jax.Array:
     """The vector in the span of some whose inner products with them are these, shape (n,).
 
     As ``frame(directions).with_products(products)``, in one pass and without roots: for an iteration that corrects what
     rounding leaves. One that depends on those before it, as at an equilibrium, is left out. A second pass is for
     directions that are nearly parallel, as in units of which one is much larger than another.
+
+    What each direction adds is left out where it is not usable: the product with that direction is then as the others
+    make it.
     """
     found = jnp.zeros_like(directions[0])
     units: list[tuple[jax.Array, jax.Array]] = []
@@ -112,7 +120,8 @@ def towards(directions: Sequence[jax.Array], products: jax.Array, passes: int = 
         use = square > jnp.maximum(DEPENDENT * jnp.dot(v, v), VANISHED)
         square = jnp.where(use, square, 1.0)
         own = jnp.where(use, own, 0.0)
-        found = found + ((product - jnp.dot(v, found)) / square) * own
+        added = ((product - jnp.dot(v, found)) / square) * own
+        found = found + (added if is_usable is None else jnp.where(is_usable(added), added, 0.0))
         units.append((own, square))
     return found
 

@@ -88,10 +88,13 @@ class DiscreteGradient(Module):
 class Gonzalez(DiscreteGradient):
     """Midpoint discrete gradient ``grad H(z) + [H(x') - H(x) - grad H(z).d] d/|d|^2``, z = x + d/2 [BFM 4.3].
 
-    ``noisy`` is :data:`NOISY`, or what takes its place where no equation is solved with it.
+    ``noisy`` is :data:`NOISY`, or what takes its place where no equation is solved with it. With ``across`` the defect
+    is used where the gradient varies in any direction, and not only along the step: on a circular orbit the gradient of
+    the energy is across each step, and the quadrature misses a few roundings of one sign.
     """
 
     noisy: float = eqx.field(static=True, default=NOISY)
+    across: bool = eqx.field(static=True, default=False)
 
     orderless = True
 
@@ -103,7 +106,7 @@ class Gonzalez(DiscreteGradient):
         predicted = jnp.dot(middle, d) + (5 / 18) * jnp.dot(second, d)
         difference = _difference(term, x, d, compensation, middle)
         slope, size, length = (jnp.linalg.norm(v) for v in (middle, x, d))
-        along = jnp.dot(second, d)
+        along = jnp.linalg.norm(second) * length if self.across else jnp.dot(second, d)
         defect = _gated_defect(*difference, predicted, slope * size, along, slope * length, self.noisy)
         return middle + _divide((5 / 18) * jnp.dot(second, d) + defect, jnp.dot(d, d)) * d
 

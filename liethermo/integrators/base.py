@@ -201,6 +201,7 @@ class Wrapping(OneStepMethod):
     carries_rounding = forwarded("method")
     held_names = forwarded("method")
     resumed = forwarded("method")
+    explain = forwarded("method")
 
 
 class TransportingMethod(OneStepMethod):

@@ -86,7 +86,7 @@ class InCharts(Wrapping):
         x, k = jnp.asarray(x), jnp.asarray(k)
         reach = float(self._reach(system, x, self.increment(h, k)))
         if not reach >= 0.5:
-            return ""
+            return self.method.explain(system, x, k, h)
         radius = self.retraction.space.injectivity_radius(system.points(x))
         return (
             f"the last step was {reach:.3g} times as long as the domain of {self.retraction} allows (injectivity "

@@ -140,7 +140,7 @@ class ExplicitMethod(TransportingMethod):
         parts that turn inside, such as a wheel that rubs, are no matter of the attitude's.
         """
         size, casimirs = system.orbit
-        held = bool(system.pushed_by) or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
+        held = system.has_impulse or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
         return system.has_all_casimirs and held and size - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -205,6 +205,8 @@ class ExplicitMethod(TransportingMethod):
         """What functions that are conserved are to change by, back to the levels that the run has begun on.
 
         Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
+        A function whose gradient depends on those before it, as that of the entropy does at an equilibrium, changes as
+        these make it.
         """
 
         def back(law: Law, gradient, level) -> jax.Array:
@@ -219,11 +221,15 @@ class ExplicitMethod(TransportingMethod):
             ]
         )
 
+        def is_near(v) -> jax.Array:
+            move = displacement(system, x, v, leaf)
+            near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
+            return jnp.stack(near).all()
+
         def allowed() -> jax.Array:
             along = directions(system, x, gradients, leaf)
-            move = displacement(system, x, correction(system, along, found), leaf)
-            near = [jnp.linalg.norm(move[b]) <= STEERABLE * jnp.linalg.norm(x[b]) for b in system.blocks]
-            return jnp.where(jnp.stack(near).all(), found, 0.0)
+            move = correction(system, along, found, is_near)
+            return jnp.stack([jnp.dot(v, move) for v in along])
 
         return jax.lax.stop_gradient(jax.lax.cond((found != 0.0).any(), allowed, lambda: found))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,12 +11,22 @@ import jax.numpy as jnp
 
 from ..functions.energy import Energy
 from ..functions.frames import VANISHED, towards
-from ..functions.gradients import EPS, Gonzalez
+from ..functions.gradients import DIFFERENCE_NOISE, EPS, SPREAD, Gonzalez
 from ..functions.surface import Surface
 from ..systems import System
 
 CORRECTIONS = 4
 """Newton corrections of a step at most: a relative error of a twentieth is one of rounding after them."""
+
+RELAXED_CORRECTIONS = 3
+"""Further corrections of a step whose levels have no common point, which leave the growth of the entropy open."""
+
+MAX_MISS, MIN_MISS = 64.0 * EPS, 1e-5 * EPS
+"""What a corrected step may miss of its levels: relative to its length; and relative to the state, if it is short."""
+
+MAX_RELAXED_MISS = 1e-6
+"""What a step may miss of the levels that stay, relative to its length and before any correction, for these corrections
+to be tried: a step that misses more is too long."""
 
 NOISY = 1e-8
 """As :data:`..functions.gradients.NOISY`, for a step that is not iterated: noise in what a function changes by is no
@@ -35,7 +45,7 @@ VANISHED_LENGTH = math.sqrt(VANISHED)
 AT_REST = 8.0 * EPS
 """Size of ``Pi(x) dH``, relative to those of x and dH, that is rounding: no step along the leaf changes H there."""
 
-ALONG = Gonzalez(NOISY)
+ALONG = Gonzalez(NOISY, across=True)
 """The discrete gradient that gives the change of a function in a step."""
 
 
@@ -74,8 +84,14 @@ def corrected(
 
     ``starts`` are the gradients of the functions at x + compensation. With ``leaf`` the displacement is along the
     symplectic leaf, and d is the covector that carries the state.
+
+    Near an equilibrium the entropy is almost the largest that the conserved functions allow, so the levels may have no
+    common point where a step overestimates the production. Corrections along gradients that depend on each other would
+    then wander, and miss all levels by rounding of one sign. So the amount by which a function is to rise or to fall is
+    left open there: it changes as the others make it, or not at all where that would have the wrong sign.
     """
     change, surface = ALONG, system.surface
+    signs = jnp.asarray([law.sign for law in laws])
     functions, blocks = [law.function for law in laws], system.blocks
 
     def landed(s: Ended) -> tuple[jax.Array, jax.Array]:
@@ -99,8 +115,15 @@ def corrected(
         ends = [f.gradient(x + (compensation + d)) for f in functions]
         return s._replace(d=d, left=left, defect=misses(d, ends)), ends
 
-    def aimed(s: Ended, ends) -> Ended:
-        """The next correction, and the lengths of its directions.
+    def without_amount(s: Ended) -> Ended:
+        """What is missed where functions that rise or fall need not change by a given amount."""
+        changed, rounding = changes - s.defect, DIFFERENCE_NOISE * s.lengths * jnp.linalg.norm(s.d)
+        return s._replace(
+            defect=jnp.where(signs == 0.0, s.defect, jnp.where(signs * changed >= -rounding, 0.0, -changed))
+        )
+
+    def aimed(s: Ended, ends, used=None) -> Ended:
+        """The next correction, along the directions that are ``used``, and the lengths of all directions.
 
         These are numbers by which what is missed becomes a length as that of d: where parts of a state have units
         of their own, as entropies beside a momentum, those by which a function changes most in d; or by what the
@@ -118,34 +141,69 @@ def corrected(
             squares = jnp.diagonal(products)
             shares = products / jnp.where(squares > VANISHED, squares, 1.0)  # of what rounds one in what rounds another
             lengths = (shares @ most) * (1.0 / jnp.where(moved > 0.0, moved, 1.0))
+        if used is not None:
+            found = [jnp.where(used[i], v, 0.0) for i, v in enumerate(found)]
         return s._replace(lengths=lengths, correction=correction(system, found, s.defect))
 
     def done(s: Ended) -> jax.Array:
         small = jnp.abs(s.defect) <= EPS * s.lengths * jnp.linalg.norm(s.d)
         return (s.left == 0.0) & (small | (s.lengths <= VANISHED_LENGTH)).all()
 
-    def again(carry, _):
-        s, ended = carry
-        s = jax.lax.cond(ended, lambda: s, lambda: aimed(*moved(s)))
-        return (s, done(s)), None
+    def again(carry, number):
+        """The next correction; those beyond the first few are relaxed, and the last is along conserved functions."""
+        s, finished = carry
+        relaxed, last = number >= corrections - 1, number >= corrections + RELAXED_CORRECTIONS - 2
+        begin = number == corrections - 1
+        finished = finished | jax.lax.cond(begin, lambda: ~is_near | is_corrected(s), lambda: jnp.asarray(False))
 
-    def hidden() -> jax.Array:
-        """What rounding of the values may make of what is missed: nothing where there is a closed form."""
-        return DIFFERENCE * jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
+        def corrected_once() -> Ended:
+            at = s._replace(d=jnp.where(begin, first[0], s.d), correction=jnp.where(begin, first[1], s.correction))
+            at, ends = moved(at)
+            at = at._replace(defect=jnp.where(relaxed, without_amount(at).defect, at.defect))
+            used = (signs == 0.0) | ~relaxed | ((at.defect != 0.0) & ~last)
+            return aimed(at, ends, used)
+
+        s = jax.lax.cond(finished, lambda: s, corrected_once)
+        return (s, finished | done(s)), None
+
+    def missed_length(s: Ended, rounding) -> jax.Array:
+        """What is missed beyond rounding, as a length, shape ()."""
+        vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
+        return jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
+
+    def is_corrected(s: Ended) -> jax.Array:
+        allowed = MAX_MISS * jnp.linalg.norm(s.d) + MIN_MISS * jnp.linalg.norm(x)
+        return s.left + missed_length(s, rounding_of_values(s.d)) <= allowed
+
+    def rounding_of_values(d) -> jax.Array:
+        """What rounding of the values may make of what is missed, shape (laws,): nothing where they are not used.
+
+        In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d.
+        """
+        sizes = jnp.stack([sum((term.hidden(x) for term in f.terms), jnp.zeros(())) for f in functions])
+        ends = [f.gradient(x + (compensation + d)) for f in functions]
+        spreads = [jnp.linalg.norm(end - start) for end, start in zip(ends, starts, strict=True)]
+        slopes = [jnp.linalg.norm(start) for start in starts]
+        varies = jnp.stack(spreads) > SPREAD * jnp.stack(slopes)
+        return jnp.where(varies | (jnp.linalg.norm(d) > SPREAD * jnp.linalg.norm(x)), DIFFERENCE * sizes, 0.0)
 
     none = jnp.zeros(len(laws))
     first = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
     s = aimed(*moved(Ended(first[0], jnp.zeros(()), none, none, first[1])))
+    is_near = missed_length(s, jnp.where(signs == 0.0, 0.0, jnp.inf)) <= MAX_RELAXED_MISS * jnp.linalg.norm(s.d)
     s, ends = moved(s)  # of a short step one correction is enough
     ended = done(s)
 
+    can_be_released = 0 < sum(law.sign == 0.0 for law in laws) < len(laws)
+    number = corrections - 1 + (RELAXED_CORRECTIONS + 1 if can_be_released else 0)
+
     def further() -> tuple[Ended, jax.Array]:
-        return jax.lax.scan(again, (aimed(s, ends), ended), length=corrections - 1)[0]
+        s_further, _ = jax.lax.scan(again, (aimed(s, ends), ended), jnp.arange(number))[0]
+        return s_further, done(s_further)
 
     s, ended = jax.lax.cond(ended, lambda: (s, ended), further)
-    rounding = jax.lax.cond(ended, lambda: jnp.zeros_like(s.defect), hidden)
-    vanished, beyond = s.lengths <= VANISHED_LENGTH, jnp.maximum(jnp.abs(s.defect) - rounding, 0.0)
-    return s.d, s.left + jnp.max(jnp.where(vanished, 0.0, beyond / jnp.where(vanished, 1.0, s.lengths)))
+    rounding = jax.lax.cond(ended, lambda: jnp.zeros_like(s.defect), lambda: rounding_of_values(s.d))
+    return s.d, s.left + missed_length(s, rounding)
 
 
 def directions(system: System, x, gradients: Sequence[jax.Array], leaf: bool = False) -> list[jax.Array]:
@@ -166,9 +224,14 @@ def _along_leaf(system: System, x, gradient) -> jax.Array:
     return jnp.where(at_rest & (jnp.arange(found.size) < n), 0.0, found)
 
 
-def correction(system: System, along: Sequence[jax.Array], changes: jax.Array) -> jax.Array:
-    """The vector in the span of these directions that changes their functions by so much."""
-    return towards(along, changes, passes=min(len(system.blocks), 2))
+def correction(
+    system: System,
+    along: Sequence[jax.Array],
+    changes: jax.Array,
+    is_usable: Callable[[jax.Array], jax.Array] | None = None,
+) -> jax.Array:
+    """The vector in the span of these directions that changes their functions by so much, as far as it is usable."""
+    return towards(along, changes, min(len(system.blocks), 2), is_usable)
 
 
 def displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:

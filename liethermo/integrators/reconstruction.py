@@ -130,7 +130,7 @@ class WithAttitude(Wrapping):
         if self.explicit:
             return self._moved_explicitly(system, x, compensation, new, new_compensation, h, k)
         xi = h * self._moving.velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
-        p, p_compensation = self._in_space(system, x, compensation, h, k, xi) if system.pushed_by else (None, None)
+        p, p_compensation = self._in_space(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
         if self.kind == "cayley":
             gained = (g + g_compensation) @ _collocated(system.group.algebra.hat(xi))
             turned, turned_compensation = compensated(g, g_compensation + gained)
@@ -147,7 +147,7 @@ class WithAttitude(Wrapping):
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         turned = g @ group.exp_map(group.algebra, local.angles(step))
         follows, p_compensation = system.body.torque_free and self._moving.transports(system.body), None
-        if system.pushed_by:
+        if system.has_impulse:
             p, p_compensation = compensated(system.in_space(x), system.in_space(compensation) + local.in_space(step))
             if follows:
                 p, p_compensation = _on_orbit(system.momenta, p, new), jnp.zeros_like(p)
@@ -156,7 +156,7 @@ class WithAttitude(Wrapping):
         if follows:
             turned = _carrying(group, turned, p, new[:n])
         turned = group.restore_map(turned)
-        return system.join(new, turned, p if system.pushed_by else None), system.join(
+        return system.join(new, turned, p if system.has_impulse else None), system.join(
             new_compensation, jnp.zeros_like(g), p_compensation
         )
 

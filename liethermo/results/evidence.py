@@ -250,21 +250,39 @@ class Witness:
         return float(np.abs(ends[1] - ends[0]).max()) / max(step.moved, whole)
 
     def _inconsistency(self, steps: list[_Step]) -> float | None:
-        """The largest over a few states of what short steps miss of the field: the least over the steps from one."""
-        blocks, fastest = self.system.blocks, max(step.length / step.h for step in steps)
+        """The largest over a few states of what short steps miss of the field: the least over the steps from one.
+
+        At rest the field of a block may vanish, as the heat of friction does, and grow like a power of time: then a
+        step of any size misses the same share of the field at its ends. So where short steps from a state miss it,
+        others begin where a first one ends.
+        """
+        fastest = max(step.length / step.h for step in steps)
         moving = [step for step in steps if step.length > 1e-6 * fastest * step.h]
-        short: list[list[_Step]] = []
-        for i in spread(len(moving), PLACES):
-            first = min(moving[i].h, SHORT * moving[i].h / moving[i].length)
-            tried = (self._step(moving[i].x, first / 8.0**n, moving[i].t, moving[i].least) for n in range(RUNGS))
-            short.append([step for step in tried if step is not None])
+        some = [moving[i] for i in spread(len(moving), PLACES)]
+        sizes = [min(step.h, SHORT * step.h / step.length) for step in some]
+        missed = self._missed_by_short_steps([step.x for step in some], some, sizes)
+        for i in np.flatnonzero(~(missed <= CLEAR)):
+            if (away := self._step(some[i].x, sizes[i], some[i].t, some[i].least)) is not None:
+                later = self._missed_by_short_steps([away.x + away.d], [some[i]], [sizes[i]])
+                missed[i] = np.fmin(missed[i], later[0])
+        return float(np.nanmax(missed)) if np.isfinite(missed).any() else None
+
+    def _missed_by_short_steps(self, x: list[np.ndarray], steps: list[_Step], sizes: list[float]) -> np.ndarray:
+        """The least that ever shorter steps from states miss of the field, shape (states,); NaN where none is known.
+
+        The first step from each state has the given size, and what is rounding is that of ``steps``.
+        """
+        short = [
+            [new for n in range(RUNGS) if (new := self._step(at, size / 8.0**n, step.t, step.least)) is not None]
+            for at, step, size in zip(x, steps, sizes, strict=True)
+        ]
         starts = [step.x for steps in short for step in steps]
         ends = [step.x + step.d for steps in short for step in steps]
         if not starts:
-            return None
+            return np.full(len(x), np.nan)
         found = iter(field_at(self.system, np.array(starts + ends)).reshape(2, len(starts), -1).swapaxes(0, 1))
-        defect = [[_missed(step, blocks, *next(found)) for step in steps] for steps in short]
-        return max((np.nanmin(values) for values in defect if np.isfinite(values).any()), default=None)
+        defects = [[_missed(step, self.system.blocks, *next(found)) for step in steps] for steps in short]
+        return np.array([min((d for d in values if np.isfinite(d)), default=np.nan) for values in defects])
 
     def _step(self, x: np.ndarray, h: float, t: float, least: np.ndarray, steps: int = 1) -> _Step | None:
         """A step from a state at a time, or so many in its place; None where it cannot be taken."""

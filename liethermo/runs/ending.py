@@ -167,7 +167,7 @@ def status_of(engine: Chosen, state, now: float, h: float, stopped: str) -> Stat
     if code == Code.NOT_CONVERGED and engine.method.explicit:
         message = (
             f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
-            f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e}). "
+            f"{residual:.2g} relative to the state (wanted: rounding, below {RULES.corrected:.0e} of the step). "
             + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)
@@ -177,7 +177,7 @@ def status_of(engine: Chosen, state, now: float, h: float, stopped: str) -> Stat
             f"relative to the state (wanted: rounding, below {RULES.plateau:.0e}). " + _advice(engine, state, h)
         )
         return Status(Code.NOT_CONVERGED, message, step, now, residual)
-    if engine.system.surface is not None and (reason := engine.system.outside(_ahead(state, h))):
+    if engine.system.surface is not None and (reason := engine.system.outside(_state_ahead(engine, state, h))):
         text = f"{where}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
         return Status(Code.NON_FINITE, text, step, now, residual)
     message = (
@@ -204,15 +204,19 @@ def _advice(engine: Chosen, state, h: float) -> str:
     )
 
 
-def _ahead(state, h: float) -> jax.Array:
-    """Where the last slopes lead to."""
-    return jnp.asarray(state.x) + h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+def _state_ahead(engine: Chosen, state, h: float) -> jax.Array:
+    """Return the state, shape (n,), to which a step of size h along the last slope leads.
+
+    The method applies the displacement: slopes need not have the shape of a state, as those of a body with an attitude.
+    """
+    displacement = h * jnp.nan_to_num(jnp.asarray(state.k[0]))
+    return engine.method.displaced(engine.system, jnp.asarray(state.x), displacement)
 
 
 def _culprit(engine: Chosen, state, h: float) -> str:
     """Which function is not finite just ahead of the last good state."""
     system = engine.system
-    ahead = _ahead(state, h)
+    ahead = _state_ahead(engine, state, h)
     if reason := system.outside(ahead):
         return reason
     if reason := engine.method.explain(system, state.x, state.k, h):

@@ -158,10 +158,12 @@ class _Members:
 
     def verdicts_of_named(self) -> np.ndarray:
         """On each Casimir that is not conserved by form, then on what is preserved: shape (B, functions)."""
-        count = len(self.casimirs) + len(self.member.preserved)
-        if self.member.pushed_by:  # a torque that is zero at some times tells nothing of others
-            return np.full((len(self.states), count), BROKEN)
-        return self._verdicts(_named_rates, count, self.casimirs, near=True)
+        count, member = len(self.casimirs) + len(self.member.preserved), self.member
+        verdicts = self._verdicts(_named_rates, count, self.casimirs, near=True)
+        # a torque that is zero at some times tells nothing of others
+        acted_on = [member.pushed_by and name not in member.casimirs_of_torque for name in self.casimirs]
+        acted_on += [bool(member.pushed_by)] * len(member.preserved)
+        return np.where(np.array(acted_on, dtype=bool), BROKEN, verdicts)
 
     def verdicts_of_asked(self) -> np.ndarray:
         """On each function that the method is asked to preserve, shape (B, functions)."""

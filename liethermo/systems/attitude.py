@@ -61,7 +61,7 @@ class AttitudeSystem(System):
         group = momenta_of(body).group
         assert group is not None
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
-        self.dim = body.dim + self._parts * group.matrix_size**2 + (group.dim if body.pushed_by else 0)
+        self.dim = body.dim + self._parts * group.matrix_size**2 + (group.dim if body.has_impulse else 0)
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self._of_momentum(body.energy)
         self.entropy = None if body.entropy is None else self._of_momentum(body.entropy)
@@ -81,6 +81,8 @@ class AttitudeSystem(System):
         return momenta_of(self.body)
 
     pushed_by = forwarded("body")
+    has_impulse = forwarded("body")
+    casimirs_of_torque = forwarded("body")
 
     def split(self, x) -> tuple[jax.Array, jax.Array]:
         """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
@@ -135,7 +137,7 @@ class AttitudeSystem(System):
         if size and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:]))
-        if not self.pushed_by:
+        if not self.has_impulse:
             return self.join(mu, g)
         return self.join(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.to_space(g)))
 
@@ -207,12 +209,12 @@ class AttitudeSystem(System):
     def constants(self):
         if not self.body.torque_free:
             return ()
-        return (WITHOUT_IMPULSE,) if self.pushed_by else (SPATIAL_MOMENTUM,)
+        return (WITHOUT_IMPULSE,) if self.has_impulse else (SPATIAL_MOMENTUM,)
 
     @property
     def impulses(self) -> tuple[str, ...]:
         """The names of the components of the impulse; none where no torque acts."""
-        return tuple(f"{IMPULSE} {i + 1}" for i in range(self.group.dim)) if self.pushed_by else ()
+        return tuple(f"{IMPULSE} {i + 1}" for i in range(self.group.dim)) if self.has_impulse else ()
 
     @property
     def ledger(self):
@@ -223,7 +225,7 @@ class AttitudeSystem(System):
 
     @property
     def blocks(self):
-        n, m = self.body.dim, self.dim - (self.group.dim if self.pushed_by else 0)
+        n, m = self.body.dim, self.dim - (self.group.dim if self.has_impulse else 0)
         return *_bounded(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
@@ -233,7 +235,7 @@ class AttitudeSystem(System):
         (mu, g), body = self.split(x), self.body_at(x)
         dS = None if body.entropy is None else body.entropy.gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
-        p = body.push(mu)[: self.group.dim] @ self.to_space(g) if self.pushed_by else None
+        p = body.push(mu)[: self.group.dim] @ self.to_space(g) if self.has_impulse else None
         return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
 
     def _of_momentum(self, energy: Energy) -> Energy:
@@ -271,7 +273,7 @@ def _in_space(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
     (state, g), p = system.split(x), system.in_space(x)
     mu, action = state[: system.group.dim], system.to_space(g)
     found = mu @ action
-    return found - p if system.pushed_by else found, jnp.max(jnp.abs(mu) @ jnp.abs(action))
+    return found - p if system.has_impulse else found, jnp.max(jnp.abs(mu) @ jnp.abs(action))
 
 
 UNIT = 2.0**-300
@@ -302,7 +304,7 @@ class TurningSystem(System):
     def __init__(self, whole: AttitudeSystem, order: int, attitude: jax.Array):
         body = whole.body
         self.whole, self.order, self.attitude = whole, order, attitude
-        self.dim, self.space = body.dim + whole.group.dim * (2 if whole.pushed_by else 1), None
+        self.dim, self.space = body.dim + whole.group.dim * (2 if whole.has_impulse else 1), None
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
@@ -312,12 +314,14 @@ class TurningSystem(System):
     @property
     def blocks(self):
         n, m = self.whole.body.dim, self.whole.body.dim + self.whole.group.dim
-        return *_bounded(self.whole.body), slice(n, m), *([slice(m, None)] if self.pushed_by else [])
+        return *_bounded(self.whole.body), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
 
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
 
     pushed_by = forwarded("whole")
+    has_impulse = forwarded("whole")
+    casimirs_of_torque = forwarded("whole")
 
     def casimirs(self):
         return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
@@ -331,7 +335,7 @@ class TurningSystem(System):
         algebra = self.whole.group.algebra
         turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
         rates = [body.field(*given), UNIT * turning]
-        if self.pushed_by:
+        if self.has_impulse:
             push = body.push(x[:n])
             assert push is not None
             rates.append(UNIT * (push[: algebra.dim] @ self.whole.to_space(self._turned(x))))

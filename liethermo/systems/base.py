@@ -419,17 +419,18 @@ class System(Kind):
 
     def _verdicts(self, near=None) -> dict[str, bool | None]:
         """Whether it conserves each of its functions: by construction, or at random points."""
-        claimed = self.claimed()
+        claimed, untouched = self.claimed(), self.casimirs_of_torque
         others = {name: f for name, f in self.functions().items() if name not in claimed}
+        # points decide, but not of what a torque acts on: one that is zero at some times tells nothing of others
+        open_ = {name: f for name, f in others.items() if not self.pushed_by or name in untouched}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            open_ = is_traced(self) or self.pushed_by  # a torque that is zero at some times tells nothing of others
-            kept = [False] * len(others) if open_ else self.conserves(tuple(others.values()), near)
-        return dict.fromkeys(claimed, True) | dict(zip(others, kept, strict=True))
+            kept = [False] * len(open_) if is_traced(self) else self.conserves(tuple(open_.values()), near)
+        return dict.fromkeys(others, False) | dict(zip(open_, kept, strict=True)) | dict.fromkeys(claimed, True)
 
     def claimed(self) -> frozenset[str]:
         """The names of the functions that it conserves by construction: nothing has to be tried out."""
-        by_form = not self.pushed_by and (self.dissipation is None or self.dissipation.keeps_casimirs)
-        return frozenset({*self.momentum_maps, *(self.casimirs() if by_form else ())})
+        by_form = self.dissipation is None or self.dissipation.keeps_casimirs
+        return frozenset({*self.momentum_maps, *(self.casimirs_of_torque if by_form else ())})
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
         """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""

@@ -135,6 +135,8 @@ class DrivenSystem(System):
     torque_free = forwarded("body")
     body_dim = forwarded("body")
     pushed_by = forwarded("body")
+    has_impulse = forwarded("body")
+    casimirs_of_torque = forwarded("body")
     needs_attitude = forwarded("body")
 
     def push(self, x):
@@ -263,6 +265,7 @@ class _Push(SkewFriction):
         return self.law
 
     noiseless = True
+    keeps_casimirs = True  # those of :attr:`System.casimirs_of_torque`; of others nobody claims it
 
     def force(self, system, x, dH, dS, dL):
         return system.pushed(x, dH)

@@ -139,6 +139,16 @@ class Kind(Geometry):
         return ""
 
     @property
+    def has_impulse(self) -> bool:
+        """Whether a torque may change the momenta that a group turns, and not those of parts inside alone."""
+        return bool(self.pushed_by)
+
+    @property
+    def casimirs_of_torque(self) -> frozenset[str]:
+        """The names of the Casimirs that no torque on the system changes."""
+        return frozenset() if self.pushed_by else frozenset(self.casimirs())
+
+    @property
     def needs_attitude(self) -> bool:
         """Whether the torque depends on the attitude."""
         return False

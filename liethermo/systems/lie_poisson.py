@@ -23,7 +23,7 @@ from ..tracing.interpret import at_points
 from ..tracing.remembered import remembered
 from .base import TIMES, System
 from .baths import EntropyOfBaths, HeatBaths
-from .torque import checked_torque, name_of, torque_at
+from .torque import checked_torque, name_of, torque_at, untouched_components
 
 
 class LiePoissonSystem(System):
@@ -100,6 +100,7 @@ class LiePoissonSystem(System):
     torque: Any
     place: tuple[jax.Array, jax.Array | None] | None
     turned_parts: tuple[bool, ...] = eqx.field(static=True)
+    untouched: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def lie_algebra(self) -> mf.LieAlgebra:
@@ -127,6 +128,7 @@ class LiePoissonSystem(System):
         self.algebra = algebra
         self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
         self.torque, self.turned_parts = checked_torque(torque, algebra, group)
+        self.untouched = () if torque is None else untouched_components(self.torque, self.turned_parts, algebra, group)
         self.place = None
         poisson = mf.LiePoisson(algebra)
         self._build(poisson, algebra.dim, energy, entropy, dissipation, momentum_maps, validate, baths=baths)
@@ -158,6 +160,17 @@ class LiePoissonSystem(System):
     @property
     def pushed_by(self) -> str:
         return "" if self.torque is None else name_of(self.torque)
+
+    @property
+    def has_impulse(self) -> bool:
+        turned = self.algebra.dim if self.group is None else self.group.dim
+        return self.torque is not None and not set(range(turned)) <= set(self.untouched)
+
+    @property
+    def casimirs_of_torque(self) -> frozenset[str]:
+        if self.torque is None:
+            return super().casimirs_of_torque
+        return _on_components(self.algebra, self.algebra.basis_names, self.untouched)
 
     @property
     def needs_attitude(self) -> bool:
@@ -204,7 +217,7 @@ class LiePoissonSystem(System):
         if self.torque is None:
             return self
         found = copy(self)
-        for name, value in {"torque": None, "turned_parts": (), "place": None}.items():
+        for name, value in {"torque": None, "turned_parts": (), "untouched": (), "place": None}.items():
             object.__setattr__(found, name, value)
         return found
 
@@ -317,6 +330,15 @@ def _on_the_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int)
     with jax.ensure_compile_time_eval():
         found = _recorded_casimirs(algebra, names).items()
         return frozenset(name for name, C in found if bool(C.gradient(jnp.asarray(x))[:n].any()))
+
+
+@functools.lru_cache(maxsize=64)
+def _on_components(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, places: tuple[int, ...]) -> frozenset[str]:
+    """Which of the recorded Casimirs depend on some components alone."""
+    x, others = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), places)
+    with jax.ensure_compile_time_eval():
+        found = _recorded_casimirs(algebra, names).items()
+        return frozenset(name for name, C in found if not bool(C.gradient(jnp.asarray(x))[others].any()))
 
 
 @functools.lru_cache(maxsize=64)

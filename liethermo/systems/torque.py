@@ -12,6 +12,7 @@ import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
+from ..tracing.interpret import LARGE, vanishing_entries
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import Traced, converted
 
@@ -60,6 +61,27 @@ def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | N
 def torque_at(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> jax.Array:
     """The sum of the parts, of the shape of mu."""
     return sum(_evaluated(torque, needs, t, mu, attitude), jnp.zeros_like(mu))
+
+
+def untouched_components(
+    torque: Any, needs: tuple[bool, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+) -> tuple[int, ...]:
+    """Return the components of the momentum on which a torque does not act, whatever its parameters.
+
+    A motor inside a body turns a wheel and changes no component of the angular momentum of the whole.
+    """
+    if algebra.dim > LARGE:
+        return ()
+    shape = () if group is None else group.identity.shape
+    complex_group = group is not None and jnp.iscomplexobj(group.identity)
+    shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
+    return tuple(sorted(vanishing_entries(_torque, (torque, needs), *shapes)))
+
+
+def _torque(model: tuple, t, mu, *attitude) -> jax.Array:
+    torque, needs = model
+    g = attitude[0] if len(attitude) == 1 else attitude[0] + 1j * attitude[1]
+    return torque_at(torque, needs, t, mu, g)
 
 
 def name_of(torque: Any) -> str:

@@ -108,6 +108,26 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
     return _known("degree", (function, form, dim), degree)
 
 
+def vanishing_entries(function: Callable, model: Any, *shapes: tuple[int, ...]) -> frozenset[int]:
+    """Return the entries of ``function(model, *arrays)`` that are zero for any parameters and any arrays.
+
+    The arrays of the model are the parameters. The entries are counted in row-major order; none is known of a function
+    that cannot be unrolled, or that closes over what is being traced.
+    """
+    leaves, form, rebuild = _parts(model)
+
+    def entries() -> frozenset[int]:
+        arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (*map(np.shape, leaves), *shapes)]
+        closed = jax.make_jaxpr(lambda *a: function(rebuild(a[: len(leaves)]), *a[len(leaves) :]))(*arrays)
+        if any(isinstance(constant, jax.core.Tracer) for constant in closed.consts):
+            return frozenset()
+        with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
+            (values,) = scalarize(closed, limit=LIMIT_FOR_DEGREES).outputs
+        return frozenset(i for i, value in enumerate(values) if type(value) is not str and value == 0.0)
+
+    return _known("zeros", (function, form, shapes), entries) or frozenset()
+
+
 def _parts(model: Any) -> tuple[list, Any, Callable]:
     """The parameters of a model, which are real arrays; a key of its form; and how it is put together again."""
     dynamic, static = eqx.partition(model, _is_parameter)

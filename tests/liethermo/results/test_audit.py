@@ -6,6 +6,7 @@ import pickle
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.optimize
 from typer.testing import CliRunner
 
@@ -349,6 +350,93 @@ def test_heat_that_is_missing_in_a_body_almost_at_rest(method, passed, nutation)
     row = the_row(solution.audit(), "consistency")
     assert row.passed is passed, row
     assert passed or row.value == pytest.approx(1e-3, rel=0.01)
+
+
+def with_drag(name):
+    """A system with drag that heats a bath, a state at rest, and its field without the bath in NumPy."""
+    baths = lt.HeatBaths(2.0, 1.0)
+    if name == "heavy top":
+        inertia, rate, gravity = np.array([1.0, 1.2, 0.5]), 0.2, np.array([0.0, 0.0, 1.0])
+        system = lt.LiePoissonSystem(
+            mf.se(3),
+            lambda mu: 0.5 * jnp.sum(mu[:3] ** 2 / inertia) + mu[5],
+            dissipation=lt.Friction([rate] * 3 + [0.0] * 3),
+            baths=baths,
+        )
+
+        def field(t, x):
+            omega = x[:3] / inertia
+            turned = np.cross(x[:3], omega) + np.cross(x[3:], gravity) - rate * omega
+            return np.concatenate([turned, np.cross(x[3:], omega)])
+
+        return system, [0.0, 0.0, 0.0, 0.6, 0.0, 0.8], field
+    potential, force = {
+        "spring": (lambda q: 0.5 * q**2, lambda q: -q),
+        "pendulum": (lambda q: 1.0 - jnp.cos(q), lambda q: -np.sin(q)),
+    }[name]
+    system = lt.MetriplecticSystem(
+        mf.Canonical(1),
+        lambda x: potential(x[0]) + 0.5 * x[1] ** 2,
+        dissipation=lt.Friction([0.0, 0.3]),
+        baths=baths,
+    )
+    return system, [1.0, 0.0], lambda t, x: np.array([x[1], force(x[0]) - 0.3 * x[1]])
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("step", [0.05, lt.Adaptive(1e-8)], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize(
+    "method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(10)], ids=str
+)
+@pytest.mark.parametrize("name", ["spring", "pendulum", "heavy top"])
+def test_drag_from_rest_is_the_motion(name, method, step):
+    """The entropy of the bath begins as t^3, so that every step misses the same share of its mean rate."""
+    system, x0, field = with_drag(name)
+    solution = lt.integrate(system, x0, (0.0, 10.0), step, method)
+    exact = scipy.integrate.solve_ivp(field, (0.0, 10.0), x0, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    assert np.abs(solution.x[-1, : len(x0)] - exact).max() < 1e-6
+    audit = solution.audit()
+    assert audit.verdict == "the laws hold, and the steps resolve the motion", str(audit)
+    assert the_row(audit, "consistency").value < 1e-10
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("power", [1, 2, 4])
+def test_a_force_that_grows_from_zero_is_the_motion(power):
+    """From rest at the equilibrium, so that the velocity begins as t^(power + 1)."""
+    system = lt.MetriplecticSystem(
+        mf.Canonical(1),
+        lambda x, t: 0.5 * x[0] ** 2 + 0.5 * x[1] ** 2 - x[0] * t**power,
+        dissipation=lt.Friction([0.0, 0.3]),
+        baths=lt.HeatBaths(2.0, 1.0),
+    )
+    audit = lt.integrate(system, [0.0, 0.0], (0.0, 5.0), 0.05, lt.MetriplecticRungeKutta(4)).audit()
+    assert audit.passed, str(audit)
+
+
+class Cool(lt.MetriplecticMidpoint):
+    """Control: a thousandth of the heat of drag on a spring is missing."""
+
+    def slopes(self, system, x, compensation, h, k):
+        return super().slopes(system, x, compensation, h, k).at[:, 2].multiply(0.999)
+
+
+def test_heat_that_is_missing_from_rest_on():
+    system, x0, _ = with_drag("spring")
+    row = the_row(lt.integrate(system, x0, (0.0, 10.0), 0.05, Cool()).audit(), "consistency")
+    assert row.passed is False
+    assert row.value == pytest.approx(1e-3, rel=0.01)
+
+
+def test_members_of_an_ensemble_that_start_at_rest():
+    """The audit of all, and that of one trajectory, which takes its steps again."""
+    system, x0, _ = with_drag("spring")
+    x0s = np.outer([1.0, 0.5, -2.0], x0)
+    many = lt.ensemble(system, x0s, (0.0, 10.0), 0.05, lt.MetriplecticRungeKutta(4), outputs="trajectory")
+    assert many.audit().verdict == "the laws hold, and the steps resolve the motion"
+    alone = many[1].audit()
+    assert alone.passed, str(alone)
+    assert the_row(alone, "consistency").value < 1e-10
 
 
 # -- what is conserved ------------------------------------------------------------------------------------------------

@@ -259,3 +259,49 @@ def test_progress_bar_is_silent_by_default_and_shown_on_request(capsys):
     assert capsys.readouterr() == ("", "")
     lt.integrate(BODY, X0, (0.0, 1.0), 0.1, progress=True)
     assert "t =" in capsys.readouterr().err
+
+
+def leaves_its_domain_with_attitude(torque=None):
+    """A body whose energy is not defined for mu_1 >= 1.05; friction, or a torque, brings it there."""
+    inertia = jnp.array([3.0, 2.0, 1.0])
+    return lt.LiePoissonSystem(
+        mf.so(3),
+        lambda mu: 0.5 * jnp.sum(mu**2 / inertia) + 0.01 * jnp.sqrt(1.05 - mu[0] ** 2),
+        dissipation=lt.DoubleBracket(0.3),
+        baths=lt.HeatBaths(2.0, 1.0),
+        group=mf.SO(3),
+        torque=torque,
+    )
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(6), lt.MetriplecticGauss(2)])
+@pytest.mark.parametrize(
+    "torque", [None, lt.torques.ConstantInBody([0.3, 0.0, 0.0]), lt.torques.ConstantInSpace([0.3, 0.0, 0.0])]
+)
+def test_a_body_with_an_attitude_that_leaves_its_domain_says_so(method, torque):
+    """The slopes of a body with an attitude have fewer components than its states."""
+    system = leaves_its_domain_with_attitude(torque)
+    run = lt.integrate(system, [0.5, 1.0, 1.2], (0.0, 4.0), 1.0, method, on_failure="return", engine="array")
+    assert run.status.code == "non_finite"
+    assert ("run away, or leave the domain" if method.explicit else "the energy first") in run.status.message
+    assert np.isfinite(run.x).all()
+    assert run.audit().verdict.startswith("THE RUN STOPPED")
+
+
+def test_the_body_of_the_readme_in_steps_that_are_too_long():
+    """A failed step is reported, and the advice of the message holds: a smaller step arrives."""
+    body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
+    options = {"method": lt.MetriplecticRungeKutta(4), "on_failure": "return"}
+    run = lt.integrate(body, [0.6, 1.0, 10.0], (0.0, 10.0), 5.0, **options)
+    assert run.status.code == "non_finite"
+    assert "too long for an explicit method" in run.status.message
+    assert lt.integrate(body, [0.6, 1.0, 10.0], (0.0, 10.0), 0.01, **options).status.ok
+
+
+def test_a_potential_with_a_logarithm_on_se3_in_a_step_that_is_too_long():
+    system = lt.LiePoissonSystem(mf.se(3), lambda mu: 0.5 * mu @ mu + jnp.log(mu[0]), group=mf.SE(3))
+    x0 = [1e-3, 0.5, 0.2, 0.3, 0.1, 0.2]
+    run = lt.integrate(system, x0, (0.0, 20.0), 1.0, lt.MetriplecticRungeKutta(4), on_failure="return", engine="array")
+    assert run.status.code == "non_finite"
+    assert "too long for an explicit method" in run.status.message

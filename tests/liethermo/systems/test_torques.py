@@ -276,6 +276,103 @@ def test_a_motor_drives_a_wheel():
         assert np.abs(run.x[:, 3] - 0.05 * (np.cos(0.3) - np.cos(run.t))).max() < 1e-7
 
 
+WHEEL = 0.1
+WITH_WHEEL = mf.direct_sum(mf.so(3), mf.abelian(1))
+
+
+def with_a_wheel(torque, **more) -> lt.LiePoissonSystem:
+    """A body with a wheel about its third axis; mu is the momentum of the whole, then that of the wheel."""
+
+    def energy(mu):
+        body = mu[:3] - jnp.array([0.0, 0.0, 1.0]) * mu[3]
+        return jnp.sum(body**2 / INERTIA) / 2 + mu[3] ** 2 / (2 * WHEEL)
+
+    return lt.LiePoissonSystem(WITH_WHEEL, energy, torque=torque, **more)
+
+
+def moment(t):
+    return 0.05 * jnp.sin(t)[None]
+
+
+INTERNAL = {
+    "motor": lt.torques.Motor(moment),
+    "number": lt.torques.Motor([0.3]),
+    "function": lambda t, mu: jnp.zeros(4).at[3].set(0.05 * jnp.sin(t) - 0.01 * mu[3] ** 3),
+    "attitude": lambda t, mu, g: jnp.append(jnp.zeros(3), 0.05 * g[0, 1]),
+    "two": [lt.torques.Motor(moment), lambda t, mu: jnp.append(jnp.zeros(3), -0.1 * mu[3])],
+}
+
+
+@pytest.mark.sampled("motor-rk4-0.5", "function-taylor-0.5", "attitude-rk4-0.5", "two-gauss2-0.5")
+@pytest.mark.parametrize("step", [0.5, lt.Adaptive(1e-6)], ids=["0.5", "adaptive"])
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("torque", INTERNAL)
+def test_an_internal_torque_leaves_the_momentum_in_space(torque, name, step):
+    """As it leaves the length of the momentum: every method holds both, and the audit has a row for each."""
+    system = with_a_wheel(INTERNAL[torque], group=SO3)
+    run = lt.integrate(system, [*START, 0.05], SPAN, step, METHODS[name], engine="array")
+    assert run.audit().passed, run.audit()
+    in_space = np.einsum("tij,tj->ti", run.attitude, run.x[:, :3])
+    assert np.abs(in_space - in_space[0]).max() <= 5e-15
+    lengths = np.linalg.norm(run.x[:, :3], axis=1)
+    assert np.abs(lengths - lengths[0]).max() <= 3e-15
+    assert row(run, "drift of momentum in space").passed
+    assert row(run, "drift of mu1**2 + mu2**2 + mu3**2").passed
+    assert not any(name.startswith("impulse") for name in run.casimirs)
+
+
+def test_a_motor_against_scipy():
+    system = with_a_wheel(INTERNAL["motor"], group=SO3)
+
+    def field(t, state):
+        mu, g = state[:4], state[4:].reshape(3, 3)
+        omega = (mu[:3] - np.array([0.0, 0.0, mu[3]])) / INERTIA
+        hat = np.array([[0.0, -omega[2], omega[1]], [omega[2], 0.0, -omega[0]], [-omega[1], omega[0], 0.0]])
+        return np.concatenate([np.cross(mu[:3], omega), [0.05 * np.sin(t)], (g @ hat).ravel()])
+
+    start = np.concatenate([START, [0.05], np.eye(3).ravel()])
+    exact = solve_ivp(field, SPAN, start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    run = lt.integrate(system, [*START, 0.05], SPAN, 0.05, METHODS["rk8"], engine="array")
+    assert np.abs(run.x[-1] - exact[:4]).max() < 1e-10
+    assert np.abs(run.attitude[-1].ravel() - exact[4:]).max() < 1e-10
+
+
+def test_a_motor_beside_friction_in_the_bearing():
+    """What is conserved is decided at random points there, and the motor is no reason against it."""
+    system = with_a_wheel(
+        INTERNAL["motor"], group=SO3, dissipation=lt.Friction([0.0, 0.0, 0.0, 0.02]), baths=lt.HeatBaths(2.0, 1.0)
+    )
+    run = lt.integrate(system, [*START, 0.05], SPAN, 0.5, METHODS["rk4"], engine="array")
+    assert run.audit().passed, run.audit()
+    assert row(run, "drift of mu1**2 + mu2**2 + mu3**2").passed
+
+
+def test_what_a_torque_acts_on_does_not_depend_on_its_numbers():
+    """A torque whose numbers happen to be zero has an impulse, as those of another member may not be zero."""
+    idle, busy = (lt.torques.ConstantInBody(moment) for moment in ([0.0, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.1]))
+    for torque in (idle, busy, [lt.torques.Motor([0.1]), idle], lambda t, mu: 0.1 * mu):
+        system = with_a_wheel(torque, group=SO3)
+        assert system.has_impulse
+        assert not system.casimirs_of_torque
+    for torque in INTERNAL.values():
+        system = with_a_wheel(torque, group=SO3)
+        assert not system.has_impulse
+        assert system.casimirs_of_torque == {"mu1**2 + mu2**2 + mu3**2"}
+    assert with_a_wheel(INTERNAL["motor"]).casimirs_of_torque == {"mu1**2 + mu2**2 + mu3**2"}
+
+
+def test_an_ensemble_over_the_moment_of_a_motor_is_single_runs():
+    moments, method = np.array([[0.0], [0.1], [-0.2]]), METHODS["rk4"]
+    system = with_a_wheel(lt.torques.Motor([0.3]), group=SO3)
+    many = lt.ensemble(system, [*START, 0.05], SPAN, 0.5, method, parameters={"torque.moment": moments})
+    assert many.audit().passed, many.audit()
+    for i in range(3):
+        alone = with_a_wheel(lt.torques.Motor(moments[i]), group=SO3)
+        one = lt.integrate(alone, [*START, 0.05], SPAN, 0.5, method, engine=many.provenance["engine"])
+        assert np.array_equal(many.x[i], one.x[-1])
+        assert np.array_equal(many.attitude[i], one.attitude[-1])
+
+
 # -- time, energies that depend on it ----------------------------------------------------------------------------------
 
 
