@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import converted
-from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
+from .energy import Energy, Function, Negative, Pullback, Sum, WithinSpan, WithTime
 
 
 def recognised(energy: Energy, dim: int) -> Energy:
@@ -23,6 +23,9 @@ def recognised(energy: Energy, dim: int) -> Energy:
         return Negative(recognised(energy.term, dim))
     if isinstance(energy, WithTime):
         return WithTime(recognised(energy.energy, dim))
+    if isinstance(energy, WithinSpan):
+        inner = recognised(energy.energy, dim)
+        return inner if inner.is_quadratic else WithinSpan(inner, energy.span)  # a polynomial is known at every time
     if isinstance(energy, Pullback):
         (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))

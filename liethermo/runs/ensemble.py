@@ -23,7 +23,17 @@ from .events import Event, Relaxed
 from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .paced import Many
-from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start
+from .preparation import (
+    as_family,
+    as_run,
+    begun,
+    check_choice,
+    decided,
+    family_within_span,
+    laws_of,
+    no_start,
+    within_span,
+)
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
@@ -140,6 +150,8 @@ def ensemble(
     attitude = np.asarray(attitude)[run] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
     family, states = as_family(family, member), np.asarray(begun(member, states, course.start, attitude, batch=True))
     method.check(member)
+    span = course.start, course.end
+    family, member = family_within_span(family, member, *span), within_span(member, *span)
     if off := _off(family, member, method, states):
         reasons = dict(reasons) | {int(run[i]): text for i, text in off.items()}
         if len(off) == len(run):

@@ -151,6 +151,19 @@ class Family:
         key = form.key, change, fixed
         return Family(Form(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *fixed)), self.values)
 
+    def with_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
+        """The family of what a function, one that has an identity, makes of the members with some numbers.
+
+        Families with other numbers have the same form.
+        """
+        form, count = self.form, len(numbers)
+
+        def rebuild(arrays):
+            return change(form.rebuild(arrays[:-count]), *arrays[-count:])
+
+        values = [*self.values, *(np.array([number]) for number in numbers)]
+        return Family(Form((form.key, change, count), (*form.shapes, *[()] * count), rebuild), values)
+
     # -- members --------------------------------------------------------------------------------------------------
 
     @property

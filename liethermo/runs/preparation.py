@@ -11,6 +11,7 @@ from manifolds._arrays import is_traced
 
 from ..errors import InputError
 from ..functions.checks import traced_energies
+from ..functions.time_span import limit_times
 from ..integrators import OneStepMethod, WithAttitude
 from ..integrators.base import pulled
 from ..integrators.fluctuating import noise_dimension
@@ -116,6 +117,21 @@ def as_family(family: Family, system: System) -> Family:
     if isinstance(system, EmbeddedSystem):
         return family.through(EmbeddedSystem, *system.known)
     return as_family(family, system.body).through(DrivenSystem) if isinstance(system, DrivenSystem) else family
+
+
+def within_span(system: System, start: float, end: float) -> System:
+    """Return a system as it is run, its functions of time evaluated at times from ``start`` to ``end`` only."""
+    return limit_times(system, start, end) if is_driven_run(system) else system
+
+
+def family_within_span(family: Family, system: System, start: float, end: float) -> Family:
+    """Return the family of what :func:`within_span` makes of the members, where the system is one of them."""
+    return family.with_numbers(limit_times, start, end) if is_driven_run(system) else family
+
+
+def is_driven_run(system: System) -> bool:
+    """Whether a system as it is run has a clock, since its functions depend on time."""
+    return isinstance(system.body if isinstance(system, AttitudeSystem) else system, DrivenSystem)
 
 
 @remembered

@@ -25,6 +25,7 @@ from .adaptive import Adaptive, pacing_of
 from .ending import STOPPED, given_up, stats_of, status_of, stopped_by
 from .events import Event
 from .fluctuations import Fluctuations, Paths
+from .preparation import within_span
 from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, Steps, follow
 from .timetable import Course
@@ -51,7 +52,8 @@ class Run:
         noise: Fluctuations | None = None,
         dense: bool = False,
     ):
-        self.system, self.method, self.course = system, method, course
+        self.prepared, self.system = system, within_span(system, course.start, course.end)
+        self.method, self.course = method, course
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
         self.times = [np.array([course.start])]
@@ -68,7 +70,7 @@ class Run:
         if noise is not None and (increments := noise_dimension(method)):
             only = Paths(noise, increments, np.zeros(1, dtype=int))
             path = lambda first, steps, h: only.rows(slice(None), first, steps, h)[0]  # noqa: E731
-        self.engine = Chosen(system, method, engine, course.steps, path)
+        self.engine = Chosen(self.system, method, engine, course.steps, path)
 
     @property
     def now(self) -> float:
@@ -223,6 +225,7 @@ class Run:
             entropy=entropy,
             steps=self._longest(len(x) - 1),
             again=Again(self.engine),
+            prepared_as=self.prepared,
             status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.now),
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),
