@@ -233,7 +233,8 @@ class Family:
     def _not_numbers(self) -> dict[int, str]:
         """Members that have parameters that are NaN."""
         bad = np.zeros(self.size, dtype=bool)
-        for value in self.values:
+        # what all share may be the NaN that a function is written with, such as a table beyond its ends
+        for value in self.values[: self.given] or [value for value in self.values if len(value) > 1]:
             bad |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
         return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(bad)}
 

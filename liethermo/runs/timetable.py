@@ -132,11 +132,11 @@ class Course:
     def reached(self, steps: np.ndarray) -> np.ndarray:
         """The times after so many steps."""
         if len(self.parts) == 1:
-            return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
+            return np.where(steps >= self.steps, self.end, np.minimum(_time_after(self.start, steps, self.h), self.end))
         place = np.clip(np.searchsorted(self._before, steps, side="right") - 1, 0, len(self.parts) - 1)
         starts, ends = (np.array([getattr(part, name) for part in self.parts])[place] for name in ("start", "end"))
         last = steps >= self._before[place + 1]
-        return np.where(last, ends, np.minimum(starts + (steps - self._before[place]) * self.h, ends))
+        return np.where(last, ends, np.minimum(_time_after(starts, steps - self._before[place], self.h), ends))
 
 
 def course_of(span, step: float | Adaptive, every: int | None, save_at=None) -> Course:
@@ -155,6 +155,26 @@ def _stops(save_at, start: float, end: float) -> np.ndarray:
     if times.min() < start or times.max() > end:
         raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
     return np.unique([*times, end])
+
+
+def _time_after(start, steps, h: float) -> np.ndarray:
+    """Return ``start + steps * h``, rounded once (Dekker's product and Knuth's sum)."""
+    steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _halves(np.float64(h))
+    high, low = _halves(steps)
+    product = steps * h
+    lost = ((high * h_high - product) + high * h_low + low * h_high) + low * h_low
+    found = start + product
+    other = found - start
+    lost = lost + (start - (found - other)) + (product - other)
+    return np.where(np.isfinite(lost), found + lost, found)
+
+
+def _halves(a) -> tuple[np.ndarray, np.ndarray]:
+    """Two numbers of 26 bits whose sum is a."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        shifted = a * (2.0**27 + 1.0)
+        high = shifted - (shifted - a)
+        return high, a - high
 
 
 def _checked_span(span) -> tuple[float, float]:

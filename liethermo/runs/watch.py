@@ -141,7 +141,7 @@ class _Step:
         self._between: np.ndarray | None = None
 
     def time(self, share: float) -> float:
-        return self.reached if share == 1.0 else self.t + share * self.h
+        return self.reached if share == 1.0 else min(self.t + share * self.h, self.reached)
 
     def state(self, share: float) -> State:
         if share not in self._states:
