@@ -147,6 +147,8 @@ class Run:
         steps = int(state.step)
         if isinstance(step, Adaptive) and (outcome.underflow is not None or outcome.limit in ("steps", "memory")):
             self.status = given_up(self.system, np.asarray(self.states[0][0]), outcome, step, (start, end), now)
+        elif outcome.unknown is not None:
+            self.status = Status(outcome.unknown.code, str(outcome.unknown), steps, now, float(state.residual))
         elif event is not None and outcome.limit:
             text = f"{event.name} is not a number at some states near t = {now:g}, and has other signs before and "
             text += "after: whether it is zero there is not known, so extend the function"
@@ -157,6 +159,8 @@ class Run:
         else:
             h = step if isinstance(step, float) else float("nan")
             self.status = status_of(self.engine, state, now, h, outcome.stopped)
+            if watch and watch.remark and self.status.ok:
+                self.status = dataclasses.replace(self.status, message=f"{self.status.message}; {watch.remark}")
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 if outcome.jumps:
