@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -36,6 +37,10 @@ MOST_LISTED = 1_000
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
+
+
+UNIT_LENGTH = 1.0
+"""The length that an endless span counts for where the first step is a share of it, from a state at rest."""
 
 
 class Run:
@@ -108,6 +113,11 @@ class Run:
         self.values = [self._energies(self.states[0])]
         self.status = Status(Code.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.course.start)
 
+    def take_no_step(self) -> None:
+        """Complete a run over a span of length zero."""
+        self.values = [self._energies(self.states[0])]
+        self.status = Status(Code.COMPLETED, f"reached t = {self.course.end:g} in 0 steps", 0, self.course.end)
+
     def by_paces(self, bar, step: float | Adaptive, until) -> None:
         """Look at every step: adaptive ones, and those with events."""
         start, end, every = self.course.start, self.course.end, self.course.every or 1
@@ -128,9 +138,10 @@ class Run:
             bar.update(ends[-1])
             self._checkpoint(steps.after)
 
+        length = end - start if math.isfinite(end) else UNIT_LENGTH
         pacing = pacing_of(step, self.method, end - start, event)
         try:
-            paces = self.engine.paces(pacing, self.states[0][0], start, float(stops[0]), end - start)
+            paces = self.engine.paces(pacing, self.states[0][0], start, float(stops[0]), length)
         except STOPPED as error:
             self._not_begun(stopped_by(error))
             return

@@ -81,6 +81,19 @@ class Watch:
                 return step.time(share), share * h, None if share == 0.0 else step.state(share)
         return None
 
+    def of_state(self, t: float, y: np.ndarray) -> bool:
+        """Note the zeros at the only state of a run that takes no step; return whether one of them ends the run."""
+        for j, function in enumerate(self.functions):
+            if float(function(t, y, *self.args)) == 0.0:
+                self.times[j].append(t)
+                self.states[j].append(y)
+        return any(len(times) == most for times, most in zip(self.times, self.most, strict=True))
+
+    @property
+    def can_end(self) -> bool:
+        """Whether a zero of some function ends the run."""
+        return any(most is not None for most in self.most)
+
     @property
     def remark(self) -> str:
         """What is not known of the events, in words; empty where there is nothing."""

@@ -159,7 +159,8 @@ def test_events_in_the_first_step_of_a_driven_system(direction):
     theirs = solve_ivp(forced, (0.0, 10.0), [1.0, 0.0], "DOP853", max_step=0.05, **settings)
     ours = lt.scipy.solve_ivp(OSCILLATOR, (0.0, 10.0), [1.0, 0.0], **settings)
     if direction <= 0:
-        assert ours.t_events[0][0] < ours.t[1] and ours.t_events[1][0] == ours.t_events[2][0] == 0.0
+        assert ours.t_events[0][0] < ours.t[1]
+        assert ours.t_events[1][0] == ours.t_events[2][0] == 0.0
     same_events(theirs, ours, 1e-6)
 
 
@@ -180,7 +181,8 @@ def test_every_change_of_sign_between_states_is_an_event():
     body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
     ours = lt.scipy.solve_ivp(body, (0.0, 400.0), [1e-6, 1.0, 1e-6], events=lambda t, y: y[0], dense_output=True)
     changes = np.flatnonzero(np.diff(np.sign(ours.y[0])) != 0.0)
-    assert len(changes) > 3 and len(ours.t_events[0]) == len(changes)
+    assert len(changes) > 3
+    assert len(ours.t_events[0]) == len(changes)
     assert ((ours.t[changes] <= ours.t_events[0]) & (ours.t_events[0] <= ours.t[changes + 1])).all()
     assert np.isfinite(ours.sol(np.linspace(*ours.t[changes[0] :][:2], 9))).all()
     assert np.ptp(np.linalg.norm(ours.y_events[0], axis=1)) < 1e-13  # roundings of 67 steps
@@ -197,15 +199,18 @@ def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
     settings = {"events": lambda t, y: t - 3.0, "rtol": 1e-6}
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, **settings)
     assert (ours.success, ours.status, ours.t_events[0].size) == (False, -1, 0)
-    assert "whether an event happens in the step from t = " in ours.message and "not_converged" in ours.message
-    assert ours.t[-1] < 3.0 and ours.solution.status.code == "not_converged"
+    assert "whether an event happens in the step from t = " in ours.message
+    assert "not_converged" in ours.message
+    assert ours.t[-1] < 3.0
+    assert ours.solution.status.code == "not_converged"
     advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
     for _ in range(5):
         ours = lt.scipy.solve_ivp(BODY, SPAN, X0, max_step=advised, **settings)
         if ours.success:
             break
         advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
-    assert ours.success and ours.t_events[0] == pytest.approx([3.0])
+    assert ours.success
+    assert ours.t_events[0] == pytest.approx([3.0])
 
 
 def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
