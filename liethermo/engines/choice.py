@@ -111,16 +111,19 @@ class Chosen:
 
         Where a part cannot be taken at once, it is divided; NaN if that does not help either.
         """
-        found = np.array(self._attempt(lambda engine, _: engine.ends(x, h)))
+        found = np.array(self._ends(x, h))
         for substeps in SUBSTEPS[1:]:
             missing = np.isnan(found).any(axis=1) & np.isfinite(x).all(axis=1)
             if not missing.any():
                 break
             some, size = x[missing], h[missing] / substeps
             for _ in range(substeps):
-                some = self._attempt(lambda engine, _, some=some, size=size: engine.ends(some, size))
+                some = self._ends(some, size)
             found[missing] = some
         return found
+
+    def _ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return self._attempt(lambda engine, _: engine.ends(x, h))
 
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise(int(state.step), steps, h)

@@ -177,6 +177,9 @@ class Run:
                 if outcome.jumps:
                     text += f": it changed its sign {len(outcome.jumps)} times without being zero, first at t = "
                     text += f"{outcome.jumps[0]:g}"
+                if outcome.undefined:
+                    text = f"{self.status.message}; whether the event ({event.name}) happened is not known, since the "
+                    text += "function is NaN at the end. Define it for all states of the run"
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:

@@ -6,6 +6,7 @@ they hold in every step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -38,6 +39,7 @@ class Outcome:
     underflow: float | None = None
     stopped: str = ""
     jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
+    undefined: bool = False  # whether the event function is not a number at the end
     unknown: UnknownStateError | None = None  # what is not known of an event
     limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
 
@@ -117,6 +119,7 @@ def _follow(
         guide.verify()
         guide.resume()
         code, t = int(scalar("status")), scalar("t")
+        outcome.undefined = not math.isfinite(scalar("value"))
         if code == Code.EVENT:
             outcome.event_time = t
         if code != Code.COMPLETED:
