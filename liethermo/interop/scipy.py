@@ -104,7 +104,8 @@ def solve_ivp(
     events : function of t, y and the ``args``, or several, optional
         Their zeros are located, all of them, by steps that end there. The attributes ``terminal`` (True, or the number
         of zeros after which to stop) and ``direction`` mean what they mean in SciPy. A change of sign counts, as in
-        SciPy, even where the function jumps; one across states where it is not a number does not.
+        SciPy, even where the function jumps; one across states where it is NaN does not, and ``message`` says where.
+        If a state that is needed cannot be found, the run ends there with status -1 and the reason.
     vectorized : bool
         Without effect: a system takes states of any shape.
     args : tuple, optional

@@ -337,6 +337,43 @@ def test_tbound_respected_oscillator(method):
     assert res.y[:4, -1] == pytest.approx(start[:4] + 100.0 * rates, rel=1e-14)
 
 
+def test_event_dense_output():
+    """test_event_dense_output_LSODA: y' = (t - 2) y, beside a momentum that stays zero; steps are up to 1 long."""
+    system = canonical(lambda x, t: (t - 2.0) * x[0] * x[1])
+
+    def exact(t):
+        return np.exp(t**2 / 2 - 2 * t + np.log(0.05) - 6)
+
+    res = solve_ivp(
+        system,
+        [-2, 2],
+        [0.05, 0.0],
+        events=lambda t, y: y[0] - 2.02e-5,
+        dense_output=True,
+        rtol=RTOL,
+        atol=ATOL,
+        first_step=1e-3,
+        max_step=1,
+    )
+    assert res.success
+    assert res.status == 0
+    assert (res.t[0], res.t[-1]) == (-2, 2)
+    assert res.t[1] + 2 == pytest.approx(1e-3)
+    for times, states in ((res.t, res.y), (np.linspace(-2, 2), res.sol(np.linspace(-2, 2)))):
+        assert np.all(np.abs(states[0] - exact(times)) / (ATOL + RTOL * exact(times)) < 5)
+    assert len(res.t_events[0]) == 1
+    assert np.array_equal(res.sol(res.t), res.y)
+
+
+def test_initial_max_step():
+    """test_inital_maxstep: the first step that is chosen is no longer than the longest allowed."""
+    free = solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL)
+    largest = 0.5 * (free.t[1] - free.t[0])
+    assert solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL, max_step=largest).t[1] - 5.0 == pytest.approx(
+        largest
+    )
+
+
 def test_an_endless_span_needs_an_end():
     """SciPy runs for ever."""
     with pytest.raises(lt.InputError, match=r"set event\.terminal = True"):
