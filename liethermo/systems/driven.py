@@ -112,7 +112,9 @@ class DrivenSystem(System):
         return self._now_of_all(x).singular(x[..., :-2])
 
     def _now_of_all(self, x) -> System:
-        return self._now(np.reshape(x, (-1, self.dim))[0])
+        """The body at the time of the first of several states, which are numbers."""
+        t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
+        return self._at(min(max(t, float(self.span.start)), float(self.span.end)))
 
     def sizes(self, k):
         clock = jnp.full((*k.shape[:-1], 2), self.unit)
@@ -168,8 +170,11 @@ class DrivenSystem(System):
         return jnp.concatenate([self.body.lowered(x[:-2], v[:-2]), v[-2:]])
 
     def _now(self, x) -> System:
+        return self._at(self.time(x))
+
+    def _at(self, t) -> System:
         where = () if self.attitude is None else (self.attitude,)
-        return self.body.at_time(self.time(x), *where)
+        return self.body.at_time(t, *where)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
