@@ -139,7 +139,7 @@ class Watch:
         self._note_undefined(j, step, [(shares[i], values[i]) for i in numbers])
         found = []
         for a, b in changes:
-            if b > a + 1:
+            if b > a + 1 and values[b] != 0.0:
                 self.undefined.append((j, step.time(shares[a]), step.time(shares[b])))
             elif self._counts(j, values[a], values[b]):
                 root = shares[b] if values[b] == 0.0 else self._zero(j, step, shares[a], shares[b])
