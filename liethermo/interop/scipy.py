@@ -92,8 +92,8 @@ def solve_ivp(
     ----------
     fun : System
     t_span : (float, float)
-        Time runs forwards. The end may be infinite if an event is terminal. Of a span of length zero the result is the
-        initial state, at its start and at its end.
+        Time runs forwards. The end may be infinite if an event is terminal. The result over a span of length zero is
+        the initial state, at the start and at the end.
     y0 : array, shape (n,)
     method : OneStepMethod, optional
         ``MetriplecticRungeKutta(order=8)`` by default; take ``MetriplecticGauss(3)`` for stiff systems.
