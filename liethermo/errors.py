@@ -55,8 +55,9 @@ class IntegrationError(LiethermoError, ArithmeticError):
 
     Attributes
     ----------
-    solution : Solution
-        The trajectory up to the last good step; ``solution.status`` says where and why it stopped.
+    solution : Solution or None
+        The trajectory up to the last good step; ``solution.status`` says where and why it stopped. None if the run is
+        complete, and only a state between its steps cannot be found.
     """
 
     def __init__(self, message: str, solution):

@@ -16,6 +16,7 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
+from .codes import Code
 from .compiled.paced import LanePaces
 from .compiled.stepper import CompiledEngine
 from .paced import ArrayPaces, Paces, continued, single
@@ -40,6 +41,10 @@ COMPILED_STEPS = 20_000
 
 SPARSE_DIM = 200
 """Components from which a system that knows its sparsity is solved by it."""
+
+
+SUBSTEPS = (1, 2, 4, 8, 16)
+"""Into how many steps a part of a step is divided, one number after another, until it can be taken."""
 
 
 Engine: TypeAlias = ArrayEngine | CompiledEngine | SparseEngine
@@ -90,7 +95,34 @@ class Chosen:
         noise = self._noise(state, 1, h)
         return self._attempt(lambda engine, state: engine.step(state, h, noise), state)
 
+    def part_of_step(self, state: State, h: float) -> State:
+        """Return the state after a part of a step that the run has taken whole, of size h.
+
+        Where the part cannot be taken at once, it is divided. If that does not help either, the status says why.
+        """
+        for substeps in SUBSTEPS:
+            after = self.advance(state, h / substeps, 1, substeps)[0]
+            if int(after.status) == Code.COMPLETED:
+                break
+        return after
+
     def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Return where parts of steps end, of sizes h, that begin at states x, shape (m, n).
+
+        Where a part cannot be taken at once, it is divided; NaN if that does not help either.
+        """
+        found = np.array(self._ends(x, h))
+        for substeps in SUBSTEPS[1:]:
+            missing = np.isnan(found).any(axis=1) & np.isfinite(x).all(axis=1)
+            if not missing.any():
+                break
+            some, size = x[missing], h[missing] / substeps
+            for _ in range(substeps):
+                some = self._ends(some, size)
+            found[missing] = some
+        return found
+
+    def _ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         return self._attempt(lambda engine, _: engine.ends(x, h))
 
     def _noise(self, state: State, steps: int, h) -> np.ndarray | None:

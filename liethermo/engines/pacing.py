@@ -174,7 +174,8 @@ def fitted(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
         return h, reached
     search = searching.Search(*pace.search)
     part = search.share * search.whole
-    return jnp.where(search.whole > 0.0, part, h), jnp.where(search.whole > 0.0, pace.t + part, reached)
+    end_of_part = jnp.minimum(pace.t + part, pace.stop)
+    return jnp.where(search.whole > 0.0, part, h), jnp.where(search.whole > 0.0, end_of_part, reached)
 
 
 def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
@@ -183,7 +184,9 @@ def fitted_whole(pacing: Pacing, pace: Pace) -> tuple[jax.Array, jax.Array]:
         left = pace.stop - pace.t
         arrives = left <= pace.proposed * (1 + 1e-12)
         h = jnp.where(arrives, left, jnp.where(left < 2.0 * pace.proposed, 0.5 * left, pace.proposed))
-        return h, jnp.where(arrives, pace.stop, pace.t + h)
+        reached = jnp.where(arrives, pace.stop, pace.t + h)
+        # the step that the clock sees, so that rounding of the times does not add up
+        return jnp.where(arrives | ~(reached > pace.t), h, reached - pace.t), reached
     # as a timetable has them
     length, done = pace.stop - pace.base, pace.state.step - pace.since
     full = jnp.floor(length / pace.proposed * (1 + 1e-12))
@@ -223,7 +226,9 @@ def judged(system: System, method: OneStepMethod, pacing: Pacing, pace: Pace, h,
         longer = after_good(optimal, pace.optimal, h, proposed, power, pacing.largest, method.explicit)
         optimal = jnp.where(h < CUT * proposed, pace.optimal, optimal)
         proposed = jnp.where(good, longer, after_bad(error, h, power))
-        code = jnp.where(good | (proposed >= pacing.shortest), Code.COMPLETED, Code.STEP_UNDERFLOW)
+        seen = reached > pace.t  # or else the step is less than the last place of the time
+        good = good & seen
+        code = jnp.where(good | (seen & (proposed >= pacing.shortest)), Code.COMPLETED, Code.STEP_UNDERFLOW)
     sight = Sight(
         good=good,
         ends=jnp.zeros((), dtype=bool),

@@ -13,7 +13,7 @@ from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import converted
-from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
+from .energy import Energy, Function, Negative, Pullback, Sum, WithinSpan, WithTime
 
 
 def recognised(energy: Energy, dim: int) -> Energy:
@@ -24,6 +24,9 @@ def recognised(energy: Energy, dim: int) -> Energy:
         return Negative(recognised(energy.term, dim))
     if isinstance(energy, WithTime):
         return WithTime(recognised(energy.energy, dim))
+    if isinstance(energy, WithinSpan):
+        inner = recognised(energy.energy, dim)
+        return inner if inner.is_quadratic else WithinSpan(inner, energy.span)  # a polynomial is known at every time
     if isinstance(energy, Pullback):
         (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, recognised(energy.term, inner))

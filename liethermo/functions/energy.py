@@ -30,6 +30,7 @@ from .coordinates import Choice, Components, check_coordinates
 from .indices import cliques, pattern, union
 from .path import Path, Scheme
 from .rounding import with_rounding
+from .time_span import TimeSpan
 
 
 @part
@@ -317,13 +318,35 @@ class TimeDependent(Energy):
         return Function(AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
 
     def with_time(self) -> Energy:
-        return WithTime(Function(Joined(self.function)))
+        return WithTime(WithinSpan(Function(Joined(self.function)), TimeSpan()))
 
     def value(self, x) -> jax.Array:
         raise InputError("this energy depends on time, so its value is known at a time only: energy(x, t)")
 
     def __neg__(self) -> Energy:
         return TimeDependent(Minus(self.function))
+
+
+class WithinSpan(Energy):
+    """A function of a state and the time behind it, shape (n + 1,), evaluated at times within a span only."""
+
+    energy: Energy
+    span: TimeSpan
+
+    def _clip(self, z) -> jax.Array:
+        return jnp.append(z[:-1], self.span.clip(z[-1]))
+
+    def value(self, z) -> jax.Array:
+        return self.energy.value(self._clip(z))
+
+    def gradient(self, z) -> jax.Array:
+        return self.energy.gradient(self._clip(z))
+
+    def sensitivity(self, z) -> jax.Array:
+        return self.energy.sensitivity(self._clip(z))
+
+    def rounded(self, z) -> jax.Array:
+        return self.energy.rounded(self._clip(z))
 
 
 class WithTime(Energy):

@@ -309,6 +309,8 @@ class Change(NamedTuple):
         # one map for all points, as one is what a compiler has to work on
         found = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
         gradients, ends = found[:-2], found[-2:]
+        # which count for rounding alone: at an end where one is infinite, as of a root that ends there, for none
+        ends = jnp.where(jnp.isfinite(ends), ends, 0.0)
         before, after = _values(term, jnp.stack([x, new]))
         # of the compensated states: else a step takes back what rounding, or a steering of the energy, has put there
         difference = (after - before) + (jnp.dot(ends[1], new_compensation) - jnp.dot(ends[0], compensation))

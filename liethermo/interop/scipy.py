@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from manifolds._names import listing
+from manifolds.errors import warn
 
 from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
-from ..runs.integrate import integrate
+from ..runs.integrate import integrate, solution_without_steps
 from ..runs.watch import Watch
 from ..systems import System
 
@@ -79,8 +80,8 @@ def solve_ivp(
     vectorized: bool = False,
     args: tuple | None = None,
     *,
-    rtol: float = 1e-3,
-    atol: float = 1e-6,
+    rtol=1e-3,
+    atol=1e-6,
     first_step: float | None = None,
     max_step: float | None = None,
     **options,
@@ -91,7 +92,8 @@ def solve_ivp(
     ----------
     fun : System
     t_span : (float, float)
-        Time runs forwards.
+        Time runs forwards. The end may be infinite if an event is terminal. The result over a span of length zero is
+        the initial state, at the start and at the end.
     y0 : array, shape (n,)
     method : OneStepMethod, optional
         ``MetriplecticRungeKutta(order=8)`` by default; take ``MetriplecticGauss(3)`` for stiff systems.
@@ -102,15 +104,17 @@ def solve_ivp(
     events : function of t, y and the ``args``, or several, optional
         Their zeros are located, all of them, by steps that end there. The attributes ``terminal`` (True, or the number
         of zeros after which to stop) and ``direction`` mean what they mean in SciPy. A change of sign counts, as in
-        SciPy, even where the function jumps; one across states where it is not a number does not.
+        SciPy, even where the function jumps; one across states where it is NaN does not, and ``message`` says where.
+        If a state that is needed cannot be found, the run ends there with status -1 and the reason.
     vectorized : bool
         Without effect: a system takes states of any shape.
     args : tuple, optional
         Passed to the events. The system has its parameters in itself.
-    rtol, atol : float
-        SciPy's defaults. What they mean: :class:`.Adaptive`.
+    rtol, atol : float or array, shape (n,)
+        SciPy's defaults. What they mean: :class:`.Adaptive`. One error is estimated for all components, so the smallest
+        entry of an array holds for all of them.
     first_step, max_step : float, optional
-        ``max_step`` may be infinite.
+        ``first_step`` is no longer than the span; ``max_step`` may be infinite.
 
     Returns
     -------
@@ -134,35 +138,52 @@ def solve_ivp(
         raise InputError("args are passed to the events, and there are none: the system has its parameters in itself")
     start, end = _span(t_span)
     wanted = None if t_eval is None else _times(t_eval, start, end)
+    _check_first_step(first_step, end - start)
     watch = Watch(functions, _tuple(args)) if functions else None
+    if math.isinf(end) and not (watch and watch.can_end):
+        raise InputError("an infinite end needs an event that ends the run: set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
+    step = Adaptive(
+        _tolerance("rtol", rtol, y0),
+        _tolerance("atol", atol, y0),
+        first_step,
+        None if max_step == math.inf else max_step,
+    )
+    if end == start:
+        return _result_without_steps(fun, y0, start, method, wanted, dense_output, watch)
     solution = integrate(
         fun,
         y0,
         (start, end),
-        Adaptive(rtol, atol, first_step, None if max_step == math.inf else max_step),
+        step,
         method,
-        save_at=None if wanted is None else [*wanted, end],
+        save_at=None if wanted is None else [start, *wanted, *([end] if math.isfinite(end) else [])],
         until=watch,
         dense=dense_output,
         on_failure="return",
         progress=False,
     )
     keep = np.ones(len(solution.t), bool) if wanted is None else np.isin(solution.t, wanted)
-    stats, sol = solution.stats, None
-    if dense_output:
+    return _result(solution, solution.t[keep], solution.x[keep], method, watch, dense_output)
 
-        def sol(t):
-            return np.moveaxis(solution(t), -1, 0)
 
-    status = STATUSES.get(str(solution.status.code), -1)
+def _result(
+    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, watch: Watch | None, dense: bool
+) -> OdeResult:
+    """Return what SciPy would of a solution, with the states x, shape (times, n), that are asked for."""
+    stats, status = solution.stats, STATUSES.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
+    shape = solution.x.shape[1:]
+
+    def sol(t):
+        return np.moveaxis(solution(t), -1, 0)
+
     return OdeResult(
-        t=solution.t[keep],
-        y=solution.x[keep].T,
-        sol=sol,
+        t=t,
+        y=x.T,
+        sol=sol if dense else None,
         t_events=None if watch is None else [np.array(times) for times in watch.times],
-        y_events=None if watch is None else [np.array(y).reshape(len(y), *solution.x.shape[1:]) for y in watch.states],
+        y_events=None if watch is None else [np.array(y).reshape(len(y), *shape) for y in watch.states],
         nfev=iterations * method.evaluations,
         njev=stats.newton_iterations,
         nlu=stats.newton_iterations,
@@ -173,11 +194,55 @@ def solve_ivp(
     )
 
 
+def _result_without_steps(
+    fun: System,
+    y0,
+    t: float,
+    method: OneStepMethod,
+    wanted: np.ndarray | None,
+    dense: bool,
+    watch: Watch | None,
+) -> OdeResult:
+    """Return the result over a span of length zero: as in SciPy, the initial state at its start and at its end."""
+    solution = solution_without_steps(fun, y0, t, method)
+    ended = watch is not None and watch.of_state(t, solution.x[0])
+    times = np.array([t, t]) if wanted is None else wanted
+    result = _result(solution, times, np.repeat(solution.x, len(times), axis=0), method, watch, dense)
+    return replace(result, status=1, message="A termination event occurred.") if ended else result
+
+
+def _check_first_step(first_step: float | None, length: float) -> None:
+    if first_step is not None and not 0.0 < first_step <= length:
+        raise InputError(
+            f"first_step must be positive and at most the length of t_span, {length:g}, got {first_step:g}. Leave it "
+            "out, and it is chosen"
+        )
+
+
+SMALLEST_RTOL = 100.0 * float(np.finfo(np.float64).eps)
+"""The least relative tolerance that an array may have, as in SciPy; smaller ones are raised to it."""
+
+
+def _tolerance(name: str, given, y0) -> float:
+    """Return the tolerance of all components: the smallest, where there is one for each."""
+    if np.ndim(given) == 0:
+        return given.item() if isinstance(given, np.ndarray) else given
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape != np.shape(y0):
+        raise InputError(f"{name} must be a number or an array of shape {np.shape(y0)}, as y0, got {values.shape}")
+    if name == "rtol" and (values < SMALLEST_RTOL).any():
+        warn(f"At least one element of rtol is too small. Setting rtol = np.maximum(rtol, {SMALLEST_RTOL:.3g})")
+        values = np.maximum(values, SMALLEST_RTOL)
+    return float(values.min())
+
+
 def _span(t_span) -> tuple[float, float]:
     try:
         start, end = map(float, t_span)
     except (TypeError, ValueError):
         raise InputError(f"t_span is two numbers (start, end), not {t_span!r}") from None
+    if math.isnan(start) or math.isnan(end) or math.isinf(start):
+        raise InputError(f"t_span must start at a finite time, got ({start:g}, {end:g})")
     if end < start:
         raise InputError(
             f"t_span = ({start:g}, {end:g}) runs backwards, and time runs forwards here, since entropy grows: "

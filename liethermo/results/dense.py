@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import ConvergenceError, InputError
 
 
 def _as_it_is(x: np.ndarray) -> np.ndarray:
@@ -50,8 +50,19 @@ class Dense:
         between = np.flatnonzero(h > 0.0)
         if between.size:
             found[between] = self.ends(found[between], h[between])
+            self._check(times[between], found[between])
         found = self.seen(found)
         return found.reshape(*t.shape, found.shape[-1])
+
+    def _check(self, t: np.ndarray, x: np.ndarray) -> None:
+        """Raise where a part of a step cannot be taken, although the run has taken the whole."""
+        unknown = np.isnan(x).any(axis=1)
+        if unknown.any():
+            raise ConvergenceError(
+                f"the state at t = {t[unknown][0]:g}, between two steps, cannot be found: a part of the step is not "
+                "solved. Ask for the states at the ends of the steps, or run with smaller steps",
+                None,
+            )
 
     def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Dense:
         """The same, of which a user sees what a function makes of it."""

@@ -84,13 +84,14 @@ def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, even
         If steps of this method cannot be adaptive.
     """
     adaptive = isinstance(step, Adaptive)
+    min_step = UNDERFLOW * length if math.isfinite(length) else 0.0
     if isinstance(step, Adaptive):
         if not estimates_error(method):
             raise InputError(f"the steps of {method} cannot be adaptive: {method.fixed}")
         numbers = [step.rtol, step.atol, step.first or 0.0, step.largest or math.inf]
-        numbers += [UNDERFLOW * length, step.most_steps]
+        numbers += [min_step, step.most_steps]
     else:
-        numbers = [0.0, 0.0, step, math.inf, UNDERFLOW * length, math.inf]
+        numbers = [0.0, 0.0, step, math.inf, min_step, math.inf]
     watched, falling = (None, False) if event is None else (event.function, event.falling)
     rtol, atol, first, largest, shortest, most = (np.asarray(float(number)) for number in numbers)
     return Pacing(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)

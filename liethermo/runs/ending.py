@@ -80,7 +80,9 @@ def given_up(
         text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "
         return Status(Code.STEP_LIMIT, text + "save_every or save_at keeps fewer states", steps, now, residual)
     text = f"the step fell to {outcome.underflow:.2g} after step {steps}, t = {now:g}, and "
-    if int(outcome.state.status) == Code.COMPLETED:
+    if now + outcome.underflow == now:
+        text += "double precision does not tell t + h from t. Measure the time from a start nearer to zero"
+    elif int(outcome.state.status) == Code.COMPLETED:
         text += "the error is still too large: the tolerance may be below what rounding allows, or the functions not "
         text += f"smooth there. Try a larger tolerance than {step}"
     else:

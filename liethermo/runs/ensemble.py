@@ -26,7 +26,18 @@ from .family import Family, common_size, why_not
 from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
 from .member_groups import common_inertia, groups_of, outside_own_domain
 from .paced import Many
-from .preparation import as_family, as_run, begun, check_choice, decided, laws_of, no_start, refuse_tracers
+from .preparation import (
+    as_family,
+    as_run,
+    begun,
+    check_choice,
+    decided,
+    family_within_span,
+    laws_of,
+    no_start,
+    refuse_tracers,
+    within_span,
+)
 from .presented import provenance_of
 from .progress import Progress
 from .record import Alone, Followed, Record
@@ -217,6 +228,8 @@ class _Plan(NamedTuple):
         family = as_family(family, member)
         states = np.asarray(begun(member, states, course.start, attitude, batch=True))
         method.check(member)
+        span = course.start, course.end
+        family, member = family_within_span(family, member, *span), within_span(member, *span)
         reasons = {int(run[i]): text for i, text in _off(family, member, method, states).items()}
         if reasons:
             left = np.flatnonzero(~np.isin(run, list(reasons)))

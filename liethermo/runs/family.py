@@ -167,6 +167,19 @@ class Family:
             return Family.of(tell(self.alike, *fixed), None)
         return self.through(tell, *fixed)
 
+    def with_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
+        """The family of what a function, one that has an identity, makes of the members with some numbers.
+
+        Families with other numbers have the same form.
+        """
+        form, count = self.form, len(numbers)
+
+        def rebuild(arrays):
+            return change(form.rebuild(arrays[:-count]), *arrays[-count:])
+
+        values = [*self.values, *(np.array([number]) for number in numbers)]
+        return Family(Form((form.key, change, count), (*form.shapes, *[()] * count), rebuild), values)
+
     # -- members --------------------------------------------------------------------------------------------------
 
     @property
@@ -240,7 +253,8 @@ class Family:
     def _not_numbers(self) -> dict[int, str]:
         """Members that have parameters that are NaN."""
         bad = np.zeros(self.size, dtype=bool)
-        for value in self.values:
+        # what all share may be the NaN that a function is written with, such as a table beyond its ends
+        for value in self.values[: self.given] or [value for value in self.values if len(value) > 1]:
             bad |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
         return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(bad)}
 

@@ -23,7 +23,7 @@ from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import hasty_program, program
 from .adaptive import Adaptive
-from .preparation import begun, of_steps, started
+from .preparation import begun, of_steps, started, within_span
 from .sensitivities import derivatives
 from .timetable import Course
 
@@ -91,6 +91,7 @@ def flow(
     x, table = system.state(x0), Course(t_span, step, save_every)
     n, shown = system.dim, system
     system, method = of_steps(system, method, None, attitude is not None)
+    system = within_span(system, table.start, table.end)
     begin = x, table.start, attitude
     # of what is traced nothing is known that a start could be refused for
     x = jnp.asarray(begun(system, *begin) if is_traced(system, x) else started(system, method, *begin))

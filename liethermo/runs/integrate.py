@@ -19,7 +19,7 @@ from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
 from .preparation import as_run, check_choice, decided, prepared, refuse_tracers, started
 from .progress import Progress
 from .run import Run
-from .timetable import course_of
+from .timetable import Course, course_of
 from .watch import Watch
 
 UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
@@ -57,7 +57,8 @@ def integrate(
         other arrays, such as density matrices and spins. If entropies of baths are left out, they are zero.
     t_span : (float, float)
         Start and end (in the unit of time of the system; s in SI), the end later. The last step is shortened to end
-        there. Energies and torques that depend on time use these times.
+        there. Energies and torques that depend on time use these times. The end may be infinite with adaptive steps and
+        ``until``: the run then ends at the event.
     step : float or Adaptive
         Step size (time), > 0, or ``lt.Adaptive(rtol, atol)``. For ``Reference`` it is the spacing of the output.
     method : OneStepMethod or Reference
@@ -148,7 +149,7 @@ def integrate(
             "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
             "are for runs without"
         )
-    course = course_of(t_span, step, save_every, save_at)
+    course = course_of(t_span, step, save_every, save_at, endless=adaptive and until is not None)
     x = started(system, method, x0, course.start, attitude)
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:
@@ -169,3 +170,19 @@ def integrate(
     if on_failure == "raise" and not solution.status.ok and solution.status.code != Code.INTERRUPTED.text:
         raise NonFiniteError(solution.status.message, solution)
     return solution
+
+
+@by_own_settings
+def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) -> Solution:
+    """Return the solution over a span of length zero: the initial state at a time.
+
+    Raises
+    ------
+    InputError
+        If no run of the method can start there.
+    """
+    system, method = as_run(decided(system, x0), method)
+    prepared(system, method)
+    run = Run(system, method, started(system, method, x0, t), Course.at(t), None, "auto", dense=True)
+    run.take_no_step()
+    return run.solution()

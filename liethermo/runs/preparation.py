@@ -13,12 +13,13 @@ from manifolds._arrays import is_traced
 
 from ..errors import InputError
 from ..functions.checks import traced_energies
+from ..functions.time_span import limit_times
 from ..integrators import OneStepMethod, WithAttitude
 from ..integrators.base import pulled
 from ..integrators.fluctuating import noise_dimension
 from ..results.status import Laws
 from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, LiePoissonSystem, System, driven, embedded
-from ..tracing.remembered import remembered
+from ..tracing.remembered import Latest, remembered
 from .family import Family
 from .fluctuations import Fluctuations
 
@@ -138,6 +139,35 @@ def as_family(family: Family, system: System) -> Family:
     if isinstance(system, EmbeddedSystem):
         return family.through(EmbeddedSystem, *system.known)
     return as_family(family, system.body).through(DrivenSystem) if isinstance(system, DrivenSystem) else family
+
+
+MAX_LIMITED_SYSTEMS = 64
+"""Systems with the spans of their runs that are held in memory, those last used."""
+
+_limited: Latest[tuple[System, System]] = Latest(MAX_LIMITED_SYSTEMS)
+
+
+def within_span(system: System, start: float, end: float) -> System:
+    """Return a system as it is run, its functions of time evaluated at times from ``start`` to ``end`` only.
+
+    One object for equal arguments, so that what is found for it is found once.
+    """
+    if not is_driven_run(system):
+        return system
+    if is_traced(system):
+        return limit_times(system, start, end)
+    # held with what it is made of, whose identity no other object takes meanwhile
+    return _limited.find((id(system), start, end), lambda: (system, limit_times(system, start, end)))[1]
+
+
+def family_within_span(family: Family, system: System, start: float, end: float) -> Family:
+    """Return the family of what :func:`within_span` makes of the members, where the system is one of them."""
+    return family.with_numbers(limit_times, start, end) if is_driven_run(system) else family
+
+
+def is_driven_run(system: System) -> bool:
+    """Whether a system as it is run has a clock, since its functions depend on time."""
+    return isinstance(system.body if isinstance(system, AttitudeSystem) else system, DrivenSystem)
 
 
 @remembered

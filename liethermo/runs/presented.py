@@ -23,7 +23,14 @@ from .preparation import prepared
 
 
 def presented(
-    system: System, method, x: np.ndarray, entropy: np.ndarray | None, steps: np.ndarray, again: Replay, **fields
+    system: System,
+    method,
+    x: np.ndarray,
+    entropy: np.ndarray | None,
+    steps: np.ndarray,
+    again: Replay,
+    prepared_as: System | None = None,
+    **fields,
 ) -> Solution:
     """The solution that a user sees of the states x, shape (times, n), of a run.
 
@@ -32,10 +39,12 @@ def presented(
     steps : array, shape (times - 1,)
         Sizes of steps that the run took from the states.
     again : Replay
+    prepared_as : System, optional
+        The system without the span of the run, for which the laws are known already; by default ``system``.
     **fields
         The others of :class:`Solution`.
     """
-    invariants, laws = prepared(system, method)
+    invariants, laws = prepared(system if prepared_as is None else prepared_as, method)
     functions = {name: f for name, (f, _) in invariants.items()}
     found = Solution(
         x=x,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import TYPE_CHECKING
 
@@ -36,7 +37,9 @@ class Progress:
             columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
             self.bar = bar = Bar(*columns, console=Console(stderr=True, force_terminal=True), transient=True)
             bar.start()
-            self.task = bar.add_task(self.text.format(self.span[0]), total=self.span[1] - self.span[0])
+            length = self.span[1] - self.span[0]
+            total = length if math.isfinite(length) else None
+            self.task = bar.add_task(self.text.format(self.span[0]), total=total)
         return self
 
     def update(self, t: float) -> None:

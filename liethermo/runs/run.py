@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +26,7 @@ from .adaptive import Adaptive, pacing_of
 from .ending import STOPPED, given_up, stats_of, status_of, stopped_by
 from .events import Event
 from .fluctuations import Fluctuations, Paths
+from .preparation import within_span
 from .presented import Again, presented, provenance_of
 from .stepwise import MOST_KEPT, Steps, follow
 from .timetable import Course
@@ -35,6 +37,10 @@ MOST_LISTED = 1_000
 
 CHECKPOINT_SECONDS = 60.0
 """A run with ``save_to`` rewrites its file at most this often before the end."""
+
+
+UNIT_LENGTH = 1.0
+"""The length that an endless span counts for where the first step is a share of it, from a state at rest."""
 
 
 class Run:
@@ -51,7 +57,8 @@ class Run:
         noise: Fluctuations | None = None,
         dense: bool = False,
     ):
-        self.system, self.method, self.course = system, method, course
+        self.prepared, self.system = system, within_span(system, course.start, course.end)
+        self.method, self.course = method, course
         self.save_to, self.started = save_to, time.perf_counter()
         self.written = self.started
         self.times = [np.array([course.start])]
@@ -68,7 +75,7 @@ class Run:
         if noise is not None and (increments := noise_dimension(method)):
             only = Paths(noise, increments, np.zeros(1, dtype=int), course)
             path = lambda first, steps, h: only.rows(slice(None), first, steps, h)[0]  # noqa: E731
-        self.engine = Chosen(system, method, engine, course.steps, path)
+        self.engine = Chosen(self.system, method, engine, course.steps, path)
 
     @property
     def now(self) -> float:
@@ -106,6 +113,11 @@ class Run:
         self.values = [self._energies(self.states[0])]
         self.status = Status(Code.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.course.start)
 
+    def take_no_step(self) -> None:
+        """Complete a run over a span of length zero."""
+        self.values = [self._energies(self.states[0])]
+        self.status = Status(Code.COMPLETED, f"reached t = {self.course.end:g} in 0 steps", 0, self.course.end)
+
     def by_paces(self, bar, step: float | Adaptive, until) -> None:
         """Look at every step: adaptive ones, and those with events."""
         start, end, every = self.course.start, self.course.end, self.course.every or 1
@@ -126,9 +138,10 @@ class Run:
             bar.update(ends[-1])
             self._checkpoint(steps.after)
 
+        length = end - start if math.isfinite(end) else UNIT_LENGTH
         pacing = pacing_of(step, self.method, end - start, event)
         try:
-            paces = self.engine.paces(pacing, self.states[0][0], start, float(stops[0]), end - start)
+            paces = self.engine.paces(pacing, self.states[0][0], start, float(stops[0]), length)
         except STOPPED as error:
             self._not_begun(stopped_by(error))
             return
@@ -147,6 +160,8 @@ class Run:
             self.status = given_up(
                 self.system, self.method, np.asarray(self.states[0][0]), outcome, step, (start, end), now
             )
+        elif outcome.unknown is not None:
+            self.status = Status(outcome.unknown.code, str(outcome.unknown), steps, now, float(state.residual))
         elif event is not None and outcome.limit:
             text = f"{event.name} is not a number at some states near t = {now:g}, and has other signs before and "
             text += "after: whether it is zero there is not known, so extend the function"
@@ -157,11 +172,16 @@ class Run:
         else:
             h = step if isinstance(step, float) else float("nan")
             self.status = status_of(self.engine, state, now, h, outcome.stopped)
+            if watch and watch.remark and self.status.ok:
+                self.status = dataclasses.replace(self.status, message=f"{self.status.message}; {watch.remark}")
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 if outcome.jumps:
                     text += f": it changed its sign {len(outcome.jumps)} times without being zero, first at t = "
                     text += f"{outcome.jumps[0]:g}"
+                if outcome.undefined:
+                    text = f"{self.status.message}; whether the event ({event.name}) happened is not known, since the "
+                    text += "function is NaN at the end. Define it for all states of the run"
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _append(self, steps: Steps, kept: np.ndarray | slice) -> None:
@@ -225,6 +245,7 @@ class Run:
             entropy=entropy,
             steps=self._longest(len(x) - 1),
             again=Again(self.engine),
+            prepared_as=self.prepared,
             status=self.status or Status(Code.INTERRUPTED, "still running", len(x) - 1, self.now),
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.started),
             provenance=self._provenance(),

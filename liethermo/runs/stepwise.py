@@ -6,6 +6,7 @@ they hold in every step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from ..engines.pacing import FINISHED, TOLD, Pacing
 from ..engines.stepping import State
 from ..tracing.scalarize import UnsupportedPrimitive
 from .ending import STOPPED, stopped_by
-from .watch import Watch
+from .watch import UnknownStateError, Watch
 
 TOGETHER = 64
 """Attempts between looks at an adaptive run."""
@@ -38,6 +39,8 @@ class Outcome:
     underflow: float | None = None
     stopped: str = ""
     jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
+    undefined: bool = False  # whether the event function is not a number at the end
+    unknown: UnknownStateError | None = None  # what is not known of an event
     limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
 
 
@@ -95,7 +98,7 @@ def follow(
     together : int
         Attempts between looks, at most.
     """
-    outcome = Outcome(paces.state())
+    outcome = Outcome(_running(paces.state()))
     try:
         _follow(engine, paces, pacing, outcome, stops, keep, most_kept, watch, 1 if watch else together)
     except STOPPED as error:
@@ -116,6 +119,7 @@ def _follow(
         guide.verify()
         guide.resume()
         code, t = int(scalar("status")), scalar("t")
+        outcome.undefined = not math.isfinite(scalar("value"))
         if code == Code.EVENT:
             outcome.event_time = t
         if code != Code.COMPLETED:
@@ -130,11 +134,15 @@ def _follow(
             guide.paces = paces = engine.instead(error, pacing, paces)
             continue
         outcome.rejected = int(scalar("rejected"))
-        after: Any = paces.state()
-        outcome.state = after._replace(status=np.int64(0))
+        outcome.state = _running(paces.state())
         if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
             x, energy, entropy, number, ends, h = (rows[name][taken] for name in TOLD)
-            if watch and (caught := watch.of_step(engine, t, h[0], ends[0], before, outcome.state)):
+            try:
+                caught = watch.of_step(engine, t, h[0], ends[0], before, outcome.state) if watch else None
+            except UnknownStateError as error:
+                outcome.state, outcome.unknown = before, error
+                return
+            if caught:
                 outcome.event_time, part, at = caught
                 outcome.state = before if at is None else at
                 if at is not None:
@@ -149,6 +157,11 @@ def _follow(
     elif code not in (Code.EVENT, FINISHED):
         outcome.state = outcome.state._replace(status=np.int64(code), residual=scalar("residual"))
         outcome.limit = "sight" if scalar("cause") == Code.COMPLETED else ""
+
+
+def _running(state: State) -> State:
+    """Return a state of a run that goes on, in place of one with the reason of a pause."""
+    return state._replace(status=np.int64(0))  # type: ignore[arg-type]
 
 
 def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:

@@ -33,6 +33,8 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, start: float, end: float, h: float) -> Part:
+        if math.isinf(h):
+            return cls(start, end, 0, end - start)
         # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14, and 1024.9 - 1024.8 from
         # asking for a second one: the times themselves are rounded.
         rounding = min(ROUNDINGS_OF_TIME * EPS * max(abs(start), abs(end)), 0.01 * h)
@@ -57,6 +59,8 @@ class Course:
         Keep the states of every ``save_every``-th step, and the last; None keeps those at the stops alone.
     stops : array, optional
         Times at which steps end, the end of the span the last, which is the only one otherwise.
+    endless : bool
+        Whether the end may be infinite, for steps that are not of one size.
 
     Attributes
     ----------
@@ -71,14 +75,22 @@ class Course:
         If the span or the step cannot be used.
     """
 
-    def __init__(self, span, step, every: int | None, stops: np.ndarray | None = None):
-        self.start, self.end = _checked_span(span)
-        self.h = _checked_step(step, self.start, self.end)
+    def __init__(self, span, step, every: int | None, stops: np.ndarray | None = None, endless: bool = False):
+        self.start, self.end = _checked_span(span, endless)
+        self.h = math.inf if math.isinf(self.end) else _checked_step(step, self.start, self.end)
         if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
             raise InputError(f"save_every must be a positive integer, not {every!r}")
         ends = [self.end] if stops is None else [float(t) for t in stops if t > self.start]
         self.every, self.parts = every, [Part.of(*ends, self.h) for ends in itertools.pairwise([self.start, *ends])]
         self.steps = sum(part.steps for part in self.parts)
+
+    @classmethod
+    def at(cls, t: float) -> Course:
+        """Return the course over a span of length zero, without a step."""
+        course = cls.__new__(cls)
+        course.start = course.end = t
+        course.h, course.every, course.parts, course.steps = 0.0, None, [], 0
+        return course
 
     def calls(
         self, limit: int = CHUNK_STEPS, saves: int = KEPT_STATES, each: bool = False
@@ -140,19 +152,20 @@ class Course:
     def reached(self, steps: np.ndarray) -> np.ndarray:
         """The times after so many steps."""
         if len(self.parts) == 1:
-            return np.where(steps >= self.steps, self.end, self.start + steps * self.h)
+            return np.where(steps >= self.steps, self.end, np.minimum(_time_after(self.start, steps, self.h), self.end))
         place = np.clip(np.searchsorted(self._before, steps, side="right") - 1, 0, len(self.parts) - 1)
         starts, ends = (np.array([getattr(part, name) for part in self.parts])[place] for name in ("start", "end"))
         last = steps >= self._before[place + 1]
-        return np.where(last, ends, np.minimum(starts + (steps - self._before[place]) * self.h, ends))
+        return np.where(last, ends, np.minimum(_time_after(starts, steps - self._before[place], self.h), ends))
 
 
-def course_of(span, step: float | Adaptive, every: int | None, save_at=None) -> Course:
+def course_of(span, step: float | Adaptive, every: int | None, save_at=None, endless: bool = False) -> Course:
     """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
-    course = Course(span, span[1] - span[0] if isinstance(step, Adaptive) and len(span) == 2 else step, every)
+    size = span[1] - span[0] if isinstance(step, Adaptive) and len(span) == 2 else step
+    course = Course(span, size, every, endless=endless)
     if save_at is None:
         return course
-    return Course(span, course.h, None, _stops(save_at, course.start, course.end))
+    return Course(span, size, None, _stops(save_at, course.start, course.end), endless)
 
 
 def _stops(save_at, start: float, end: float) -> np.ndarray:
@@ -165,13 +178,37 @@ def _stops(save_at, start: float, end: float) -> np.ndarray:
     return np.unique([*times, end])
 
 
-def _checked_span(span) -> tuple[float, float]:
+def _time_after(start, steps, h: float) -> np.ndarray:
+    """Return ``start + steps * h``, rounded once (Dekker's product and Knuth's sum)."""
+    steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _halves(np.float64(h))
+    high, low = _halves(steps)
+    product = steps * h
+    lost = ((high * h_high - product) + high * h_low + low * h_high) + low * h_low
+    found = start + product
+    other = found - start
+    lost = lost + (start - (found - other)) + (product - other)
+    return np.where(np.isfinite(lost), found + lost, found)
+
+
+def _halves(a) -> tuple[np.ndarray, np.ndarray]:
+    """Two numbers of 26 bits whose sum is a."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        shifted = a * (2.0**27 + 1.0)
+        high = shifted - (shifted - a)
+        return high, a - high
+
+
+def _checked_span(span, endless: bool) -> tuple[float, float]:
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), not {span!r}") from None
-    if not (math.isfinite(start) and math.isfinite(end) and end > start):
-        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g})")
+    if not (math.isfinite(start) and end > start and (endless or math.isfinite(end))):
+        cure = "" if end != math.inf else (
+            ". An infinite end needs lt.integrate with adaptive steps and an event to stop at: step=lt.Adaptive(rtol), "
+            "until=event"
+        )  # fmt: skip
+        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g}){cure}")
     return start, end
 
 

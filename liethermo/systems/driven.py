@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..functions.checks import recognised
 from ..functions.coordinates import Choice
 from ..functions.energy import Energy, InChart, Linear, Pullback, Quadratic, Sum, WithTime
+from ..functions.time_span import TimeSpan
 from .base import System
 
 UNIT = 2.0**-100
@@ -50,14 +51,18 @@ class DrivenSystem(System):
         That at which a torque is taken that needs one: see :meth:`turned`.
     torque : array, shape (n,), or None
         The torque itself, where it is known: see :meth:`with_torque`.
+    span : TimeSpan
+        The functions of time are evaluated at times in it only; a run sets it.
     """
 
     body: System
     unit: float = eqx.field(static=True)
     attitude: jax.Array | None
     torque: jax.Array | None
+    span: TimeSpan
 
     def __init__(self, body: System, unit: float = UNIT):
+        self.span = TimeSpan()
         self.body, self.unit, self.dim, self.attitude, self.torque = body, unit, body.dim + 2, None, None
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
@@ -92,8 +97,8 @@ class DrivenSystem(System):
         return self.body.points(x[..., :-2])
 
     def time(self, x) -> jax.Array:
-        """t, shape (...)."""
-        return x[..., -2] / self.unit
+        """t, shape (...), within the span."""
+        return self.span.clip(x[..., -2] / self.unit)
 
     def work(self, x) -> jax.Array:
         """W, shape (...)."""
@@ -113,7 +118,9 @@ class DrivenSystem(System):
         return self._now_of_all(x).singular(x[..., :-2])
 
     def _now_of_all(self, x) -> System:
-        return self._now(np.reshape(x, (-1, self.dim))[0])
+        """The body at the time of the first of several states, which are numbers."""
+        t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
+        return self._at(min(max(t, float(self.span.start)), float(self.span.end)))
 
     def sizes(self, k):
         clock = jnp.full((*k.shape[:-1], 2), self.unit)
@@ -171,8 +178,11 @@ class DrivenSystem(System):
         return jnp.concatenate([self.body.lowered(x[:-2], v[:-2]), v[-2:]])
 
     def _now(self, x) -> System:
+        return self._at(self.time(x))
+
+    def _at(self, t) -> System:
         where = () if self.attitude is None else (self.attitude,)
-        return self.body.at_time(self.time(x), *where)
+        return self.body.at_time(t, *where)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 

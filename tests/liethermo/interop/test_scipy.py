@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
+import manifolds as mf
+from liethermo.engines.choice import Chosen
 
 BODY = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
 X0, SPAN = [0.1, 0.2, 1.0], (0.0, 8.0)
@@ -133,6 +138,96 @@ def test_a_function_that_is_not_a_number_has_no_zero_there(width):
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t - 3.0)
     assert ours.success
     assert ours.t_events[0].size == 0
+
+
+def forced(t, y):
+    return [y[1], -y[0] + 0.1 * np.sin(2.0 * t)]
+
+
+OSCILLATOR = lt.MetriplecticSystem(
+    poisson=mf.Canonical(1), energy=lambda x, t: 0.5 * (x @ x) - 0.1 * jnp.sin(2.0 * t) * x[0], dim=2
+)
+
+
+@pytest.mark.parametrize("direction", [-1, 0, 1])
+def test_events_in_the_first_step_of_a_driven_system(direction):
+    """Whatever the run looks at before its first step: an event in it, and zeros at the start."""
+    functions = (lambda t, y: y[0] - 0.9995, lambda t, y: y[1], lambda t, y: y[0] - 1.0, lambda t, y: t)
+    events = [_event(f, direction=direction) for f in functions]
+    settings = {"events": events, "rtol": 1e-9, "atol": 1e-9}
+    # in longer steps SciPy sees no event that is undone within a step
+    theirs = solve_ivp(forced, (0.0, 10.0), [1.0, 0.0], "DOP853", max_step=0.05, **settings)
+    ours = lt.scipy.solve_ivp(OSCILLATOR, (0.0, 10.0), [1.0, 0.0], **settings)
+    if direction <= 0:
+        assert ours.t_events[0][0] < ours.t[1]
+        assert ours.t_events[1][0] == ours.t_events[2][0] == 0.0
+    same_events(theirs, ours, 1e-6)
+
+
+@pytest.mark.parametrize(
+    "events", [lambda t, y: y[1] * 0.0, lambda t, y: min(t - 1.0, 0.0) if t else 0.0], ids=["zero", "nearly"]
+)
+def test_a_zero_at_the_start_is_a_zero_whatever_comes_next(events):
+    """As in SciPy, where it ends the run if it is terminal."""
+    settings = {"events": _event(events, terminal=True)}
+    theirs = solve_ivp(forced, (0.0, 10.0), [1.0, 0.0], **settings)
+    ours = lt.scipy.solve_ivp(OSCILLATOR, (0.0, 10.0), [1.0, 0.0], **settings)
+    assert ours.status == theirs.status == 1
+    assert ours.t_events[0].tolist() == theirs.t_events[0].tolist() == [0.0]
+
+
+def test_every_change_of_sign_between_states_is_an_event():
+    """Near the middle axis, at this tolerance, parts of steps have to be divided: the corrections do not converge."""
+    body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
+    ours = lt.scipy.solve_ivp(body, (0.0, 400.0), [1e-6, 1.0, 1e-6], events=lambda t, y: y[0], dense_output=True)
+    changes = np.flatnonzero(np.diff(np.sign(ours.y[0])) != 0.0)
+    assert len(changes) > 3
+    assert len(ours.t_events[0]) == len(changes)
+    assert ((ours.t[changes] <= ours.t_events[0]) & (ours.t_events[0] <= ours.t[changes + 1])).all()
+    assert np.isfinite(ours.sol(np.linspace(*ours.t[changes[0] :][:2], 9))).all()
+    assert np.ptp(np.linalg.norm(ours.y_events[0], axis=1)) < 1e-13  # roundings of 67 steps
+
+
+def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
+    """Where no part of a long step can be taken; the message's advice helps."""
+
+    def part_of_step(self, state, h, found=Chosen.part_of_step):
+        after = found(self, state, h)
+        return after if h < 0.05 else after._replace(status=np.int64(1))
+
+    monkeypatch.setattr(Chosen, "part_of_step", part_of_step)
+    settings = {"events": lambda t, y: t - 3.0, "rtol": 1e-6}
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, **settings)
+    assert (ours.success, ours.status, ours.t_events[0].size) == (False, -1, 0)
+    assert "whether an event happens in the step from t = " in ours.message
+    assert "not_converged" in ours.message
+    assert ours.t[-1] < 3.0
+    assert ours.solution.status.code == "not_converged"
+    advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
+    for _ in range(5):
+        ours = lt.scipy.solve_ivp(BODY, SPAN, X0, max_step=advised, **settings)
+        if ours.success:
+            break
+        advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
+    assert ours.success
+    assert ours.t_events[0] == pytest.approx([3.0])
+
+
+def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
+    monkeypatch.setattr(Chosen, "ends", lambda self, x, h: np.full_like(x, np.nan))
+    run = lt.integrate(BODY, X0, SPAN, 0.5, dense=True)
+    assert np.array_equal(run(SPAN[1]), run.x[-1])
+    with pytest.raises(lt.ConvergenceError, match=r"the state at t = 0\.75, between two steps, cannot be found"):
+        run([0.5, 0.75])
+
+
+@pytest.mark.parametrize("width", [1e-6, 0.5, 3.0])
+def test_the_message_says_where_a_function_is_not_a_number(width):
+    """A change of sign across it may be a zero, or none: what is not known is said."""
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t - 3.0)
+    assert "the event function is NaN between t = " in ours.message
+    kept = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t + 3.0)
+    assert "NaN" not in kept.message
 
 
 def test_arguments_of_scipy():

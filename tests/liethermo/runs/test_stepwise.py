@@ -373,6 +373,20 @@ def test_an_event_that_never_happens():
     assert solution.t[-1] == 10.0
 
 
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-3)], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize(
+    "until",
+    [lambda x: jnp.nan * x[0], lambda x: jnp.where(x[1] < 0.995, jnp.nan, 1.0)],
+    ids=["always", "from some time on"],
+)
+def test_of_a_function_that_is_not_a_number_at_the_end_nothing_is_known(until, step):
+    """It may have been zero: that the event has not happened would be a guess."""
+    solution = lt.integrate(BODY, X0, (0.0, 20.0), step, until=until)
+    assert solution.x[-1, 1] < 0.995
+    assert solution.event_time is None
+    assert "whether the event (the event function) happened is not known" in solution.status.message
+
+
 def test_a_file_keeps_the_event(tmp_path):
     solution = lt.integrate(BODY, X0, (0.0, 1e3), 0.1, until=lt.Relaxed(1e-6))
     assert lt.load(solution.save(tmp_path / "run.nc")).event_time == solution.event_time
