@@ -44,9 +44,9 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     Parameters
     ----------
     inertia : three positive numbers, or array of shape (3, 3)
-        Principal moments of inertia, or the tensor in body axes (mass * length**2). Those of a body obey ``I_i <= I_j + I_k``, since each is a sum
-        of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
-        so(3)* they are as good as any, but no rigid body has them.
+        Principal moments of inertia, or the tensor in body axes (mass * length**2). The moments of a body obey
+        ``I_i <= I_j + I_k``, since each is a sum of two of three moments of its masses. The default is the paper's
+        (Fig. 1), which does not: as equations on so(3)* they are as good as any, but no rigid body has them.
     rate : float, >= 0
         lambda in ``mu' = mu x Omega + lambda Omega x (mu x Omega)`` (time). 1 is the equation as printed in the paper,
         where 𝒦 is the dot product. It is ``KillingDissipation(rate / 2)``, since the Killing form of so(3) is -2 times
@@ -76,7 +76,8 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
     The default inertias are those of a published check, which no body has: see :func:`rigid_body`.
     """
-    return LiePoissonSystem(mf.so(3), energy=Quadratic(inverse_inertia(checked_inertia(inertia))), entropy=Quadratic(np.ones(3)))
+    energy = Quadratic(inverse_inertia(checked_inertia(inertia)))
+    return LiePoissonSystem(mf.so(3), energy=energy, entropy=Quadratic(np.ones(3)))
 
 
 def checked_inertia(inertia) -> np.ndarray | jax.Array:

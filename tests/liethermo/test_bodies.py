@@ -140,7 +140,7 @@ def test_the_damping_time_of_a_solid_body():
     assert np.allclose(rates[0], 2 * rates[1])
 
 
-# -- relaxation times ---------------------------------------------------------------------------------------------------
+# -- relaxation times --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("inertia", [(162.75, 162.75, 37.5), (37.5, 162.75, 162.75), (3.0, 0.5, 3.0)], ids=str)
@@ -171,7 +171,7 @@ def test_the_relaxation_time_is_an_eigenvalue_of_the_linear_equations(middle, ta
 
 
 def test_nearly_equal_moments_with_strong_friction_fall_to_their_plane_in_the_relaxation_time():
-    """The momentum comes to the plane of the two greatest moments in tau, and crosses it to the axis in a longer time."""
+    """The momentum comes to the plane of the two greatest moments in tau; within it the axis takes a longer time."""
     inertia, tau, L = np.array([162.75, 162.7, 37.5]), 20.0, 40.0
     rate = float(lt.bodies.rate_of(tau, inertia, L))
     d2, d3 = 1 / inertia[1:] - 1 / inertia[0]
@@ -194,7 +194,7 @@ def test_the_rate_has_derivatives_and_is_continuous_at_a_rod():
         rate(Rotation.random(rng=1).as_matrix() @ np.diag([2.0, 2.0, 2.0]) @ Rotation.random(rng=1).inv().as_matrix())
 
 
-# -- tensors of inertia ---------------------------------------------------------------------------------------------------
+# -- tensors of inertia ------------------------------------------------------------------------------------------------
 
 TURNED = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
 TENSOR = TURNED @ np.diag([2.0, 2.5, 3.0]) @ TURNED.T
