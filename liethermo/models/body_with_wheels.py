@@ -70,7 +70,7 @@ def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3
 
 def _moments(inertia) -> jax.Array:
     """Return the principal moments of the body; a tensor is refused, since the wheels stand along principal axes."""
-    if jnp.shape(inertia) == (3, 3):
+    if np.shape(inertia) == (3, 3):
         raise InputError(
             "inertia must be three principal moments, since there is a wheel along each principal axis, got an array "
             "of shape (3, 3): give liethermo.bodies.principal_axes(inertia).moments"
