@@ -158,7 +158,7 @@ def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarr
 
 
 DIFFERENCE_ORDERS = (2, 3, 4, 5, 6)
-"""Orders of divided differences by which noise is told from motion."""
+"""Orders of divided differences that distinguish noise from motion."""
 
 NOISE_PLATEAU = 0.7
 """Ratio of the estimates by the highest order and by the one two below it, above which they are of noise: those of a

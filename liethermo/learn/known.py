@@ -174,10 +174,10 @@ def several(
 ) -> Fits:
     """Fits from different first weights to data that are drawn again from those given: how far they agree.
 
-    Of at least 8 trajectories as many are drawn, with replacement, for each fit (bootstrap). Fewer cannot be drawn
-    often enough: then each fit has the data with further errors of the size of the noise, given or estimated, and the
-    deviation of the fits is the standard error of one. Fewer trajectories without noise are drawn too, none of the
-    draws twice; of a single one without noise only the first weights and the batches differ.
+    From 8 trajectories or more, each fit draws as many with replacement (bootstrap). Draws of fewer are often the same.
+    Then each fit has the data with further errors of the size of the noise, given or estimated, and the deviation of
+    the fits is the standard error of one. Fewer trajectories without noise are drawn too, no draw twice. If there is
+    only one, without noise, the fits differ in their first weights and batches alone.
 
     Parameters
     ----------

@@ -43,8 +43,8 @@ class Weights(NamedTuple):
     start: np.ndarray
     shapes: tuple[tuple[int, ...], ...]
     system: Callable[[Any], Any]
-    names: tuple[str, ...]
-    is_log: np.ndarray
+    names: tuple[str, ...] = ()
+    is_log: np.ndarray = np.zeros(0, bool)
 
 
 def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:

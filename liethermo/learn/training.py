@@ -129,17 +129,17 @@ class Training:
 
     def with_findings(self, own: Weights, refined: Refined | None, noise, noise_is_estimated: bool) -> Training:
         """Return the record with what a refinement by least squares has found, and the noise."""
-        known = {"noise": np.zeros(0) if noise is None else np.asarray(noise), "noise_is_estimated": noise_is_estimated}
+        sigma = np.zeros(0) if noise is None else np.asarray(noise)
+        record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
         if refined is None:
-            return replace(self, **known)
+            return record
         values = np.where(own.is_log, np.exp(refined.weights), refined.weights)
         scale = np.where(own.is_log, values, 1.0)
         with np.errstate(invalid="ignore"):
             covariance = refined.covariance * np.outer(scale, scale)
         covariance = np.where(np.isfinite(covariance), covariance, np.inf)
         return replace(
-            self,
-            **known,
+            record,
             names=own.names,
             values=values,
             standard_errors=np.sqrt(np.diag(covariance)),

@@ -26,8 +26,8 @@ class Periods(NamedTuple):
         The mean time (time) in which the axis that the body circles about turns once about the angular momentum in
         space. It is ``2 pi I_1 / L`` of a body with two equal moments.
     axis : ndarray of int
-        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2. Of a tensor it
-        is the number of a principal axis in ascending order of the moments, 0 or 2: see
+        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2. If a tensor is
+        given, it is the number of a principal axis in ascending order of the moments, 0 or 2: see
         :func:`liethermo.bodies.principal_axes`.
     """
 
@@ -119,10 +119,10 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     - A rod, ``I_2 = I_3``, does not oscillate: it comes to a flat spin about whichever transverse axis. The tangent of
       the angle from the flat spin falls by e in tau, ``1/tau = r d_1``, at small angles and at large ones. That is
       twice the rate of a body whose two greatest moments differ by ever so little, and oscillates.
-    - Of a body with nearly equal ``I_2`` and ``I_3``, and friction too strong for it to oscillate, the angle between
-      the momentum and the plane of the axes 2 and 3 falls by e in tau, the shorter time of the linear equation,
+    - If ``I_2`` and ``I_3`` are nearly equal, friction may be too strong for an oscillation. Then the angle between
+      the momentum and the plane of the axes 2 and 3 falls by e in tau, the shorter time of the linear equation:
       ``1/tau = r (d_1 + d_2) / 2 + sqrt(r**2 (d_1 - d_2)**2 / 4 - L**2 d_1 d_2)``. The way to the axis 3 within that
-      plane takes the longer time, about ``rate / d_2``, and is not what tau means.
+      plane takes the longer time, about ``rate / d_2``, which tau does not mean.
 
     The rate is a continuous function of the moments and of tau through all three, but moments that differ by less than
     1e-9 of themselves count as equal.

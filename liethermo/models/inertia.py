@@ -77,9 +77,9 @@ def are_tensors(inertia) -> bool:
     """Return whether an array of shape (..., 3) holds tensors of inertia, shape (..., 3, 3), rather than moments.
 
     Symmetric positive definite blocks whose principal moments obey ``I_i <= I_j + I_k`` are tensors. Their rows are
-    then never the moments of three bodies: if the rows obeyed those inequalities, the trace would be at most twice the
-    sum of the three products of inertia, the mean of the quadratic form over (1, 1, 1) at least 2/3 of the trace, and
-    so the greatest principal moment greater than the sum of the other two.
+    then never the moments of three bodies. Proof: let the rows obey these inequalities. Then the trace is at most twice
+    the sum s of the three entries above the diagonal. The quotient ``v . I v / v . v`` at ``v = (1, 1, 1)`` is
+    ``(tr I + 2 s) / 3``, at least 2/3 of the trace. So the greatest principal moment exceeds the sum of the others.
 
     Raises
     ------

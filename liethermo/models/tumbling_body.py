@@ -42,10 +42,10 @@ def tumbling_body(
         Principal moments of inertia, of which none is more than the sum of the others, or the tensor in body axes
         (kg m**2).
     relaxation_time : float, > 0
-        In which small nutations fall by e (s), of a body with the angular momentum given beside it. Of a body with
-        three different moments it is the time of the amplitude of a nutation that oscillates; of a rod, whose two
-        greatest moments are equal, that of the tangent of the angle from the flat spin. See
-        :func:`liethermo.bodies.rate_of`, for nearly equal moments too.
+        Time (s) in which small nutations fall by e, at the angular momentum given beside it. If the three moments
+        differ, the nutation oscillates, and its amplitude falls by e. If the two greatest are equal, as those of a rod,
+        the tangent of the angle from the flat spin falls by e. :func:`liethermo.bodies.rate_of` says what holds for
+        nearly equal moments.
     momentum : float, > 0, or three numbers
         The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
         time, which falls as ``1 / |mu|**2``. What the body starts with is the state that a run is given.
