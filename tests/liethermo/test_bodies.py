@@ -248,6 +248,7 @@ def test_no_tensor_of_a_rigid_body_is_ever_three_bodies(masses, seed):
         (lambda I: lt.models.body_with_wheels(I(TENSOR)), "principal_axes"),
         (lambda I: body_with_wheels_rest(1.0, 1.0, I(TENSOR)), "principal_axes"),
         (lambda I: lt.models.rigid_body(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]])), "must be symmetric"),
+        (lambda I: lt.torques.GravityGradient(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]]), 1.0), "must be symmetric"),
         (lambda I: lt.models.tumbling_body(I([[2, 3, 0], [3, 2, 0], [0, 0, 2]]), rate=0.1), "positive definite, got"),
     ],
 )
