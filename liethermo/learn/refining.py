@@ -187,7 +187,10 @@ def refine(
     schur, slope = _schur(_with_prior(squares, p, variance), slopes, p, taken)
     total = costs[taken].sum()
     variance = total / freedom if freedom > 0 else np.nan
-    inverse, rank, condition = _inverse(schur)
+    inverse, _, condition = _inverse(schur)
+    without_prior, rank, _ = _inverse(_schur(squares, slopes, p, taken)[0])
+    if rank < p:  # the prior alone determines the rest
+        inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
     held = np.nan
     if not taken.all() and np.isfinite(costs[~taken]).all():
         behind = _freedom(np.asarray(runs.is_observed), runs.shown.shape[-1], squares[:, p:, p:], ~taken, 0)
