@@ -8,7 +8,19 @@ from __future__ import annotations
 from manifolds._names import listing
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
+from .models.inertia import PrincipalAxes, principal_axes
 from .results.orientation import nutation, precession, quaternions, spin
 
-__all__ = ["Periods", "damping_time", "nutation", "periods", "precession", "quaternions", "rate_of", "spin"]
+__all__ = [
+    "Periods",
+    "PrincipalAxes",
+    "damping_time",
+    "nutation",
+    "periods",
+    "precession",
+    "principal_axes",
+    "quaternions",
+    "rate_of",
+    "spin",
+]
 __dir__ = listing(__all__)

@@ -84,6 +84,11 @@ class Dissipation(Module):
     def needs_entropy(self) -> bool:
         return True
 
+    @property
+    def can_drive_baths(self) -> bool:
+        """Whether it acts on states with the entropies of baths behind them, where a body has no entropy of its own."""
+        return False
+
     def prepared(self, system: Geometry) -> Dissipation:
         """This dissipation, checked against the system it is used in and completed with what that determines."""
         return self

@@ -36,10 +36,14 @@ class FrictionOperator(Dissipation):
     O(h^2) in a step, and keep the same laws; the orthogonal one moves kernel vectors of K that dH is not orthogonal to,
     and needs no safeguard where dH turns away from grad H.
 
+    Where a system has baths (:class:`liethermo.HeatBaths`) and no entropy of its own, K acts on states with the
+    entropies of the baths behind those of the body, as their sum is the entropy that it drives up.
+
     Parameters
     ----------
     K : function from x, shape (n,), to a matrix (n, n), or a constant matrix
         The friction matrix, symmetric and semidefinite, in units such that ``rate * K`` has x**2 / (entropy * time).
+        With baths, n counts their entropies too.
     rate : float, >= 0
         Factor of K: see there for the unit.
     project : bool
@@ -61,6 +65,8 @@ class FrictionOperator(Dissipation):
         if projection not in ("oblique", "orthogonal"):
             raise InputError(f"projection is 'oblique' or 'orthogonal', not {projection!r}")
         self.projection = projection
+
+    can_drive_baths = True
 
     def prepared(self, system):
         check_matrix(self.K, system.dim, "the friction operator K")

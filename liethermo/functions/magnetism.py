@@ -65,7 +65,7 @@ def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
     InputError
     """
     shape = checked_sites(sites)
-    if neighbours is None and _is_graph(strength):
+    if neighbours is None and _is_graph(strength, shape):
         return _on_graph(shape, strength)
     return _lattice(shape, strength, None, neighbours, periodic, "an exchange constant")
 
@@ -77,7 +77,8 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Ene
     ----------
     sites : int or tuple of int
     vectors : array, shape (3,), or ``(*sites, 3)``; or a list of them, one for each neighbour; or list of edges
-        D of each pair of a site with the one ahead; or edges ``(i, j, D)``, D being that from i to j.
+        D of each pair of a site with the one ahead, such as ``[(0, D, 0), (-D, 0, 0)]`` on a square lattice; or edges
+        ``(i, j, D)``, D being that from i to j.
     neighbours, periodic
         As of :func:`exchange`.
 
@@ -86,7 +87,7 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Ene
     InputError
     """
     shape = checked_sites(sites)
-    if neighbours is None and _is_edge_list(vectors):
+    if neighbours is None and _is_edge_list(vectors) and all(np.ndim(edge[2]) == 1 for edge in vectors):
         ends, D = _directed(vectors, math.prod(shape))
         return Each(_turned, _places(ends[:, 0], ends[:, 1]), D)
     return _lattice(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
@@ -290,7 +291,7 @@ def _lattice(shape, strength, vectors, neighbours, periodic, what: str) -> Energ
     given = strength if vectors is None else vectors
     each = (
         given
-        if isinstance(given, list) and len(given) == len(offsets) and np.ndim(given[0])
+        if isinstance(given, list | tuple) and len(given) == len(offsets) and np.ndim(given[0])
         else [given] * len(offsets)
     )
     tail = () if vectors is None else (3,)
@@ -337,19 +338,26 @@ def _of_sites(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
 
 
 def _is_edge_list(graph) -> bool:
+    """Return whether these are edges ``(i, j, weight)``, two integers first, and not a list of values."""
     return (
-        isinstance(graph, list | tuple) and len(graph) > 0 and all(isinstance(e, tuple) and len(e) == 3 for e in graph)
+        isinstance(graph, list | tuple)
+        and len(graph) > 0
+        and all(isinstance(e, tuple) and len(e) == 3 and _is_integer(e[0]) and _is_integer(e[1]) for e in graph)
     )
 
 
-def _is_graph(strength) -> bool:
-    return (
-        scipy.sparse.issparse(strength)
-        or _is_edge_list(strength)
-        or (
-            not isinstance(strength, list) and np.ndim(strength) == 2 and np.shape(strength)[0] == np.shape(strength)[1]
-        )
-    )
+def _is_integer(value) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _is_graph(strength, shape: tuple[int, ...]) -> bool:
+    """Return whether an exchange is given on a graph: a square matrix, unless it has the shape of a lattice."""
+    if scipy.sparse.issparse(strength) or _is_edge_list(strength):
+        return True
+    if isinstance(strength, list) or np.ndim(strength) != 2:
+        return False
+    given = np.shape(strength)
+    return given[0] == given[1] and given != shape
 
 
 def _on_graph(shape, graph) -> Energy:

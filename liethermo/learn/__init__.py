@@ -8,12 +8,13 @@ from .known import Determined, Fits, determined, several
 from .model import Metriplectic
 from .networks import Learned
 from .parts import Energy, Entropy, Friction, Poisson
-from .training import Training
+from .training import FitWarning, Training
 
 __all__ = [
     "Determined",
     "Energy",
     "Entropy",
+    "FitWarning",
     "Fits",
     "Friction",
     "Learned",

@@ -158,6 +158,56 @@ def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarr
     return np.stack([f(u) for f in columns], axis=1), np.stack([f.derivative()(u) for f in columns], axis=1) / length
 
 
+DIFFERENCE_ORDERS = (2, 3, 4, 5, 6)
+"""Orders of divided differences that distinguish noise from motion."""
+
+NOISE_PLATEAU = 0.7
+"""Ratio of the estimates by the highest order and by the one two below it, above which they are of noise: those of a
+motion that is resolved fall from order to order."""
+
+MIN_DIFFERENCES = 12
+"""Differences of the highest order from which noise is estimated."""
+
+MIN_RELATIVE_NOISE = 1e-3
+"""Noise below this part of the spread of the data is left out of account."""
+
+
+def estimated_noise(data: list[Trajectory], size: np.ndarray) -> np.ndarray | None:
+    """Return standard deviations of the errors of data, shape (k,), from their differences; None where none are seen.
+
+    A divided difference of order d of a smooth motion falls with d, and that of independent errors, with weights of
+    norm one, does not.
+    """
+    order = DIFFERENCE_ORDERS[-1]
+    if sum(max(len(t) - order, 0) for t, _ in data) < MIN_DIFFERENCES:
+        return None
+    levels = np.stack([_difference_level(data, d) for d in DIFFERENCE_ORDERS])
+    is_noise = (levels[-1] > NOISE_PLATEAU * levels[-3]) & (levels[-1] > MIN_RELATIVE_NOISE * size)
+    if not is_noise.any():
+        return None
+    found = np.where(is_noise, levels[-3:].mean(axis=0), levels.min(axis=0))
+    return np.maximum(found, MIN_RELATIVE_NOISE * size)
+
+
+def _difference_level(data: list[Trajectory], order: int) -> np.ndarray:
+    """Return the standard deviation of normalised divided differences, shape (k,), by their median."""
+    found = []
+    for t, x in data:
+        if len(t) <= order:
+            continue
+        times = np.lib.stride_tricks.sliding_window_view(t, order + 1)
+        times = (times - times[:, :1]) / (times[:, -1:] - times[:, :1])
+        gaps = times[:, :, None] - times[:, None, :] + np.eye(order + 1)
+        weights = 1.0 / np.prod(gaps, axis=2)
+        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+        found.append(np.einsum("wj,wkj->wk", weights, np.lib.stride_tricks.sliding_window_view(x, order + 1, axis=0)))
+    return np.median(np.abs(np.concatenate(found)), axis=0) / MEDIAN_OF_NORMAL
+
+
+MEDIAN_OF_NORMAL = 0.6744897501960817
+"""Median of the absolute value of a normal variable, in its standard deviations."""
+
+
 class Windows(NamedTuple):
     """Short pieces of trajectories, all of the same number m of intervals.
 
@@ -171,12 +221,15 @@ class Windows(NamedTuple):
         What is observed at their ends, that of the start first.
     following : array of int, shape (windows,)
         The window that begins where one ends; -1 where none does.
+    first : array of int, shape (trajectories,)
+        The window in which each trajectory begins.
     """
 
     starts: np.ndarray
     sizes: np.ndarray
     shown: np.ndarray
     following: np.ndarray
+    first: np.ndarray
 
 
 def windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart: bool) -> Windows:
@@ -184,15 +237,17 @@ def windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart
     length = min(length, *(len(t) - 1 for t, _ in data))
     starts, sizes, shown = [], [], []
     following: list[int] = []
+    begins = []
     for (t, x), own in zip(data, states, strict=True):
         last = len(t) - 1 - length
         firsts = list(range(0, last + 1, length if apart else 1))
         if firsts[-1] != last:
             firsts.append(last)
+        begins.append(len(following))
         for i in firsts:
             follows = apart and i + length in firsts
             starts.append(own[i])
             sizes.append(np.diff(t[i : i + length + 1]))
             shown.append(x[i : i + length + 1])
             following.append(len(following) + 1 if follows else -1)
-    return Windows(np.stack(starts), np.stack(sizes), np.stack(shown), np.array(following))
+    return Windows(np.stack(starts), np.stack(sizes), np.stack(shown), np.array(following), np.array(begins))

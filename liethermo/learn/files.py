@@ -23,6 +23,15 @@ FORMAT = "liethermo-learned-1"
 
 CURVES = ("step", "phase", "loss", "validation")
 
+FINDINGS = ("values", "standard_errors", "covariance", "noise")
+"""Arrays of the record of a fit that files of older versions do not have."""
+
+SAID = (
+    *("parameters", "seconds", "ended", "names", "rank", "condition", "residual", "held_out", "gradient"),
+    *("converged", "noise_is_estimated"),
+)
+"""Other parts of the record of a fit, in the JSON of its file."""
+
 
 def _arrays(system: Any) -> tuple[list[Any], Any, Any]:
     dynamic, static = eqx.partition(system, eqx.is_array)
@@ -51,7 +60,8 @@ def save(system: System, path: str | os.PathLike) -> Path:
     said: dict[str, Any] = {"format": FORMAT, "kind": system.kind}
     if training is not None:
         arrays |= {name: getattr(training, name) for name in CURVES}
-        said["training"] = {name: getattr(training, name) for name in ("parameters", "seconds", "ended")}
+        arrays |= {name: getattr(training, name) for name in FINDINGS}
+        said["training"] = {name: getattr(training, name) for name in SAID}
     write(path, said, arrays)
     return path
 
@@ -86,7 +96,9 @@ def load(path: str | os.PathLike, system: T) -> T:
         raise FileError(f"{path!s:.200} has numbers that are not finite: it is no system that was fitted")
     if "training" in said:
         try:
-            training = Training(**{name: arrays[name] for name in CURVES}, **said["training"])  # type: ignore[arg-type]
+            curves = {name: arrays[name] for name in CURVES} | {n: arrays[n] for n in FINDINGS if n in arrays}
+            words = said["training"] | {"names": tuple(said["training"].get("names", ()))}
+            training = Training(**curves, **words)  # type: ignore[arg-type]
         except (KeyError, TypeError) as error:
             raise FileError(f"{path!s:.200} has a record of its fit that is damaged ({error!s:.100})") from None
         object.__setattr__(found, "training", training)

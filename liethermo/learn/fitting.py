@@ -8,19 +8,23 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from manifolds._precision import by_own_settings
+from manifolds.errors import warn
 
 from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..systems import System
 from . import losses
-from .data import Trajectory, scales, smoothed, trajectories, windows
+from .data import Trajectory, estimated_noise, scales, smoothed, trajectories, windows
 from .losses import Task
 from .model import has_networks, in_units
 from .observation import coordinates, observation, plain_states, states_that_move
-from .training import Course, Phase, fingerprint
+from .refining import can_refine, joined_runs, refine
+from .training import Course, FitWarning, Phase, fingerprint
 
 T = TypeVar("T", bound=System)
 
@@ -61,6 +65,12 @@ def fit(
     is a descent by SOAP [Vyas et al. 2025], which is Adam in the eigenvectors of each layer's gradients, with a rate
     that falls along a cosine. The same arguments give the same result.
 
+    If at most 64 numbers are learned, none of them in networks of this module, a third part follows the second: least
+    squares over whole trajectories by Levenberg and Marquardt's method, which finds the first states too. It gives
+    standard errors of the numbers, says how many combinations of them the data determine, and whether the iteration has
+    converged: see :class:`Training`. The errors suppose that those of the data are independent, and that the model can
+    describe the data.
+
     Parameters
     ----------
     system : System
@@ -84,7 +94,8 @@ def fit(
     noise : float, or array, shape (n,), optional
         Standard deviation of the errors of the data (in their units), one number or one for each number observed.
         Splines then smooth the data, losses are relative to it, and the fit also finds the initial states of the short
-        runs.
+        runs. By default it is estimated from the data, by differences that a motion does not have; errors below a
+        thousandth of the spread of the data are left out of account. 0 says that the data are exact.
     observed : sequence of int, optional
         Indices of the components that were measured; the data then have shape (m, len(observed)).
     observe : function of x, shape (n,), or of x and the attitude, shape (m, m); optional
@@ -113,6 +124,12 @@ def fit(
     System
         The fitted system, with the record in ``.training``: see :class:`Training`.
 
+    Warns
+    -----
+    FitWarning
+        If the least squares have not converged, the data do not determine a number, or what the runs miss of the data
+        is much more than the noise.
+
     Raises
     ------
     InputError
@@ -137,7 +154,10 @@ def fit(
     run = losses.stepper(system, method, substeps, seen.group is not None)[0]
     whole = [trajectory.flat for trajectory in trajectories(data, system, seen)]
     shown = scales(whole)
-    sigma = _noise(noise, shown.size.size)
+    sigma = checked_noise(noise, shown.size.size)
+    noise_is_estimated = noise is None
+    if noise_is_estimated:
+        sigma = estimated_noise(whole, shown.size)
     smooth = [smoothed(trajectory, sigma) for trajectory in whole]
     if seen.is_whole or has_networks(system):
         starts = [plain_states(seen, run, x) for x, _ in smooth]
@@ -184,8 +204,9 @@ def fit(
                 own.shapes,
             )
         )
+    free = sigma is not None or not seen.is_whole
     if shooting:
-        free, slower = sigma is not None or not seen.is_whole, SLOWER if phases else 1.0
+        slower = SLOWER if phases else 1.0
         task = shot(train, free)
         phases.append(
             Phase(
@@ -210,9 +231,30 @@ def fit(
     if path is not None and path.exists():
         course.resume(path)
     course.run(seed, patience, path, progress)
-    fitted = cast(T, own.system(course.weights))
-    object.__setattr__(fitted, "training", course.record(time.perf_counter() - began))
+    weights, refined = course.weights, None
+    if shooting and can_refine(own, system, whole, run, substeps) and "interrupted" not in course.ended.values():
+        firsts = _first_states(course.best, own, train, window, free, seen, run, searched)
+        parts = [pair[0] for pair in (*train, *held)]
+        runs = joined_runs(parts, [*firsts, *(states[0] for _, states in held)])
+        is_held_out = np.arange(len(parts)) >= len(train)
+        refined = refine(own, weights, method, runs, is_held_out, seen, units[:2], substeps)
+        weights = refined.weights
+    fitted = cast(T, own.system(jnp.asarray(weights)))
+    training = course.record(time.perf_counter() - began).with_findings(own, refined, sigma, noise_is_estimated)
+    object.__setattr__(fitted, "training", training)
+    for problem in training.problems:
+        warn(problem, FitWarning)
     return fitted
+
+
+def _first_states(vector, own, train: list, window: int, free: bool, seen, run, searched) -> np.ndarray:
+    """Return the states in which whole trajectories begin, as the shooting has found them, shape (B, N)."""
+    starts = np.stack([states[0] for _, states in train])
+    if not free:
+        return starts
+    pieces = windows([trajectory for trajectory, _ in train], [states for _, states in train], window, free)
+    moves = np.asarray(vector)[own.start.size :].reshape(len(pieces.starts), -1)[pieces.first] * searched
+    return np.asarray(jax.vmap(lambda x, z: seen.moved(run, x, z))(jnp.asarray(starts), jnp.asarray(moves)))
 
 
 def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
@@ -226,13 +268,16 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def _noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
+def checked_noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
+    """Return standard deviations of the errors of data, shape (count,); None where none are given, or 0."""
     if noise is None:
         return None
     try:
         sigma = np.asarray(noise, dtype=np.float64)
     except (TypeError, ValueError):
         sigma = np.array(np.nan)
+    if sigma.shape == () and sigma == 0.0:
+        return None
     if sigma.shape not in ((), (count,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
         raise InputError(
             f"noise is a positive standard deviation, or one for each of {count} components, not {noise!r}"

@@ -11,20 +11,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._precision import by_own_settings
+from manifolds.errors import warn
 
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..runs.integrate import integrate
 from ..systems import System
 from . import losses
-from .data import trajectories
-from .fitting import fit
+from .data import Trajectory, estimated_noise, scales, trajectories
+from .fitting import checked_noise, fit
 from .observation import observation
+from .training import FitWarning
 
 T = TypeVar("T", bound=System)
 
 DEPENDENT = 1e-8
 """Singular values, relative to the largest, below which a combination of parameters changes nothing."""
+
+
+MIN_RESAMPLED = 8
+"""Trajectories from which they are drawn again: of fewer the draws are often the same."""
+
+MAX_DRAWS = 100
+"""Draws of trajectories in the search for one that has not been drawn before."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +145,19 @@ class Fits:
         Parameters
         ----------
         quantity : function from a system to an array
+
+        Warns
+        -----
+        FitWarning
+            If all systems have the same values: then their deviation of 0 says nothing of what the data determine.
         """
         found = np.stack([np.asarray(quantity(system)) for system in self.systems])
+        if (found == found[0]).all():
+            warn(
+                "the quantity is equal in all fits, so its deviation of 0 is no error: the fits had the same data and "
+                "first weights, or it does not depend on what was learned. Give noise=, or more trajectories",
+                FitWarning,
+            )
         return found.mean(axis=0), found.std(axis=0, ddof=1)
 
     def forecast(
@@ -152,7 +172,12 @@ class Fits:
 def several(
     build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **how
 ) -> Fits:
-    """Fits from different first weights to trajectories drawn again from those given: how far they agree.
+    """Fits from different first weights to data that are drawn again from those given: how far they agree.
+
+    From 8 trajectories or more, each fit draws as many with replacement (bootstrap). Draws of fewer are often the same.
+    Then each fit has the data with further errors of the size of the noise, given or estimated, and the deviation of
+    the fits is the standard error of one. Fewer trajectories without noise are drawn too, no draw twice. If there is
+    only one, without noise, the fits differ in their first weights and batches alone.
 
     Parameters
     ----------
@@ -165,7 +190,7 @@ def several(
     seed : int
         Of the first.
     resample : bool
-        Draw as many trajectories as there are, with replacement, for each (bootstrap), where there is more than one.
+        Draw data again for each fit.
 
     Raises
     ------
@@ -174,10 +199,34 @@ def several(
     """
     if isinstance(number, bool) or not isinstance(number, int) or number < 2:
         raise InputError(f"number of fits is an integer >= 2, not {number!r}")
-    systems = []
+    systems: list[System] = []
+    drawn: set[tuple[int, ...]] = set()
     for own in range(seed, seed + number):
-        system = build(own)
+        system, random = build(own), np.random.default_rng(own)
         whole = trajectories(data, system, observation(system, how.get("observed"), how.get("observe")))
-        drawn = np.random.default_rng(own).integers(len(whole), size=len(whole)) if resample else range(len(whole))
-        systems.append(fit(system, [whole[i] for i in drawn], seed=own, **how))
+        sigma = _noise_of(whole, how.get("noise")) if resample and len(whole) < MIN_RESAMPLED else None
+        if sigma is not None:
+            noisy = [(t, x + (sigma * random.standard_normal((len(t), sigma.size))).reshape(x.shape)) for t, x in whole]
+            more = {} if how.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
+            systems.append(fit(system, noisy, seed=own, **{**how, **more}))
+            continue
+        chosen = _new_draw(len(whole), random, drawn) if resample else range(len(whole))
+        systems.append(fit(system, [whole[i] for i in chosen], seed=own, **how))
     return Fits(tuple(systems))
+
+
+def _noise_of(whole: list[Trajectory], noise) -> np.ndarray | None:
+    """Return the standard deviations of the errors of data, given or estimated; None where there are none."""
+    flat = [trajectory.flat for trajectory in whole]
+    size = scales(flat).size
+    return estimated_noise(flat, size) if noise is None else checked_noise(noise, size.size)
+
+
+def _new_draw(count: int, random: np.random.Generator, drawn: set[tuple[int, ...]]) -> np.ndarray:
+    """Draw so many out of as many, with replacement, and remember it; another draw than before, where there is one."""
+    for _ in range(MAX_DRAWS):
+        chosen = random.integers(count, size=count)
+        if tuple(sorted(chosen.tolist())) not in drawn:
+            break
+    drawn.add(tuple(sorted(chosen.tolist())))
+    return chosen

@@ -35,11 +35,17 @@ class Weights(NamedTuple):
     shapes : tuple of tuple of int
         Of the arrays that stand in it, one after another.
     system : function from such a vector to the system
+    names : tuple of str, of length p
+        Where each number stands in the system: ``"dissipation.rate"``, ``"energy.A[0]"``.
+    is_log : array of bool, shape (p,)
+        Which of them are logarithms.
     """
 
     start: np.ndarray
     shapes: tuple[tuple[int, ...], ...]
     system: Callable[[Any], Any]
+    names: tuple[str, ...] = ()
+    is_log: np.ndarray = np.zeros(0, bool)
 
 
 def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:
@@ -61,7 +67,20 @@ def weights(system: System, also: Callable | None = None, positive: Callable | N
         logs, plain = back(vector)
         return tied(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
 
-    return Weights(np.asarray(first), tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(both)), rebuilt)
+    shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(both))
+    count = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
+    return Weights(np.asarray(first), shapes, rebuilt, _names(both), np.arange(first.size) < count)
+
+
+def _names(trees: tuple) -> tuple[str, ...]:
+    """Where each number of some trees stands in its tree, in the order of the numbers."""
+    found: list[str] = []
+    for tree in trees:
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+            name = jax.tree_util.keystr(path).lstrip(".")
+            shape = np.shape(leaf)
+            found += [name + (f"[{', '.join(map(str, i))}]" if shape else "") for i in np.ndindex(shape)]
+    return tuple(found)
 
 
 class Task(NamedTuple):

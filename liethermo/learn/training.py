@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from .. import disk
 from ..errors import FileError, InputError
 from ..runs.progress import Progress
 from .descent import descent
-from .losses import Task
+from .losses import Task, Weights
 from .quickly import quickly
+from .refining import Refined
 
 BLOCK = 50
 """Steps between two looks at the course."""
@@ -46,6 +47,20 @@ class Phase:
     shapes: tuple[tuple[int, ...], ...]
 
 
+LEAST_SQUARES = "least squares"
+"""Name of the refinement in the record of a fit."""
+
+VAGUE = 0.5
+"""Standard error of a number, relative to it, above which the data do not determine it."""
+
+MISFIT = 1.5
+"""Residual, relative to the noise, above which the model does not describe the data."""
+
+
+class FitWarning(UserWarning):
+    """A fit that has not converged, or whose data do not determine what is learned."""
+
+
 @dataclass(frozen=True)
 class Training:
     """The record of a fit.
@@ -66,6 +81,30 @@ class Training:
         Of this call, compilation among them.
     ended : dict of str
         How each phase ended, in words.
+    names : tuple of str
+        Where each learned number stands in the system, if the fit was refined by least squares, else none. What
+        follows is about these numbers, in their order; arrays are empty and numbers NaN without them.
+    values, standard_errors : ndarray, shape (p,)
+        The learned numbers, and their standard errors: infinite for a number that the data do not determine.
+    covariance : ndarray, shape (p, p)
+        Of their errors.
+    rank : int
+        Number of combinations of the learned numbers that the data determine; p if they determine all.
+    condition : float
+        Of the Jacobian with columns of norm one: large if some combination is hardly determined.
+    residual : float
+        Root mean square of what the runs miss of the data, by degrees of freedom, relative to the noise: 1 if the model
+        describes the data. If the noise is not known, relative to the spread of the data.
+    held_out : float
+        The same of the trajectories held out, of which only the first states are found.
+    gradient : float
+        Norm of the derivative of ln(loss) by the learned numbers, logarithms of those that stay positive: of the least
+        squares, or of the last batch.
+    converged : bool or None
+        Whether the Newton step of the least squares is below a hundredth of a standard error; None without them.
+    noise : ndarray, shape (k,)
+        Standard deviations of the errors of the data, given or estimated; empty where they count as exact.
+    noise_is_estimated : bool
     """
 
     step: np.ndarray
@@ -75,6 +114,69 @@ class Training:
     parameters: int
     seconds: float
     ended: dict[str, str] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+    values: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    standard_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    rank: int | None = None
+    condition: float = np.nan
+    residual: float = np.nan
+    held_out: float = np.nan
+    gradient: float = np.nan
+    converged: bool | None = None
+    noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    noise_is_estimated: bool = False
+
+    def with_findings(self, own: Weights, refined: Refined | None, noise, noise_is_estimated: bool) -> Training:
+        """Return the record with what a refinement by least squares has found, and the noise."""
+        sigma = np.zeros(0) if noise is None else np.asarray(noise)
+        record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
+        if refined is None:
+            return record
+        values = np.where(own.is_log, np.exp(refined.weights), refined.weights)
+        scale = np.where(own.is_log, values, 1.0)
+        with np.errstate(invalid="ignore"):
+            covariance = refined.covariance * np.outer(scale, scale)
+        covariance = np.where(np.isfinite(covariance), covariance, np.inf)
+        return replace(
+            record,
+            names=own.names,
+            values=values,
+            standard_errors=np.sqrt(np.diag(covariance)),
+            covariance=covariance,
+            rank=refined.rank,
+            condition=refined.condition,
+            residual=refined.residual,
+            held_out=refined.held_out,
+            gradient=refined.gradient,
+            converged=refined.converged,
+            ended=self.ended | {LEAST_SQUARES: f"after {refined.iterations} iterations"},
+        )
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong with the fit, a sentence each; empty where nothing is known to be."""
+        found = []
+        if self.converged is False:
+            found.append(
+                "the fit has not converged: its least squares could not be made smaller, or are not finite. Begin "
+                "nearer to the data, or give more iterations, as shooting=2000"
+            )
+        vague = [
+            f"{name} = {value:.3g} ± {error:.2g}"
+            for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True)
+            if np.isinf(error) or (value > 0.0 and error > VAGUE * value)
+        ]
+        if vague:
+            found.append(
+                f"the data do not determine {', '.join(vague)}: give more data, or leave known numbers out of the fit"
+            )
+        if self.noise.size and self.residual > MISFIT:
+            found.append(
+                f"what the runs miss of the data is {self.residual:.2g} times the noise: the model cannot describe "
+                "them, its steps are too long (substeps=), or the noise is larger (noise=)"
+            )
+        return found
 
     def __str__(self) -> str:
         lines = [f"{self.parameters} parameters, {self.seconds:.1f} s"]
@@ -83,8 +185,41 @@ class Training:
             if len(of):
                 last, held = self.loss[of[-1]], self.validation[of[-1]]
                 beside = "" if np.isnan(held) else f", held out {held:.2e}"
-                lines.append(f"{name}: loss {self.loss[of[0]]:.2e} to {last:.2e}{beside}; {how}")
-        return "\n".join(lines)
+                lines.append(f"{name}: loss {self.loss[of[0]]:.2e} to {last:.2e}{beside}; {how}{self._fall(of)}")
+        if self.noise.size:
+            low, high = float(self.noise.min()), float(self.noise.max())
+            size = f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
+            lines.append(f"noise of the data: {size}, {'estimated' if self.noise_is_estimated else 'given'}")
+        if self.converged is None:
+            if np.isfinite(self.gradient):
+                lines.append(f"norm of the gradient of ln(loss) of the last batch: {self.gradient:.1e}")
+            return "\n".join(lines)
+        verdict = "converged" if self.converged else "NOT converged"
+        lines.append(
+            f"{LEAST_SQUARES}: {verdict} {self.ended[LEAST_SQUARES]}; norm of the gradient of ln(loss) "
+            f"{self.gradient:.1e}"
+        )
+        of_what = "the noise" if self.noise.size else "the spread of the data"
+        beside = "" if np.isnan(self.held_out) else f", held out {self.held_out:.3g}"
+        lines.append(f"residuals: {self.residual:.3g} of {of_what}{beside}")
+        lines.append(
+            f"the data determine {self.rank} of {self.parameters} numbers; condition of the Jacobian "
+            f"{self.condition:.1e}"
+        )
+        lines += [
+            f"  {name} = {value:.6g} ± {error:.1g}"
+            for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True)
+        ]
+        return "\n".join([*lines, *(f"CAUTION: {problem}" for problem in self.problems)])
+
+    def _fall(self, of: np.ndarray) -> str:
+        """By how much the loss fell in the last fifth of the looks at a phase, in words."""
+        if len(of) < 10:
+            return ""
+        before, last = self.loss[of[-1 - len(of) // 5]], self.loss[of[-1]]
+        return (
+            f", in the last fifth of which the loss fell by {max(1.0 - last / before, 0.0):.1%}" if before > 0.0 else ""
+        )
 
 
 class Course:
@@ -94,6 +229,7 @@ class Course:
         self.phases, self.identity = phases, identity
         self.index = self.block = 0
         self.looks: list[tuple[int, str, float, float]] = []
+        self.gradient = float("nan")
         self.ended: dict[str, str] = {}
         self.weights = np.asarray(start)
         self._enter()
@@ -143,7 +279,8 @@ class Course:
             random = np.random.default_rng([seed, self.index, self.block])
             batch = min(phase.batch, phase.task.items)
             chosen = np.stack([random.permutation(phase.task.items)[:batch] for _ in range(length)])
-            self.vector, self.state, losses = descend(self.vector, self.state, phase.task.arrays, chosen)
+            self.vector, self.state, losses, slopes = descend(self.vector, self.state, phase.task.arrays, chosen)
+            self.gradient = float(slopes[-1])
             self.block += 1
             step, loss, held = before + self.block * length, float(jnp.mean(losses)), look(self.vector)
             self.looks.append((step, phase.name, loss, held))
@@ -166,7 +303,7 @@ class Course:
         steps, phases, values, held = zip(*self.looks, strict=True) if self.looks else ((), (), (), ())
         count = self.weights.size
         arrays = np.array(steps, dtype=int), np.array(phases, dtype=str), np.array(values), np.array(held)
-        return Training(*arrays, count, seconds, self.ended)
+        return Training(*arrays, count, seconds, self.ended, gradient=self.gradient)
 
     # -- files --------------------------------------------------------------------------------------------------------
 
@@ -182,6 +319,7 @@ class Course:
             "least": self.least,
             "looks": self.looks,
             "ended": self.ended,
+            "gradient": self.gradient,
         }
         leaves = jax.tree_util.tree_leaves(self.state)
         arrays = {"weights": self.weights, "vector": self.vector, "best": self.best}
@@ -203,7 +341,9 @@ class Course:
             )
         self.index, self.weights = said["index"], arrays["weights"]
         self.looks, self.ended = [tuple(look) for look in said["looks"]], said["ended"]
+        self.gradient = said.get("gradient", float("nan"))
         if self.index >= len(self.phases):
+            self.best = arrays["best"]
             return
         self._enter()
         self.block, self.since, self.least = said["block"], said["since"], said["least"]
@@ -232,11 +372,12 @@ def _programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
         vector, state, arrays = carry
         value, slope = jax.value_and_grad(phase.task.loss)(vector, arrays, chosen)
         updates, state = optimiser.update(slope, state, vector)
-        return (vector + updates, state, arrays), value
+        count = slope.size - phase.task.free.size
+        return (vector + updates, state, arrays), (value, jnp.linalg.norm(slope[:count]) / value)
 
     def block(vector, state, arrays, chosen):
-        (vector, state, _), values = jax.lax.scan(one, (vector, state, arrays), chosen)
-        return vector, state, values
+        (vector, state, _), (values, slopes) = jax.lax.scan(one, (vector, state, arrays), chosen)
+        return vector, state, values, slopes
 
     held = phase.held_out
     descend = jax.jit(block, compiler_options=quickly())

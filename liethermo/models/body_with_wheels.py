@@ -11,6 +11,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._module import Module
 
+from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem
 from .parameters import positive
 
@@ -55,7 +56,7 @@ def body_with_wheels(
     friction, heat, temperature : float, > 0
         k (mass * length**2 / time), the heat capacity C, and T_0.
     """
-    body, wheel = positive(inertia, "inertia", 3), positive(wheels, "wheels", 3)
+    body, wheel = _moments(inertia), positive(wheels, "wheels", 3)
     lagrangian = _Lagrangian(body, wheel, positive(heat, "heat"), positive(temperature, "temperature"))
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     return EulerPoincareClosedSystem(algebra, lagrangian, _InBearings(positive(friction, "friction")))
@@ -63,5 +64,15 @@ def body_with_wheels(
 
 def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:
     """The temperature at the end, from the angular momentum's size and the total energy."""
-    greatest = float(np.max(np.add(inertia, wheels)))
+    greatest = float(np.max(_moments(inertia) + positive(wheels, "wheels", 3)))
     return (float(energy) - float(momentum) ** 2 / (2 * greatest)) / heat
+
+
+def _moments(inertia) -> jax.Array:
+    """Return the principal moments of the body; a tensor is refused, since the wheels stand along principal axes."""
+    if np.shape(inertia) == (3, 3):
+        raise InputError(
+            "inertia must be three principal moments, since there is a wheel along each principal axis, got an array "
+            "of shape (3, 3): give liethermo.bodies.principal_axes(inertia).moments"
+        )
+    return positive(inertia, "inertia", 3)

@@ -11,6 +11,7 @@ import scipy.special
 
 from ..errors import InputError
 from ..functions.conditions import numbers, require
+from .inertia import EQUAL_MOMENTS_RTOL, are_tensors, principal_axes, principal_moments
 
 
 class Periods(NamedTuple):
@@ -25,7 +26,9 @@ class Periods(NamedTuple):
         The mean time (time) in which the axis that the body circles about turns once about the angular momentum in
         space. It is ``2 pi I_1 / L`` of a body with two equal moments.
     axis : ndarray of int
-        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2.
+        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2. If a tensor is
+        given, it is the number of a principal axis in ascending order of the moments, 0 or 2: see
+        :func:`liethermo.bodies.principal_axes`.
     """
 
     rotation: np.ndarray
@@ -41,8 +44,10 @@ def periods(inertia, momentum, energy=None) -> Periods:
 
     Parameters
     ----------
-    inertia : array, shape (..., 3), > 0
-        Principal moments (mass * length**2), in any order.
+    inertia : array, shape (..., 3), > 0, or (..., 3, 3)
+        Principal moments (mass * length**2), in any order, or tensors of inertia in body axes. An array whose last two
+        axes have length 3 holds tensors where each block is symmetric and positive definite and its principal moments
+        obey ``I_i <= I_j + I_k``; no three rigid bodies have the rows of such a block as their moments.
     momentum : array, shape (..., 3), or (...) beside an energy
         Angular momentum in body axes, or its size L (mass * length**2 / time).
     energy : array, shape (...), optional
@@ -58,10 +63,12 @@ def periods(inertia, momentum, energy=None) -> Periods:
     InputError
         If no motion of the body has such an energy and momentum: ``L**2 / (2 I_3) <= E <= L**2 / (2 I_1)``.
     """
-    moments, L = _moments(inertia), np.asarray(momentum, dtype=float)
+    moments, L = np.asarray(principal_moments(inertia)), np.asarray(momentum, dtype=float)
     if energy is None:
         if L.shape[-1:] != (3,):
             raise InputError(f"a momentum without an energy has shape (..., 3), not {L.shape}")
+        if are_tensors(np.asarray(inertia)):
+            L = np.einsum("...ji,...j->...i", principal_axes(inertia).axes, L)
         E, L = 0.5 * np.sum(L**2 / moments, axis=-1), np.linalg.norm(L, axis=-1)
     else:
         E = np.asarray(energy, dtype=float)
@@ -100,19 +107,33 @@ def _third(n, m) -> np.ndarray:
 
 
 def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
-    """The rate of friction inside a body whose small nutations fall by e in the relaxation time.
+    """Return the rate of friction inside a body whose small nutations fall by e in the relaxation time.
 
-    ``1 / tau = rate L**2 / 2 ((1/I_1 - 1/I_3) + (1/I_2 - 1/I_3))`` near the spin about the axis of the greatest moment
-    ``I_3``, for ``x' = Pi dH + rate Pi Pi dH``: exact in the linear equations, where friction is so weak that
-    they oscillate. Large nutations of a body with ``I_1 = I_2`` obey it too:
-    ``tan theta = tan theta_0 exp(-t / tau)``.
+    The friction is that of ``x' = Pi dH + rate Pi Pi dH``. With ``I_1 <= I_2 <= I_3``, ``d_i = 1/I_i - 1/I_3`` and
+    ``r = rate L**2``, small nutations from the spin about the axis 3 obey a linear equation with the trace
+    ``-r (d_1 + d_2)`` and the determinant ``(r**2 + L**2) d_1 d_2``. There are three cases.
+
+    - The nutation oscillates, where ``rate L |d_1 - d_2| < 2 sqrt(d_1 d_2)``, as it does for every body with three
+      different moments and weak friction. Its amplitude falls by e in ``tau``, ``1/tau = r (d_1 + d_2) / 2``. Large
+      nutations of a body with ``I_1 = I_2`` obey that too: ``tan theta = tan theta_0 exp(-t / tau)``.
+    - A rod, ``I_2 = I_3``, does not oscillate: it comes to a flat spin about whichever transverse axis. The tangent of
+      the angle from the flat spin falls by e in tau, ``1/tau = r d_1``, at small angles and at large ones. That is
+      twice the rate of a body whose two greatest moments differ by ever so little, and oscillates.
+    - If ``I_2`` and ``I_3`` are nearly equal, friction may be too strong for an oscillation. Then the angle between
+      the momentum and the plane of the axes 2 and 3 falls by e in tau, the shorter time of the linear equation:
+      ``1/tau = r (d_1 + d_2) / 2 + sqrt(r**2 (d_1 - d_2)**2 / 4 - L**2 d_1 d_2)``. The way to the axis 3 within that
+      plane takes the longer time, about ``rate / d_2``, which tau does not mean.
+
+    The rate is a continuous function of the moments and of tau through all three, but moments that differ by less than
+    1e-9 of themselves count as equal.
 
     Parameters
     ----------
     relaxation_time : float or array, > 0
         tau (time).
-    inertia : array, shape (..., 3), > 0
-        Principal moments (mass * length**2), in any order, one of them the greatest.
+    inertia : array, shape (..., 3), > 0, or (..., 3, 3)
+        Principal moments (mass * length**2), in any order, not all equal; or tensors of inertia, by the rule of
+        :func:`periods`.
     momentum : float or array, > 0
         The size L of the angular momentum (mass * length**2 / time).
 
@@ -125,16 +146,22 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     ------
     InputError
     """
-    moments = numbers(inertia, "inertia")
-    if moments.shape[-1:] != (3,):
-        raise InputError(f"inertia has shape (..., 3), not {moments.shape}")
+    moments = principal_moments(inertia)
     tau, L = numbers(relaxation_time, "a relaxation time"), numbers(momentum, "the size of a momentum")
-    for value, what in ((moments, "moments of inertia"), (tau, "a relaxation time"), (L, "the size of a momentum")):
+    for value, what in ((tau, "a relaxation time"), (L, "the size of a momentum")):
         require(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
-    above = jnp.sum(1.0 / moments, axis=-1) - 3.0 / jnp.max(moments, axis=-1)
-    unequal = jnp.min(moments, axis=-1) < jnp.max(moments, axis=-1)
+    least, middle, greatest = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
+    unequal = greatest - least > EQUAL_MOMENTS_RTOL * greatest
     require(unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
-    return 2.0 / (tau * L**2 * above)
+    is_rod = greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
+    d1 = (greatest - least) / (greatest * least)
+    ratio = jnp.where(is_rod, 0.0, (greatest - middle) * least / ((greatest - least) * middle))  # d_2 / d_1
+    decay = 1.0 / (tau * L * d1)
+    oscillates = decay * (1.0 - ratio) <= jnp.sqrt(jnp.where(ratio > 0.0, ratio, 1.0)) * (1.0 + ratio) * (ratio > 0.0)
+    weak = 2.0 * decay / (1.0 + ratio)
+    square = jnp.where(oscillates, 1.0, (decay * (1.0 - ratio)) ** 2 - 4.0 * ratio**2)  # sqrt has a derivative
+    strong = 2.0 * (decay**2 + ratio) / ((1.0 + ratio) * decay + jnp.sqrt(square))
+    return jnp.where(oscillates, weak, strong) / L
 
 
 def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -> np.ndarray:
@@ -183,11 +210,3 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     for name, value in given.items():
         require(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
     return A * mu * Q / (rho * R**2 * omega**3)
-
-
-def _moments(inertia) -> np.ndarray:
-    moments = np.asarray(inertia, dtype=float)
-    if moments.shape[-1:] != (3,):
-        raise InputError(f"inertia has shape (..., 3), not {moments.shape}")
-    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia are positive and finite, not {value}")
-    return moments

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
@@ -16,9 +17,14 @@ from ..dissipation.inner_product import KillingDissipation
 from ..functions.conditions import numbers, require
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
+from .inertia import checked_tensors, inverse_inertia
 
 PUBLISHED = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
 """Inertias of published examples, the first of them the paper's, though no body has them."""
+
+
+POSITIVE = "moments of inertia are positive and finite, not {value}"
+"""Message to those who give others."""
 
 
 class InertiaWarning(UserWarning):
@@ -37,10 +43,10 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
 
     Parameters
     ----------
-    inertia : three positive numbers
-        Principal moments of inertia (mass * length**2). Those of a body obey ``I_i <= I_j + I_k``, since each is a sum
-        of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
-        so(3)* they are as good as any, but no rigid body has them.
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments of inertia, or the tensor in body axes (mass * length**2). The moments of a body obey
+        ``I_i <= I_j + I_k``, since each is a sum of two of three moments of its masses. The default is the paper's
+        (Fig. 1), which does not: as equations on so(3)* they are as good as any, but no rigid body has them.
     rate : float, >= 0
         lambda in ``mu' = mu x Omega + lambda Omega x (mu x Omega)`` (time). 1 is the equation as printed in the paper,
         where 𝒦 is the dot product. It is ``KillingDissipation(rate / 2)``, since the Killing form of so(3) is -2 times
@@ -59,7 +65,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     """
     return LiePoissonSystem(
         mf.so(3),
-        energy=Quadratic(1.0 / checked_inertia(inertia)),
+        energy=Quadratic(inverse_inertia(checked_inertia(inertia))),
         entropy=Quadratic(np.ones(3)),
         dissipation=KillingDissipation(0.5 * checked_rate(rate)),
     )
@@ -70,14 +76,31 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
     The default inertias are those of a published check, which no body has: see :func:`rigid_body`.
     """
-    return LiePoissonSystem(mf.so(3), energy=Quadratic(1.0 / checked_inertia(inertia)), entropy=Quadratic(np.ones(3)))
+    energy = Quadratic(inverse_inertia(checked_inertia(inertia)))
+    return LiePoissonSystem(mf.so(3), energy=energy, entropy=Quadratic(np.ones(3)))
 
 
 def checked_inertia(inertia) -> np.ndarray | jax.Array:
-    checked = numbers(inertia, "inertia", (3,))
-    moments = checked if is_traced(inertia) else np.asarray(inertia, dtype=np.float64)
-    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia are positive and finite, not {value}")
-    if not isinstance(moments, jax.core.Tracer) and tuple(moments.tolist()) not in PUBLISHED:
+    """Return moments of inertia, shape (3,), or a tensor, shape (3, 3), with a warning where no body has them.
+
+    A tensor that is diagonal is returned as its moments.
+    """
+    checked = numbers(inertia, "inertia", (3,), (3, 3))
+    if is_traced(inertia):
+        if checked.ndim == 2:
+            require(checked, _is_positive_definite, "a tensor of inertia must be positive definite, got {value}")
+        else:
+            require(checked, _are_positive, POSITIVE)
+        return checked
+    array = np.asarray(inertia, dtype=np.float64)
+    if array.ndim == 2:
+        array = checked_tensors(array)
+        if not (array - np.diag(np.diag(array))).any():
+            array = np.diag(array).copy()
+    else:
+        require(array, _are_positive, POSITIVE)
+    moments = array if array.ndim == 1 else np.linalg.eigvalsh(array)
+    if tuple(moments.tolist()) not in PUBLISHED:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())
         if largest > others * (1 + 1e-12):
             warn(
@@ -85,4 +108,12 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
                 f"the sum of the others, {others:g}. The equations hold all the same",
                 InertiaWarning,
             )
-    return moments
+    return array
+
+
+def _are_positive(moments):
+    return (moments > 0.0) & (moments < np.inf)
+
+
+def _is_positive_definite(tensor):
+    return jnp.linalg.eigvalsh(tensor) > 0.0

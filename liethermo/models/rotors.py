@@ -19,6 +19,7 @@ from ..functions.conditions import numbers, require
 from ..functions.energy import Quadratic
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
+from .inertia import inverse_inertia, principal_moments
 from .parameters import positive
 from .rigid_body import checked_inertia
 
@@ -118,8 +119,8 @@ def damper_wheel(
 
     Parameters
     ----------
-    inertia : three positive numbers
-        Principal moments I of the whole, the wheel held fast (kg m**2).
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments I of the whole, or its tensor in body axes, the wheel held fast (kg m**2).
     axis : three numbers
         a, the direction of the axis of the wheel in body axes, of any length.
     wheel : float, > 0
@@ -203,8 +204,8 @@ def dual_spin(
 
     Parameters
     ----------
-    inertia : three positive numbers
-        Principal moments I of the whole in axes of the platform, the rotor held fast (kg m**2).
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments I of the whole, or its tensor, in axes of the platform, the rotor held fast (kg m**2).
     axis : three numbers
         a, the direction of the common axis in those axes, of any length.
     rotor : float, > 0
@@ -243,23 +244,26 @@ def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -
     inertia, capacity, temperature
         As the models have them.
     """
-    return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * max(inertia))) / capacity
+    greatest = float(np.max(principal_moments(inertia)))
+    return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 
 def _with_rotor(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
     """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
-    I, J = jnp.asarray(checked_inertia(inertia)), positive(rotor, "the moment of the rotor")
+    inverse, J = inverse_inertia(checked_inertia(inertia)), positive(rotor, "the moment of the rotor")
+    inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
     numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
     a = jnp.asarray(direction / np.linalg.norm(direction))
-    left = 1.0 - J * jnp.dot(a, a / I)
+    turned = inverse @ a
+    left = 1.0 - J * jnp.dot(a, turned)
     require(
         left, lambda v: v > 0.0, "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}"
     )
-    B = jnp.diag(1.0 / I) + J / left * jnp.outer(a / I, a / I)
-    Ba = a / I / left
+    B = inverse + J / left * jnp.outer(turned, turned)
+    Ba = turned / left
     A = jnp.block([[B, -Ba[:, None]], [-Ba[None], (1.0 / J + jnp.dot(a, Ba))[None, None]]])
     algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
     group = mf.SO(3) if attitude else None

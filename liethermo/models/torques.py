@@ -19,6 +19,7 @@ from manifolds._names import listing
 
 from ..errors import InputError
 from ..functions.conditions import numbers, require
+from .inertia import checked_tensors
 from .parameters import finite, positive
 
 __all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
@@ -88,6 +89,8 @@ class GravityGradient(Module):
 
     def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
         self.inertia = numbers(inertia, "inertia", (3,), (3, 3))
+        if self.inertia.ndim == 2 and not is_traced(inertia):
+            self.inertia = jnp.asarray(checked_tensors(self.inertia))
         self.mean_motion = positive(mean_motion, "mean_motion")
         self.towards, self.normal = _direction(towards, "towards"), _direction(normal, "normal")
         if not is_traced((self.towards, self.normal)):

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..functions.energy import Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
 from .free_motion import rate_of
+from .inertia import inverse_inertia
 from .rigid_body import checked_inertia
 
 
@@ -37,11 +38,14 @@ def tumbling_body(
 
     Parameters
     ----------
-    inertia : three positive numbers
-        Principal moments of inertia (kg m**2), of which none is more than the sum of the others.
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments of inertia, of which none is more than the sum of the others, or the tensor in body axes
+        (kg m**2).
     relaxation_time : float, > 0
-        In which small nutations fall by e (s), of a body with the angular momentum given beside it: see
-        :func:`liethermo.bodies.rate_of`.
+        Time (s) in which small nutations fall by e, at the angular momentum given beside it. If the three moments
+        differ, the nutation oscillates, and its amplitude falls by e. If the two greatest are equal, as those of a rod,
+        the tangent of the angle from the flat spin falls by e. :func:`liethermo.bodies.rate_of` says what holds for
+        nearly equal moments.
     momentum : float, > 0, or three numbers
         The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
         time, which falls as ``1 / |mu|**2``. What the body starts with is the state that a run is given.
@@ -79,7 +83,7 @@ def tumbling_body(
     friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _size(momentum))
     return LiePoissonSystem(
         mf.so(3),
-        energy=Quadratic(1.0 / moments),
+        energy=Quadratic(inverse_inertia(moments)),
         dissipation=DoubleBracket(friction),
         group=mf.SO(3) if attitude else None,
         baths=HeatBaths(capacity, temperature),

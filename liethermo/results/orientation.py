@@ -6,10 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from ..models.inertia import EQUAL_MOMENTS_RTOL
 from .evidence import Recorded
-
-EQUAL = 1e-9
-"""Difference of two moments of inertia, relative to them, up to which they count as equal."""
 
 
 def quaternions(solution: Recorded) -> np.ndarray:
@@ -176,7 +174,7 @@ def _frame(solution: Recorded, axis) -> np.ndarray:
                 "inertias that differ in an ensemble: give axis=, such as (0, 0, 1)"
             )
         moments, axes = np.linalg.eigh(inertia)
-        e = axes[:, 2 if moments[2] - moments[1] > EQUAL * moments[2] else 0]
+        e = axes[:, 2 if moments[2] - moments[1] > EQUAL_MOMENTS_RTOL * moments[2] else 0]
         e = np.sign(e[np.argmax(np.abs(e) > 1e-8)]) * e
     else:
         e = np.asarray(axis, dtype=float)

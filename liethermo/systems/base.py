@@ -112,25 +112,38 @@ class System(Kind):
             self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
             self.momentum_maps = {name: recognised(J, dim) for name, J in self.momentum_maps.items()}
         dissipation = total(dissipation)
-        for part in () if dissipation is None or self.entropy is not None else dissipation.terms:
-            if part.needs_entropy:
+        of_baths: tuple[Dissipation, ...] = ()
+        if dissipation is not None and self.entropy is None:
+            of_baths = tuple(part for part in dissipation.terms if part.needs_entropy)
+            dissipation = total([part for part in dissipation.terms if not part.needs_entropy] or None)
+        for part in of_baths:
+            if baths is None:
                 raise InputError(f"{type(part).__name__} drives the entropy up, so the system needs an entropy")
+            if not part.can_drive_baths:
+                raise InputError(
+                    f"{type(part).__name__} drives the entropy of the body up, which it needs beside the entropies of "
+                    "its baths: give entropy="
+                )
         self.dissipation = None
         if dissipation is not None:
             dissipation = on_sites(dissipation, self.shape)
-            dissipation = traced_energies(dissipation, dim, "a preserved function")
-            self.dissipation = self._traced_dissipation(dissipation.prepared(self))
+            self.dissipation = self._prepared_dissipation(dissipation)
         if baths is not None:
-            self._heat(baths)
+            self._heat(baths, of_baths)
         if self.preserved and not is_traced(self):
             self.preserved_as = self._preserved_names()
         if validate and not is_traced(self):
             self._validate()
 
-    def _heat(self, baths: HeatBaths) -> None:
-        """Put baths beside the body that this system has been so far."""
+    def _prepared_dissipation(self, dissipation: Dissipation) -> Dissipation:
+        dissipation = traced_energies(dissipation, self.dim, "a preserved function")
+        return self._traced_dissipation(dissipation.prepared(self))
+
+    def _heat(self, baths: HeatBaths, of_baths: tuple[Dissipation, ...] = ()) -> None:
+        """Put baths beside the body that this system has been so far; ``of_baths`` act on the states with baths."""
         body, n, m = copy(self), self.dim, baths.number
-        self.dissipation = heated(self.dissipation, body, m, baths.positive, self._of_body)
+        if self.dissipation is not None or not of_baths:
+            self.dissipation = heated(self.dissipation, body, m, baths.positive, self._of_body)
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m
@@ -140,6 +153,9 @@ class System(Kind):
         heat = EntropyOfBaths(m)
         self.entropy = heat if body.entropy is None else self._of_body(body.entropy) + heat
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
+        if of_baths:
+            parts = tuple(self._prepared_dissipation(part) for part in of_baths)
+            self.dissipation = total([part for part in (self.dissipation, *parts) if part is not None])
 
     def without_baths(self) -> System:
         if self.baths is None:

@@ -100,11 +100,11 @@ def check_system(
         for name, (axiom, note) in _AXIOMS.items()
         if name in measured
     ]
-    rows += [
-        _row(system, name, values[inside], name, _MOMENTUM_MAP if name.startswith("momentum map") else _OWN)
-        for name, values in measured.items()
-        if name not in _AXIOMS and name != "domain"
-    ]
+    for name, values in measured.items():
+        if name.startswith("momentum map"):
+            rows.append(_momentum_map_row(system, name, values[inside]))
+        elif name not in _AXIOMS and name != "domain":
+            rows.append(_row(system, name, values[inside], name, _OWN))
     if not inside.all():
         rows.append(CheckRow("domain", float((~inside).sum()), 0.0, None, "points outside the domain, left out"))
     return CheckReport(tuple(rows), int(inside.sum()))
@@ -150,6 +150,17 @@ def _row(system: Any, name: str, values: np.ndarray, axiom: str, note: str) -> C
         return CheckRow(f"{axiom} {system.production_name}", least, 0.0, None, note)
     passed = worst <= AXIOM_TOLERANCE
     return CheckRow(axiom, worst, AXIOM_TOLERANCE, passed, "" if passed else note)
+
+
+def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
+    """Return the row of a momentum map at the points inside its own domain, if there are any."""
+    is_defined = np.isfinite(values)
+    if not is_defined.any():
+        return CheckRow(name, float("nan"), AXIOM_TOLERANCE, False, "it is not finite at any of the points")
+    row = _row(system, name, values[is_defined], name, _MOMENTUM_MAP)
+    if is_defined.all() or not row.passed:
+        return row
+    return CheckRow(name, row.value, AXIOM_TOLERANCE, True, f"{int((~is_defined).sum())} points outside its domain")
 
 
 def _indefiniteness(K: np.ndarray) -> float:
@@ -207,7 +218,8 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
             found["second law"] = relative(wrong, size(dS) * speed)
     for name, J in system.momentum_maps.items():
         dJ = J.gradient(x)
-        found[f"momentum map {name}"] = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
+        drift = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
+        found[f"momentum map {name}"] = jnp.where(jnp.isfinite(J.value(x)), drift, jnp.nan)
     return found | system.own_residuals(x)
 
 

@@ -22,7 +22,7 @@ from ..tracing.interpret import at_points
 from ..tracing.traced import settled
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component
-from .ledger import ForcesAndHeat, WithLedger, field
+from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
 
 
 class EulerPoincareClosedSystem(WithLedger):
@@ -43,9 +43,11 @@ class EulerPoincareClosedSystem(WithLedger):
     algebra : manifolds.LieAlgebra
     lagrangian : function of (xi, S), xi of shape (dim,), to a scalar
         l, regular: ``l_xi xi`` has an inverse.
-    friction : function of (xi, S), or of (xi, S, t), to a covector, shape (dim,), optional
-        f, with ``f . xi <= 0``.
-    external : function likewise, or an array of shape (dim,); optional
+    friction : function of (xi, S), or of (xi, S, t), to a covector, shape (dim,); or a coefficient; optional
+        f, with ``f . xi <= 0``. A coefficient R means ``f = -R xi``, as of :class:`liethermo.SimpleClosedSystem`: a
+        number, an array of shape (dim,) for a diagonal matrix, or (dim, dim), whose symmetric part is positive
+        semidefinite.
+    external : function of the same arguments, or an array of shape (dim,); optional
         F, in the frame of the body.
     heat_power : function likewise to a scalar, or a number; optional
         P_H, the heat received per time (power).
@@ -84,7 +86,10 @@ class EulerPoincareClosedSystem(WithLedger):
         check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = settled(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         self.algebra, self.lagrangian = algebra, lagrangian
-        self.friction = None if friction is None else field(friction, ((n,), ()), (n,), "the friction", at)
+        if friction is None or callable(friction):
+            self.friction = None if friction is None else field(friction, ((n,), ()), (n,), "the friction", at)
+        else:
+            self.friction = linear_friction(friction, n, "a coefficient of friction")
         self.external = None if external is None else field(external, ((n,), ()), (n,), "the external force", at)
         self.heat_power = None if heat_power is None else field(heat_power, ((n,), ()), (), "the heat power", at)
         casimirs = {

@@ -10,13 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._module import Module
 from manifolds.matrices.linear import solve
 from manifolds.structures.poisson import Beside
 
 from ..dissipation.base import Law, SkewFriction
+from ..dissipation.checks import semidefinite
+from ..errors import InputError
 from ..functions.arguments import Constant, Steady, needed_arguments
 from ..functions.checks import check_shape
-from ..functions.conditions import numbers
+from ..functions.conditions import numbers, require
 from ..functions.energy import Energy, Quadratic
 from .base import System
 
@@ -118,6 +121,37 @@ class ForcesAndHeat(SkewFriction):
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
         v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
         return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
+
+
+# -- friction by a coefficient -----------------------------------------------------------------------------------------
+
+
+class LinearFriction(Module):
+    """The force ``-R v`` as a function of parts of a state that end with (v, S, t)."""
+
+    R: jax.Array
+
+    def __call__(self, *parts):
+        v = parts[-3]
+        return -(self.R @ v if self.R.ndim == 2 else self.R * v)
+
+
+def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
+    """Return the friction ``-R v`` of a coefficient R: a number, shape (n,) for a diagonal matrix, or (n, n).
+
+    Raises
+    ------
+    InputError
+        If R has another shape, or the force would inject energy.
+    """
+    R = numbers(coefficient, what)
+    R = jnp.full(n, R) if R.ndim == 0 else R
+    if R.shape not in ((n,), (n, n)):
+        raise InputError(f"{what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
+    if R.ndim == 2:
+        return LinearFriction(semidefinite(R, what, symmetric=False))
+    require(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, not {{value:g}}: it would inject energy")
+    return LinearFriction(R)
 
 
 # -- functions of a state and the time --------------------------------------------------------------------------------

@@ -15,15 +15,13 @@ import manifolds as mf
 from manifolds._module import Module
 from manifolds.structures.poisson import Beside
 
-from ..dissipation.checks import semidefinite
 from ..errors import InputError
 from ..functions.arguments import needed_arguments
-from ..functions.conditions import numbers, require
 from ..functions.energy import Energy
 from ..tracing.interpret import at_points
 from .evolution import configurations, entropy_component, in_one_array, states_on
 from .herglotz import OnVelocities
-from .ledger import ForcesAndHeat, WithLedger, field
+from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
 
 
 class SimpleClosedSystem(WithLedger, OnVelocities):
@@ -217,15 +215,6 @@ def _temperature(system: SimpleClosedSystem, x):
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-class _Linear(Module):
-    """``-R v``."""
-
-    R: jax.Array
-
-    def __call__(self, q, v, S, t):
-        return -(self.R @ v if self.R.ndim == 2 else self.R * v)
-
-
 def lagrangian_of(lagrangian, space: mf.Space | None = None):
     """A Lagrangian as a function of one array."""
     if callable(lagrangian) and not isinstance(lagrangian, Energy) and needed_arguments(lagrangian) == 4:
@@ -238,16 +227,7 @@ def lagrangian_of(lagrangian, space: mf.Space | None = None):
 def _force(friction, at: tuple[int, ...], what: str) -> Callable | None:
     if friction is None or callable(friction):
         return None if friction is None else _field(friction, at, at, what)
-    R, n = numbers(friction, f"a coefficient of {what}"), math.prod(at)
-    R = jnp.full(n, R) if R.ndim == 0 else R
-    if R.shape not in ((n,), (n, n)):
-        raise InputError(f"a coefficient of {what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
-    if R.ndim == 2:
-        return _Linear(semidefinite(R, f"the coefficient of {what}", symmetric=False))
-    require(
-        R.min(), lambda r: r >= 0.0, f"a coefficient of {what} must be >= 0, not {{value:g}}: it would inject energy"
-    )
-    return _Linear(R)
+    return linear_friction(friction, math.prod(at), f"a coefficient of {what}")
 
 
 class InOneRow(Module):

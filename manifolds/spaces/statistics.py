@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import is_traced
 from ..errors import DomainError, ParameterError
 from .base import Space
 
@@ -21,6 +22,9 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     less than ``pi / (4 sqrt(K))`` for sectional curvatures up to K > 0 [Karcher 1977]; of points further apart a point
     is found at which the mean square distance is stationary.
 
+    Under ``jax.jit``, ``vmap`` and derivatives the mean is NaN where these errors would be raised. Its first
+    derivatives are exact, by the implicit function theorem; second ones are not defined.
+
     Parameters
     ----------
     space : Space
@@ -35,6 +39,8 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     OffManifoldError, ParameterError
     """
     x, w = _sample(space, points, weights)
+    if is_traced(x, w):
+        return _traced_mean(space, x, w)
     try:
         mean = space.project(jnp.tensordot(w, x, axes=1))
     except DomainError:  # as of antipodal points
@@ -57,6 +63,8 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
 def dispersion(space: Space, points, weights=None, mean=None) -> jax.Array:
     """The mean square distance of points from their Fréchet mean, a scalar.
 
+    It can be traced, with first and second derivatives: see :func:`frechet_mean`.
+
     Parameters
     ----------
     space, points, weights
@@ -67,6 +75,44 @@ def dispersion(space: Space, points, weights=None, mean=None) -> jax.Array:
     x, w = _sample(space, points, weights)
     mean = frechet_mean(space, x, w) if mean is None else mean
     return jnp.dot(w, space.distance(mean, x) ** 2)
+
+
+def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
+    """The mean of points that are traced, or NaN where the iteration does not come to rest.
+
+    The iteration is the same, without derivatives. One step of Newton's method for ``sum_i w_i log(m, x_i) = 0`` in
+    coordinates around its end has the derivatives of the root.
+    """
+    points, weights = jax.lax.stop_gradient((x, w))
+
+    def shift(mean, x, w):
+        return jnp.tensordot(w, space.log(mean, x), axes=1)
+
+    def advance(state):
+        mean, _, best, stalled, count = state
+        step = shift(mean, points, weights)
+        size = space.norm(mean, step)
+        stalled = jnp.where(size < 0.5 * best, 0, stalled + 1)
+        return space.exp(mean, step), size, jnp.minimum(best, size), stalled, count + 1
+
+    def is_at_rest(state):
+        mean, size, _, stalled, _ = state
+        return (size == 0.0) | ((stalled > 2) & (size < 1e-12 * jnp.maximum(1.0, jnp.max(jnp.abs(mean)))))
+
+    first = space.project(jnp.tensordot(weights, points, axes=1))
+    first = jnp.where(jnp.isfinite(first).all(), first, points[0])
+    start = first, jnp.inf * jnp.ones(()), jnp.inf * jnp.ones(()), jnp.zeros((), int), jnp.zeros((), int)
+    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < LIMIT), advance, start)
+    mean = jnp.where(is_at_rest(end), end[0], jnp.nan)
+
+    def shift_at(c, x, w):
+        near = space.exp(mean, space.from_coordinates(mean, c))
+        return space.coordinates(near, shift(near, x, w))
+
+    origin = jnp.zeros(space.dim)
+    slope = jax.lax.stop_gradient(jax.jacfwd(shift_at)(origin, x, w))
+    correction = -jnp.linalg.solve(slope, shift_at(origin, x, w))
+    return space.exp(mean, space.from_coordinates(mean, correction - jax.lax.stop_gradient(correction)))
 
 
 def _sample(space: Space, points, weights) -> tuple[jax.Array, jax.Array]:
@@ -81,6 +127,6 @@ def _sample(space: Space, points, weights) -> tuple[jax.Array, jax.Array]:
     w = jnp.asarray(weights, dtype=jnp.float64)
     if w.shape != batch:
         raise ParameterError(f"one weight for each point, of shape {batch}, not {w.shape}")
-    if not bool((w >= 0.0).all() & (w.sum() > 0.0) & jnp.isfinite(w).all()):
+    if not is_traced(w) and not bool((w >= 0.0).all() & (w.sum() > 0.0) & jnp.isfinite(w).all()):
         raise ParameterError("weights are finite and not negative, with a positive sum")
     return x, w.ravel() / w.sum()

@@ -1,11 +1,17 @@
 """Closed forms of free bodies, and what is told of how a body is turned."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import liethermo as lt
+from liethermo.models.body_with_wheels import body_with_wheels_rest
+from liethermo.models.rotors import spin_temperature
 
 ASYMMETRIC = np.array([1.0, 2.0, 3.0])
 
@@ -132,3 +138,143 @@ def test_the_damping_time_of_a_solid_body():
         lt.bodies.damping_time(5e9, 100.0, 2500.0, 1e3, 0.0)
     rates = lt.bodies.rate_of(np.array([1.0, 2.0]), (1.0, 1.5, 2.0), 3.0)
     assert np.allclose(rates[0], 2 * rates[1])
+
+
+# -- relaxation times --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inertia", [(162.75, 162.75, 37.5), (37.5, 162.75, 162.75), (3.0, 0.5, 3.0)], ids=str)
+def test_a_rod_comes_to_its_flat_spin_in_the_relaxation_time(inertia):
+    """``tan theta = tan theta_0 exp(t / tau)`` from the long axis, at every angle; it was reached in tau / 2."""
+    inertia, tau, L = np.array(inertia), 7.0, 1.3
+    long_axis = np.argmin(inertia)
+    mu0 = L * np.roll([np.cos(0.1), np.sin(0.1), 0.0], long_axis)
+    rate = float(lt.bodies.rate_of(tau, inertia, L))
+    run = free(inertia, mu0, 6 * tau, tau * np.arange(7), rate)
+    tangent = np.linalg.norm(np.delete(run.y[:3], long_axis, axis=0), axis=0) / run.y[long_axis]
+    assert np.allclose(np.diff(np.log(tangent)), 1.0, rtol=0, atol=1e-9)
+    body = lt.models.tumbling_body(inertia, relaxation_time=tau, momentum=L, attitude=False)
+    assert float(body.dissipation.part.rate) == rate
+    angle = lt.bodies.nutation(lt.integrate(body, mu0, (0.0, tau), tau / 200, lt.MetriplecticRungeKutta(8)))
+    assert np.tan(angle[-1]) / np.tan(angle[0]) == pytest.approx(np.e, rel=1e-8)
+
+
+@pytest.mark.parametrize("middle", [162.75 * (1 - 1e-12), 162.7499, 162.7, 162.0, 155.0, 100.0, 37.5], ids=str)
+@pytest.mark.parametrize("tau", [1.0, 50.0, 5000.0])
+def test_the_relaxation_time_is_an_eigenvalue_of_the_linear_equations(middle, tau):
+    """The real part of the faster root is -1 / tau, whether the two roots oscillate or not."""
+    inertia, L = np.array([162.75, middle, 37.5]), 40.0
+    rate = float(lt.bodies.rate_of(tau, inertia, L))
+    d2, d3 = 1 / inertia[1:] - 1 / inertia[0]
+    linear = np.array([[-rate * L**2 * d2, -L * d3], [L * d2, -rate * L**2 * d3]])
+    assert np.linalg.eigvals(linear).real.min() * tau == pytest.approx(-1.0, rel=1e-5)  # equal to 1e-9 is equal
+
+
+def test_nearly_equal_moments_with_strong_friction_fall_to_their_plane_in_the_relaxation_time():
+    """The momentum comes to the plane of the two greatest moments in tau; within it the axis takes a longer time."""
+    inertia, tau, L = np.array([162.75, 162.7, 37.5]), 20.0, 40.0
+    rate = float(lt.bodies.rate_of(tau, inertia, L))
+    d2, d3 = 1 / inertia[1:] - 1 / inertia[0]
+    linear = np.array([[-rate * L**2 * d2, -L * d3], [L * d2, -rate * L**2 * d3]])
+    roots, modes = np.linalg.eig(linear)
+    fast = modes[:, np.argmin(roots)]  # -0.06 rad across the plane for each rad within it
+    mu0 = np.array([L, *(1e-4 * L * fast)])
+    run = free(inertia, mu0, 3 * tau, tau * np.arange(4), rate)
+    assert np.allclose(np.diff(np.log(np.abs(run.y[2]))), -1.0, rtol=0, atol=1e-4)
+    within_the_plane = free(inertia, L * np.array([np.cos(0.02), np.sin(0.02), 0.0]), rate / d2, [0, rate / d2], rate)
+    assert np.log(within_the_plane.y[1, 0] / within_the_plane.y[1, -1]) == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_rate_has_derivatives_and_is_continuous_at_a_rod():
+    rate = lambda inertia: lt.bodies.rate_of(5.0, inertia, 40.0)  # noqa: E731
+    for inertia in ([162.75, 162.75, 37.5], [162.75, 162.7, 37.5], [162.75, 100.0, 37.5], [162.75, 37.5, 37.5]):
+        assert np.isfinite(jax.grad(rate)(jnp.array(inertia))).all()
+    assert float(rate([162.75, 162.75 * (1 - 1e-8), 37.5])) == pytest.approx(float(rate([162.75, 162.75, 37.5])))
+    with pytest.raises(lt.InputError, match="three equal moments"):
+        rate(Rotation.random(rng=1).as_matrix() @ np.diag([2.0, 2.0, 2.0]) @ Rotation.random(rng=1).inv().as_matrix())
+
+
+# -- tensors of inertia ------------------------------------------------------------------------------------------------
+
+TURNED = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+TENSOR = TURNED @ np.diag([2.0, 2.5, 3.0]) @ TURNED.T
+
+
+def test_a_tensor_is_one_body():
+    """It was read as three bodies, and the answers looked plausible."""
+    mu = np.array([0.1, 0.2, 1.0])
+    one, other = lt.bodies.periods(TENSOR, TURNED @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
+    assert one.rotation.shape == ()
+    assert np.allclose([*one], [*other], rtol=1e-12)
+    by_energy = lt.bodies.periods(TENSOR, np.linalg.norm(mu), 0.5 * np.sum(mu**2 / [2.0, 2.5, 3.0]))
+    assert np.allclose([*by_energy], [*other], rtol=1e-12)
+    many = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
+    assert np.allclose(many.rotation[0], other.rotation, rtol=1e-12)
+    assert np.allclose(many.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
+    assert float(lt.bodies.rate_of(3.0, TENSOR, 1.0)) == pytest.approx(float(lt.bodies.rate_of(3.0, (2, 2.5, 3), 1.0)))
+    moments, axes = lt.bodies.principal_axes(TENSOR)
+    assert np.allclose(moments, [2.0, 2.5, 3.0], rtol=1e-14)
+    assert np.allclose(axes @ np.diag(moments) @ axes.T, TENSOR, rtol=0, atol=1e-14)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_three_bodies_are_three_bodies():
+    """Moments that happen to make a symmetric array, which is then no tensor of a rigid body."""
+    three = np.array([[2.0, 3.0, 4.0], [3.0, 4.0, 2.0], [4.0, 2.0, 3.0]])
+    found = lt.bodies.periods(three, 1.0, 0.5 / 2.5)
+    alone = [lt.bodies.periods(body, 1.0, 0.5 / 2.5).rotation for body in three]
+    assert np.array_equal(found.rotation, alone)
+    assert lt.bodies.rate_of(1.0, np.ones((3, 3)) * [1.0, 1.5, 2.0], 1.0).shape == (3,)
+    equal = [[3.0, 2.0, 2.0], [2.0, 3.0, 2.0], [2.0, 2.0, 3.0]]  # positive definite, and its rows are bodies
+    assert lt.bodies.rate_of(1.0, equal, 1.0).shape == (3,)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.integers(0, 2**16))
+def test_no_tensor_of_a_rigid_body_is_ever_three_bodies(masses, seed):
+    rotation = Rotation.random(rng=seed).as_matrix()
+    moments = np.sum(masses) - np.array(masses)  # of three masses on the axes
+    assert lt.bodies.rate_of(1.0, rotation @ np.diag(moments + 1e-3 * np.arange(3)) @ rotation.T, 1.0).shape == ()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda I: lt.bodies.rate_of(1.0, I([[9, 1, 1], [1, 2, 1], [1, 1, 3]]), 1.0), "one body at a time"),
+        (lambda I: lt.bodies.periods(I([[2, -3, 0], [-3, 2, 0], [0, 0, 2]]), 1.0, 1.0), "positive definite, got"),
+        (lambda I: lt.bodies.periods(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]]), 1.0, 1.0), "positive and finite"),
+        (lambda I: jax.jit(lambda i: lt.bodies.rate_of(1.0, i, 1.0))(I(TENSOR)), "use jax.vmap for many"),
+        (lambda I: lt.bodies.principal_axes(I([2.0, 2.5, 3.0])), r"has shape \(\.\.\., 3, 3\), not \(3,\)"),
+        (lambda I: lt.models.body_with_wheels(I(TENSOR)), "principal_axes"),
+        (lambda I: body_with_wheels_rest(1.0, 1.0, I(TENSOR)), "principal_axes"),
+        (lambda I: lt.models.rigid_body(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]])), "must be symmetric"),
+        (lambda I: lt.torques.GravityGradient(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]]), 1.0), "must be symmetric"),
+        (lambda I: lt.models.tumbling_body(I([[2, 3, 0], [3, 2, 0], [0, 0, 2]]), rate=0.1), "positive definite, got"),
+    ],
+)
+def test_arrays_that_are_no_inertia(call, message):
+    with pytest.raises(lt.InputError, match=message) as error:
+        call(lambda rows: np.array(rows, dtype=float))
+    assert "\n" not in str(error.value)
+
+
+def test_models_take_tensors():
+    """The same motion in other axes: rows of states are turned, energies are equal."""
+    moments, mu = np.array([2.0, 2.5, 3.0]), np.array([0.1, 0.2, 1.0])
+    axis = np.array([0.0, 1.0, 0.0])
+    for make, more in (
+        (lambda I, axis: lt.models.tumbling_body(I, relaxation_time=5.0, momentum=1.0), []),
+        (lambda I, axis: lt.models.rigid_body(I, 0.1), []),
+        (lambda I, axis: lt.models.free_rigid_body(I), []),
+        (lambda I, axis: lt.models.damper_wheel(I, axis), [0.1]),
+        (lambda I, axis: lt.models.dual_spin(I, axis, platform_rate=0.1, rotor_rate=0.2), [0.1]),
+    ):
+        one = lt.integrate(make(TENSOR, TURNED @ axis), [*(TURNED @ mu), *more], (0.0, 2.0), 0.1)
+        other = lt.integrate(make(moments, axis), [*mu, *more], (0.0, 2.0), 0.1)
+        assert np.allclose(one.x[:, :3] @ TURNED, other.x[:, :3], rtol=0, atol=1e-13)
+        assert np.allclose(one.energy, other.energy, rtol=1e-13)
+    assert spin_temperature(1.0, 2.0, TENSOR) == pytest.approx(spin_temperature(1.0, 2.0, moments), rel=1e-14)
+    diagonal = lt.models.free_rigid_body(np.diag(moments))
+    assert np.array_equal(diagonal.energy.A, 1.0 / moments)
+    gravity = lt.torques.GravityGradient(np.diag(moments), 1.0)
+    assert np.allclose(gravity(0.3, mu, TURNED), lt.torques.GravityGradient(moments, 1.0)(0.3, mu, TURNED), atol=1e-15)

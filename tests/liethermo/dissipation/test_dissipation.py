@@ -301,6 +301,36 @@ def test_a_friction_operator_is_not_repaired_unasked(K):
     assert "K grad H = 0, as given" in [row.axiom for row in report.rows if row.passed is False]
 
 
+def _drag_and_its_heat(x):
+    v = jnp.array([0.0, 1.0, -x[1] / jnp.exp(x[2])])  # orthogonal to grad (H + U) = (q, p, T)
+    return 0.3 * jnp.exp(x[2]) * jnp.outer(v, v)
+
+
+def test_a_friction_operator_drives_the_entropies_of_baths():
+    """It was refused, "the system needs an entropy", though that of the baths is one."""
+    oscillator, baths = lt.Quadratic(np.ones(2)), lt.HeatBaths(1.0, 1.0)
+    operator, drag = lt.FrictionOperator(_drag_and_its_heat), lt.Friction([0.0, 0.3])
+    system = lt.MetriplecticSystem(mf.Canonical(1), oscillator, dissipation=operator, baths=baths)
+    other = lt.MetriplecticSystem(mf.Canonical(1), oscillator, dissipation=drag, baths=baths)
+    x = np.random.default_rng(0).standard_normal((5, 3))
+    np.testing.assert_allclose(system.vector_field(x), other.vector_field(x), rtol=0, atol=1e-14)
+    assert system.check().passed
+    run = lt.integrate(system, [1.0, 0.7], (0.0, 5.0), 0.1)
+    assert run.audit().passed, f"\n{run.audit()}"
+    both = lt.MetriplecticSystem(mf.Canonical(1), oscillator, dissipation=[drag, operator], baths=baths)
+    np.testing.assert_allclose(
+        both.vector_field(x), other.vector_field(x) + system.vector_field(x) - _free(x), rtol=0, atol=1e-14
+    )
+    with pytest.raises(lt.InputError, match=r"\(3, 3\) matrix for a state of 3 components"):
+        lt.MetriplecticSystem(mf.Canonical(1), oscillator, dissipation=lt.FrictionOperator(np.eye(2)), baths=baths)
+    with pytest.raises(lt.InputError, match=r"beside the entropies of its baths: give entropy="):
+        lt.LiePoissonSystem(mf.so(3), TILTED, dissipation=lt.KillingDissipation(), baths=baths)
+
+
+def _free(x):
+    return np.stack([x[:, 1], -x[:, 0], 0.0 * x[:, 0]], axis=1)
+
+
 def test_a_friction_operator_that_is_to_be_projected():
     system = lt.LiePoissonSystem(mf.so(3), TILTED, lt.Quadratic(np.ones(3)), lt.FrictionOperator(np.eye(3), 0.3, True))
     assert system.check().passed

@@ -180,6 +180,27 @@ def test_su3_by_the_exponential():
     assert np.abs(g[-1] @ g[-1].conj().T - np.eye(3)).max() < 1e-13
 
 
+@pytest.mark.parametrize(
+    "R", [0.2, [0.2, 0.1, 0.3], [[0.2, 0.1, 0.0], [-0.1, 0.3, 0.0], [0.0, 0.0, 0.1]]], ids=["number", "array", "matrix"]
+)
+def test_a_number_for_the_friction_is_a_coefficient(R):
+    """As of a simple closed system: it was read as a constant force, and refused."""
+    matrix = np.diag(np.broadcast_to(R, 3)) if np.ndim(R) < 2 else np.array(R)
+    system = lt.EulerPoincareClosedSystem(mf.so(3), tangled, friction=R)
+    other = lt.EulerPoincareClosedSystem(mf.so(3), tangled, lambda xi, S: -matrix @ xi)
+    x = np.array([0.5, -0.3, 0.4, 0.1])
+    np.testing.assert_allclose(system.vector_field(x), other.vector_field(x), rtol=0, atol=1e-15)
+    driven = lt.EulerPoincareClosedSystem(mf.so(3), tangled, friction=R, heat_power=lambda xi, S, t: 0.1 * t)
+    np.testing.assert_allclose(driven.friction_force(x[:3], x[3], 2.0), -matrix @ x[:3], atol=1e-15)
+    run = lt.integrate(system, x, (0.0, 2.0), 0.05, METHOD)
+    by_function = lt.integrate(other, x, (0.0, 2.0), 0.05, METHOD)
+    np.testing.assert_allclose(run.x, by_function.x, atol=1e-13)
+    with pytest.raises(lt.InputError, match=r"must be >= 0, not -0\.1: it would inject energy"):
+        lt.EulerPoincareClosedSystem(mf.so(3), tangled, friction=-0.1)
+    with pytest.raises(lt.InputError, match=r"has shape \(\), \(3,\) or \(3, 3\), not \(2,\)"):
+        lt.EulerPoincareClosedSystem(mf.so(3), tangled, friction=[0.1, 0.2])
+
+
 @pytest.mark.slow
 def test_a_control_that_does_not_keep_the_spatial_momentum():
     """The same system by a metriplectic scheme, which knows no group: its |mu| drifts."""

@@ -119,6 +119,46 @@ def test_energies_are_the_sums_over_their_edges(name):
     assert not hessian[~pattern].any()
 
 
+D = 0.3
+IN_PLANE = [(0.0, D, 0.0), (-D, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    "vectors",
+    [IN_PLANE, [(0, D, 0), (-D, 0, 0)], tuple(IN_PLANE), [list(v) for v in IN_PLANE], [np.array(v) for v in IN_PLANE]],
+    ids=["tuples", "with integers", "tuple", "lists", "arrays"],
+)
+def test_a_vector_for_each_neighbour_is_no_list_of_edges(vectors):
+    """``[(0, D, 0), (-D, 0, 0)]`` was read as the edges (0, D) and (-D, 0)."""
+    energy = lt.models.spin_lattice(SITES, 0.0, dmi=vectors, baths=False).energy
+    given = {(1, 0): IN_PLANE[0], (0, 1): IN_PLANE[1]}
+
+    def written(s):
+        return sum(over_pairs(s, [o], (True, True), lambda site, a, b, v=v: turned(a, b, v)) for o, v in given.items())
+
+    assert float(energy.value(SPINS.ravel())) == pytest.approx(float(written(SPINS)), abs=1e-13)
+
+
+def test_a_list_of_integers_is_a_vector_for_the_neighbour():
+    """On a chain ``[(0, 1, 0)]`` is the vector of the pair ahead; an edge has a vector behind its two ends."""
+    chain = np.random.default_rng(3).standard_normal((5, 3))
+    energy = mag.dzyaloshinskii_moriya(5, [(0, 1, 0)])
+    assert float(energy.value(chain.ravel())) == pytest.approx(np.cross(chain, np.roll(chain, -1, axis=0))[:, 1].sum())
+    edge = mag.dzyaloshinskii_moriya(5, [(0, 1, (0, 1, 0))])
+    assert float(edge.value(chain.ravel())) == pytest.approx(np.cross(chain[0], chain[1])[1])
+
+
+def test_an_exchange_for_each_site_of_a_square_lattice_is_no_graph():
+    """An array of the shape (4, 4) of the sites was refused as a matrix that is not (16, 16)."""
+    J, s = RANDOM.standard_normal((4, 4)), RANDOM.standard_normal((4, 4, 3))
+    by_sites = sum(np.sum(J * np.sum(s * np.roll(s, -1, axis), axis=-1)) for axis in (0, 1))
+    assert float(mag.exchange((4, 4), J).value(s.ravel())) == pytest.approx(-by_sites)
+    values = mag.exchange(3, [(0.1, 0.2, 0.3)])  # of the pair ahead of each of three sites, not an edge from 0.1 to 0.2
+    assert float(values.value(s[0, :3].ravel())) == pytest.approx(
+        -np.sum(np.array([0.1, 0.2, 0.3]) * np.sum(s[0, :3] * np.roll(s[0, :3], -1, 0), axis=-1))
+    )
+
+
 def formula(x, sites, H_s, rate, ratio, capacity):
     """The motion written once more, in NumPy: one bath."""
     s, a = x[:-1].reshape(-1, 3), H_s(x[:-1]).reshape(-1, 3)

@@ -154,6 +154,24 @@ def test_canonical_structure():
     assert system.entropy_law is None
 
 
+def test_a_momentum_map_that_is_not_defined_everywhere():
+    """Points outside its domain are left out, as they are of an entropy; a wrong one fails all the same."""
+    oscillator = lambda x: 0.5 * (x[0] ** 2 + x[1] ** 2)  # noqa: E731
+    outside = lambda x: jnp.sqrt(x[0] ** 2 + x[1] ** 2 - 1.0)  # noqa: E731
+    system = lt.MetriplecticSystem(mf.Canonical(1), oscillator, momentum_maps={"outside": outside})
+    (row,) = (row for row in system.check().rows if row.name == "momentum map outside")
+    assert row.passed
+    assert "points outside its domain" in row.note
+    run = lt.integrate(system, [1.5, 0.5], (0.0, 10.0), 0.1)
+    assert run.audit().passed, f"\n{run.audit()}"
+    log = lambda x: jnp.log(x[0] ** 2 + x[1] ** 2 - 1.0)  # noqa: E731  (its derivative is defined everywhere)
+    assert lt.MetriplecticSystem(mf.Canonical(1), oscillator, momentum_maps={"log": log}).check().passed
+    with pytest.raises(lt.AxiomError, match="has to commute with H"):
+        lt.MetriplecticSystem(mf.Canonical(1), oscillator, momentum_maps={"q": lambda x: jnp.sqrt(x[0])})
+    with pytest.raises(lt.AxiomError, match="not finite at any of the points"):
+        lt.MetriplecticSystem(mf.Canonical(1), oscillator, momentum_maps={"none": lambda x: jnp.sqrt(-1.0 - x[0] ** 2)})
+
+
 def test_a_field_on_many_sites_makes_no_matrix():
     n = 100_000
     field = lt.MetriplecticSystem(mf.Canonical(n), lambda x: 0.5 * jnp.sum(x**2) + jnp.sum(x[:n] ** 4))

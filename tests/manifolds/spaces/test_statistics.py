@@ -1,5 +1,6 @@
 """Fréchet means and dispersions, against geomstats and what defines them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -54,6 +55,43 @@ def test_no_point_nearby_is_better(space):
     for direction in rng.standard_normal((5, space.dim)):
         other = space.exp(mean, space.from_coordinates(mean, 0.05 * direction / np.linalg.norm(direction)))
         assert mf.dispersion(space, points, weights, other) > least + 1e-4
+
+
+@pytest.mark.sampled("S^2")
+@pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
+def test_means_and_dispersions_can_be_traced(space):
+    """Under jit and vmap they are what they are without; derivatives agree with differences along geodesics."""
+    points, centre = cloud(space, 3, size=6), space.random(3)
+    weights = jnp.arange(1.0, 7.0)
+    mean = jax.jit(lambda x, w: mf.frechet_mean(space, x, w))(points, weights)
+    np.testing.assert_allclose(mean, mf.frechet_mean(space, points, weights), rtol=0, atol=3e-15)
+    least = jax.jit(lambda x, w: mf.dispersion(space, x, w))
+    assert float(least(points, weights)) == pytest.approx(float(mf.dispersion(space, points, weights)), rel=1e-14)
+    both = jax.vmap(lambda w: mf.dispersion(space, points, w))(jnp.stack([weights, jnp.ones(6)]))
+    np.testing.assert_allclose(both, [least(points, weights), mf.dispersion(space, points)], rtol=1e-14)
+
+    rng = np.random.default_rng(4)
+    turns = jnp.asarray(rng.standard_normal((6, space.dim)))
+    at = jax.vmap(lambda x, c, s: space.exp(x, space.from_coordinates(x, s * c)), (0, 0, None))
+    moved = lambda s: mf.dispersion(space, at(points, turns, s), weights)  # noqa: E731
+    h = 1e-3
+    below, here, above = (float(moved(s)) for s in (-h, 0.0, h))
+    first, second = jax.grad(moved)(0.0), jax.grad(jax.grad(moved))(0.0)
+    assert float(first) == pytest.approx((above - below) / (2 * h), rel=1e-4, abs=1e-6)
+    assert float(second) == pytest.approx((above - 2 * here + below) / h**2, rel=1e-4)
+    means = lambda s: mf.frechet_mean(space, at(points, turns, s), weights)  # noqa: E731
+    slope = jax.jvp(means, (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(slope, (means(h) - means(-h)) / (2 * h), rtol=1e-3, atol=1e-4)
+    far = jax.jit(lambda x: mf.dispersion(space, points, None, x))(centre)
+    assert float(far) == pytest.approx(float(mf.dispersion(space, points, None, centre)), rel=1e-14)
+
+
+def test_a_traced_mean_that_does_not_come_to_rest_is_nan():
+    """Antipodal points: an error where their values are known."""
+    pole = jnp.array([0.0, 0.0, 1.0])
+    assert np.isnan(jax.jit(lambda x: mf.frechet_mean(mf.Sphere(2), x))(jnp.stack([pole, -pole]))).all()
+    with pytest.raises(mf.ManifoldsError):
+        mf.frechet_mean(mf.Sphere(2), jnp.stack([pole, -pole]))
 
 
 @pytest.mark.slow

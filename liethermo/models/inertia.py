@@ -1,0 +1,155 @@
+"""Moments and tensors of inertia: which of the two an array holds, and the principal axes of a tensor."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import is_traced
+
+from ..errors import InputError
+from ..functions.conditions import numbers, require
+
+SYMMETRY_RTOL = 1e-9
+"""Largest asymmetry of a tensor of inertia, relative to its largest entry."""
+
+INEQUALITY_RTOL = 1e-9
+"""Relative excess of a moment of inertia over the sum of the other two that counts as rounding."""
+
+EQUAL_MOMENTS_RTOL = 1e-9
+"""Difference of two moments of inertia, relative to the greatest, up to which they count as equal."""
+
+
+class PrincipalAxes(NamedTuple):
+    """Principal moments of inertia and their axes.
+
+    Attributes
+    ----------
+    moments : ndarray, shape (..., 3)
+        Principal moments in ascending order (mass * length**2).
+    axes : ndarray, shape (..., 3, 3)
+        Unit vectors along the principal axes in body axes, as columns of a rotation: column i belongs to moment i, so
+        ``axes.T @ mu`` is a momentum in principal axes. Each has its first component that is not zero positive, but for
+        the last one, whose direction makes the frame right-handed.
+    """
+
+    moments: np.ndarray
+    axes: np.ndarray
+
+
+def principal_axes(inertia) -> PrincipalAxes:
+    """Return the principal moments of inertia and the principal axes of one tensor, or of many.
+
+    Parameters
+    ----------
+    inertia : array, shape (..., 3, 3) symmetric, positive definite
+        Tensors of inertia in body axes (mass * length**2).
+
+    Returns
+    -------
+    PrincipalAxes
+
+    Raises
+    ------
+    InputError
+        If an array is not a symmetric positive definite tensor.
+
+    Examples
+    --------
+    >>> moments, axes = lt.bodies.principal_axes([[2.0, 0.0, 0.0], [0.0, 2.5, 0.5], [0.0, 0.5, 2.5]])
+    >>> np.allclose(moments, [2.0, 2.0, 3.0]), np.allclose(np.abs(axes[:, 2]), [0.0, 0.5**0.5, 0.5**0.5])
+    (True, True)
+    """
+    tensors = np.asarray(numbers(inertia, "inertia"), dtype=np.float64)
+    if tensors.shape[-2:] != (3, 3):
+        raise InputError(f"a tensor of inertia has shape (..., 3, 3), not {tensors.shape}")
+    moments, axes = np.linalg.eigh(checked_tensors(tensors))
+    first = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
+    axes = axes * np.where(first < 0.0, -1.0, 1.0)
+    axes[..., 2] *= np.linalg.det(axes)[..., None]
+    return PrincipalAxes(moments, axes)
+
+
+def are_tensors(inertia) -> bool:
+    """Return whether an array of shape (..., 3) holds tensors of inertia, shape (..., 3, 3), rather than moments.
+
+    Symmetric positive definite blocks whose principal moments obey ``I_i <= I_j + I_k`` are tensors. Their rows are
+    then never the moments of three bodies. Proof: let the rows obey these inequalities. Then the trace is at most twice
+    the sum s of the three entries above the diagonal. The quotient ``v . I v / v . v`` at ``v = (1, 1, 1)`` is
+    ``(tr I + 2 s) / 3``, at least 2/3 of the trace. So the greatest principal moment exceeds the sum of the others.
+
+    Raises
+    ------
+    InputError
+        If neither reading is that of rigid bodies, or the values are not known because the array is traced.
+    """
+    if inertia.shape[-2:] != (3, 3):
+        return False
+    if is_traced(inertia):
+        raise InputError(
+            f"inertia of shape {inertia.shape} may hold tensors or moments, which cannot be decided from a traced "
+            "array: give the moments of one body, shape (3,), and use jax.vmap for many"
+        )
+    blocks = np.asarray(inertia, dtype=np.float64)
+    if not np.isfinite(blocks).all() or not is_symmetric(blocks):
+        return False
+    principal = np.linalg.eigvalsh(blocks)
+    is_positive_definite = bool((principal > 0.0).all())
+    if is_positive_definite and satisfies_inequalities(principal):
+        return True
+    if (blocks > 0.0).all() and (not is_positive_definite or satisfies_inequalities(blocks)):
+        return False
+    if is_positive_definite and (blocks > 0.0).all():
+        raise InputError(
+            f"inertia must be moments or tensors of rigid bodies, got the symmetric array {blocks.tolist()}, which is "
+            "neither: give principal moments, shape (3,), one body at a time"
+        )
+    return True
+
+
+def checked_tensors(tensors) -> np.ndarray:
+    """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric, or refuse them."""
+    blocks = np.asarray(tensors, dtype=np.float64)
+    if not np.isfinite(blocks).all():
+        raise InputError(f"a tensor of inertia must be finite, got {blocks.tolist()}")
+    if not is_symmetric(blocks):
+        raise InputError(f"a tensor of inertia must be symmetric, got {blocks.tolist()}")
+    blocks = 0.5 * (blocks + blocks.swapaxes(-1, -2))
+    least = float(np.linalg.eigvalsh(blocks).min())
+    if least <= 0.0:
+        raise InputError(f"a tensor of inertia must be positive definite, got the principal moment {least:g}")
+    return blocks
+
+
+def principal_moments(inertia) -> jax.Array:
+    """Return principal moments, shape (..., 3), of moments in any order or of tensors (then in ascending order)."""
+    array = numbers(inertia, "inertia")
+    if array.shape[-1:] != (3,):
+        raise InputError(f"inertia has shape (..., 3), or (..., 3, 3) of tensors, not {array.shape}")
+    moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array
+    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, not {value}")
+    return moments
+
+
+def inverse_inertia(inertia) -> jax.Array:
+    """Return the inverse of moments of inertia, shape (3,), or of a tensor, shape (3, 3)."""
+    inertia = jnp.asarray(inertia)
+    if inertia.ndim == 1:
+        return 1.0 / inertia
+    inverse = jnp.linalg.inv(inertia)
+    return 0.5 * (inverse + inverse.T)
+
+
+def is_symmetric(blocks: np.ndarray) -> bool:
+    """Return whether blocks of shape (..., 3, 3) are symmetric to rounding, each relative to its largest entry."""
+    asymmetry = np.abs(blocks - blocks.swapaxes(-1, -2)).max(axis=(-2, -1))
+    return bool((asymmetry <= SYMMETRY_RTOL * np.abs(blocks).max(axis=(-2, -1))).all())
+
+
+def satisfies_inequalities(moments: np.ndarray) -> bool:
+    """Return whether moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as those of every rigid body do."""
+    largest = moments.max(axis=-1)
+    return bool((largest <= (moments.sum(axis=-1) - largest) * (1.0 + INEQUALITY_RTOL)).all())
