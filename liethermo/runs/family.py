@@ -178,7 +178,9 @@ class Family:
             return change(form.rebuild(arrays[:-count]), *arrays[-count:])
 
         values = [*self.values, *(np.array([number]) for number in numbers)]
-        return Family(Form((form.key, change, count), (*form.shapes, *[()] * count), rebuild), values)
+        return Family(
+            Form((form.key, change, count), (*form.shapes, *[()] * count), rebuild), values, varying=self.varying
+        )
 
     # -- members --------------------------------------------------------------------------------------------------
 
