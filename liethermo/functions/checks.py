@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import converted
 from .energy import Energy, Function, Negative, Pullback, Sum, WithTime
@@ -57,6 +57,8 @@ def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> En
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         for term in energy.terms:
             term.check_places(dim, role)  # says which term, where the fault is in its coordinates
+        if isinstance(error, IndexOutOfRangeError):
+            raise error.of(f"{role}, a function of a state of shape ({dim},),") from None
         message = f"{type(error).__name__}: {error}".rstrip(".")
         raise FunctionError(
             f"{role} could not be evaluated on a state of shape ({dim},): {message}. "
@@ -107,6 +109,8 @@ def check_shape(
     """
     try:
         function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
+    except IndexOutOfRangeError as error:
+        raise error.of(f"{what}, at {at},") from None
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         raise FunctionError(f"{what} could not be evaluated at {at}: {type(error).__name__}: {error}") from error
     if found.shape not in shapes:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from manifolds._module import Module
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..systems import System
 from ..tracing.traced import settled
 
@@ -80,7 +80,10 @@ class Event:
             self.function: Any = Excess(jnp.asarray(until.tol), rate)
         elif callable(until):
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
-            self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+            try:
+                self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+            except IndexOutOfRangeError as error:
+                raise error.of(f"the event function, at a state of shape {seen.shape},") from None
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
         x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
