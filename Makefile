@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo test test-slow docs docs-check wheel bench lock format clean
+.PHONY: help .venv demo test test-slow fuzz docs docs-check wheel bench lock format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -20,6 +20,7 @@ help:
 	@echo "make demo       run a tumbling body with friction inside; results go to demo_output/"
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
 	@echo "make test-slow  the slow tests; with PART=3/8 the third of eight parts of them"
+	@echo "make fuzz       random functions by the compiler and by JAX, for a minute (SECONDS=600 for ten)"
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
@@ -67,6 +68,11 @@ test: .venv/test
 
 test-slow: .venv/test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow $(if $(PART),--part $(PART))
+
+SECONDS ?= 60
+
+fuzz: .venv/test
+	$(BIN)/python -m tests.fuzz --seconds $(SECONDS)
 
 docs: .venv/docs
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html

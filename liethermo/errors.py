@@ -15,6 +15,31 @@ class FunctionError(LiethermoError, TypeError):
     """A user's function that does not return what its role asks for."""
 
 
+class IndexOutOfRangeError(FunctionError, IndexError):
+    """A function with a constant index that an array does not have.
+
+    Attributes
+    ----------
+    index, size : int
+        The index, and how many entries the axis has.
+    where : str
+        The line of the user's code, as far as JAX knows.
+    """
+
+    def __init__(self, index: int, size: int, where: str, function: str = "a function"):
+        self.index, self.size, self.where = index, size, where
+        last = f"counts from 0, so the last index is {size - 1}" if size else "finds no entry in it"
+        super().__init__(
+            f"{function} has the index {index} of an axis with {size} entries, which is out of range ({where}). "
+            f"Python {last}. JAX would take another entry without a word; where that is meant, write "
+            f'x.at[{index}].get(mode="clip")'
+        )
+
+    def of(self, function: str) -> IndexOutOfRangeError:
+        """Return the same error, saying which function has the index."""
+        return type(self)(self.index, self.size, self.where, function)
+
+
 class AxiomError(LiethermoError, ValueError):
     """A system that is not metriplectic: some axiom fails at a point.
 

@@ -15,6 +15,7 @@ from manifolds.matrices.stumpff import hyperbolic_stumpff
 from ..errors import FunctionError, InputError
 from ..functions.arguments import needed_arguments
 from ..functions.conditions import numbers
+from ..tracing.index_check import result_shape
 from .base import Dissipation
 from .checks import zero_state
 from .factor import Factor
@@ -78,7 +79,7 @@ class DissipationPotential(Dissipation):
 
     def prepared(self, system):
         found = eqx.tree_at(lambda d: d.of, self, self.of.prepared(system))
-        shape = jax.eval_shape(
+        shape = result_shape(
             lambda x: found.psi_of(x)(jnp.zeros(found._factor_at(system, x).size)), zero_state(system.dim)
         )
         if shape.shape != ():

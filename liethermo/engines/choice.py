@@ -58,8 +58,8 @@ class CompiledEngineWarning(UserWarning):
 class Chosen:
     """The engine of a run, an :class:`Engine` itself: chosen when the run begins.
 
-    Where "auto" has taken the compiled engine and it meets what it cannot unroll, at the start or where a step first
-    needs Newton's method, the array engine goes on from the last good state, and says so.
+    With "auto", the array engine takes over where the compiled one meets what it cannot unroll, or fails: at the start,
+    or where a step first needs Newton's method. It goes on from the last good state, and says so.
 
     Parameters
     ----------

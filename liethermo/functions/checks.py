@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import converted
@@ -61,6 +61,8 @@ def check_scalar(energy: Energy, dim: int, role: str, timed: bool = False) -> En
     except TRACE_ERRORS as error:
         for term in energy.terms:
             term.check_places(dim, role)  # says which term, where the fault is in its coordinates
+        if isinstance(error, IndexOutOfRangeError):
+            raise error.of(f"{role}, a function of a state of shape ({dim},),") from None
         cure = "It must be written with jax.numpy and accept one array"
         message = explain(f"{role} could not be evaluated on a state of shape ({dim},)", error, cure)
         raise FunctionError(message) from error
@@ -109,6 +111,8 @@ def check_shape(
     """
     try:
         function, found = converted(function, lambda function, *a: jnp.asarray(function(*a)), *arguments)
+    except IndexOutOfRangeError as error:
+        raise error.of(f"{what}, at {at},") from None
     except TRACE_ERRORS as error:
         raise FunctionError(explain(f"{what} could not be evaluated at {at}", error)) from error
     if found.shape not in shapes:

@@ -12,10 +12,11 @@ import numpy as np
 
 import manifolds as mf
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.arguments import needed_arguments
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
+from ..tracing.index_check import result_shape
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from .quickly import quickly
 
@@ -107,7 +108,9 @@ def observation(system: System, observed: Sequence[int] | None, observe: Callabl
         raise InputError("observe is a function of the attitude: give the system a group, such as group=mf.SO(3)")
     parts = [jnp.zeros(system.dim)] if group is None else [jnp.zeros(system.dim), group.identity]
     try:
-        found = jax.eval_shape(lambda *parts: jnp.asarray(observe(*parts)), *parts)
+        found = result_shape(lambda *parts: jnp.asarray(observe(*parts)), *parts)
+    except IndexOutOfRangeError as error:
+        raise error.of(f"observe, at a state of shape ({system.dim},),") from None
     except TRACE_ERRORS as error:
         what = f"observe could not be evaluated on a state of shape ({system.dim},)"
         raise FunctionError(explain(what, error)) from error

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from manifolds._module import Module
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..systems import System
 from ..tracing.trace_errors import TRACE_ERRORS, explain
 from ..tracing.traced import settled
@@ -83,6 +83,8 @@ class Event:
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             try:
                 self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+            except IndexOutOfRangeError as error:
+                raise error.of(f"the event function, at a state of shape {seen.shape},") from None
             except TRACE_ERRORS as error:
                 what = f"the event function could not be evaluated on a state of shape {seen.shape}"
                 raise FunctionError(explain(what, error)) from error

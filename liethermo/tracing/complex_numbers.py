@@ -67,7 +67,7 @@ class ComplexBuilder:
         return Pair(a.re, self.real.neg(a.im))
 
     def div(self, a, b):
-        """With the divisor scaled, so that its square neither overflows nor vanishes."""
+        """With the divisor scaled, so that its square neither overflows nor vanishes; by infinity it is zero."""
         a, b, r = pair(a), pair(b), self.real
         if type(b.im) is not str and b.im == 0:
             return Pair(r.div(a.re, b.re), r.div(a.im, b.re))
@@ -75,7 +75,9 @@ class ComplexBuilder:
         c, d = r.div(b.re, size), r.div(b.im, size)
         square = r.mul(r.add(r.mul(c, c), r.mul(d, d)), size)
         over = self.mul(a, Pair(c, r.neg(d)))
-        return Pair(r.div(over.re, square), r.div(over.im, square))
+        infinite = r.op("eq", size, math.inf)
+        zero = r.add(r.sub(a.re, a.re), r.sub(a.im, a.im))  # or NaN
+        return Pair(*(r.select(infinite, zero, r.div(part, square)) for part in (over.re, over.im)))
 
     def integer_pow(self, a, n: int, one=1.0):
         if n < 0:
@@ -137,8 +139,11 @@ class ComplexBuilder:
 
     def _log1p(self, a):
         r = self.real
-        square = r.add(r.mul(a.re, r.add(2.0, a.re)), r.mul(a.im, a.im))
-        return Pair(r.mul(0.5, r.op("log1p", square)), r.op("atan2", a.im, r.add(1.0, a.re)))
+        square = r.add(r.mul(a.re, r.add(2.0, a.re)), r.mul(a.im, a.im))  # |1 + a|^2 - 1, which may overflow
+        size = self.size(Pair(r.add(1.0, a.re), a.im))
+        near = r.mul(0.5, r.op("log1p", square))
+        real = r.select(r.op("gt", size, 4.0), r.op("log", size), near)
+        return Pair(real, r.op("atan2", a.im, r.add(1.0, a.re)))
 
     def _expm1(self, a):
         r = self.real

@@ -79,7 +79,10 @@ def evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray]
 
     def interpreted(points):
         portions = np.array_split(points, max(1, -(-len(points) // PORTION)))
-        found = [np.concatenate(parts) for parts in zip(*map(evaluated, portions), strict=True)]
+        try:
+            found = [np.concatenate(parts) for parts in zip(*map(evaluated, portions), strict=True)]
+        except Exception:  # a fault of the interpreter: XLA is slower, and right
+            return _by_compiler(function, model, points)
         return jax.tree_util.tree_unflatten(structure, found)
 
     return interpreted

@@ -325,33 +325,80 @@ def convolution(b, eqn, x, kernel):
 
 # -- special functions ------------------------------------------------------------------------------------------------
 
-BERNOULLI = [1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6, -3617 / 510, 43867 / 798, -174611 / 330]
+EULER_MACLAURIN = [12.0, -720.0, 30240.0, -1209600.0, 47900160.0, -1.8924375803183791606e9, 7.47242496e10]
+EULER_MACLAURIN += [-2.950130727918164224e12, 1.1646782814350067249e14, -4.5979787224074726105e15]
+EULER_MACLAURIN += [1.8152105401943546773e17, -7.1661652561756670113e18]
+"""Divisors ``(2 j)! / B_2j`` of the terms j = 1, 2, ... of the asymptotic series of ``zeta``."""
+
 SHIFT = 10
 """Terms that are summed before the asymptotic series of ``zeta`` begins."""
 
 
 def zeta(b, s: Scalar, q: Scalar) -> Scalar:
-    """Hurwitz's ``sum_k (q + k)^-s`` for s > 1 and q > 0, by Euler and Maclaurin's formula."""
+    """Return Hurwitz's ``sum_k (q + k)^-s`` by the formula of Euler and Maclaurin, term by term as XLA computes it.
+
+    For q < 0 and an integer s too, but the series is of little use where ``q + 10`` is not well above zero.
+    """
     minus = b.neg(s)
     total = reduce(b.add, (b.pow(b.add(q, float(k)), minus) for k in range(SHIFT)))
     at = b.add(q, float(SHIFT))
     power = b.pow(at, minus)
-    total = b.add(total, b.add(b.div(b.mul(at, power), b.sub(s, 1.0)), b.mul(0.5, power)))
-    factor, square = b.div(b.mul(s, power), at), b.mul(at, at)
-    for j, number in enumerate(BERNOULLI, 1):
-        total = b.add(total, b.mul(number / math.factorial(2 * j), factor))
-        rising = b.mul(b.add(s, 2.0 * j - 1.0), b.add(s, 2.0 * j))
-        factor = b.div(b.mul(factor, rising), square)
-    defined = b.op("and", b.op("gt", s, 1.0), b.op("gt", q, 0.0))
-    return b.select(defined, total, math.nan)
+    total = b.add(total, b.div(b.mul(power, at), b.sub(s, 1.0)))
+    inverse_square, series = b.div(1.0, b.mul(at, at)), 0.0
+    for j in reversed(range(1, len(EULER_MACLAURIN))):
+        rising = b.mul(b.add(s, 2.0 * j), b.add(s, 2.0 * j - 1.0))
+        series = b.mul(rising, b.mul(inverse_square, b.add(series, 1.0 / EULER_MACLAURIN[j])))
+    series = b.add(series, 1.0 / EULER_MACLAURIN[0])
+    total = b.add(total, b.mul(power, b.add(b.mul(b.div(s, at), series), 0.5)))
+
+    def whole(a: Scalar) -> Scalar:
+        return b.op("eq", a, b.op("floor", a))
+
+    below = b.op("le", q, 0.0)
+    is_even = b.op("and", whole(s), b.op("eq", b.op("rem", s, 2.0), 0.0))
+    undefined = b.op("or", b.op("lt", s, 1.0), b.op("and", below, b.op("not", whole(s))))
+    at_pole = b.op("and", below, whole(q))
+    total = b.select(at_pole, b.select(is_even, math.inf, math.nan), b.select(undefined, math.nan, total))
+    return b.select(b.op("eq", s, 1.0), math.inf, total)
+
+
+def digamma(b, x: Scalar) -> Scalar:
+    """Return the logarithmic derivative of the gamma function: NaN at zero, as XLA has it."""
+    return b.select(b.op("eq", x, 0.0), math.nan, b.op("digamma", x))
+
+
+def lgamma(b, x: Scalar) -> Scalar:
+    """Return ``log(abs(gamma(x)))``: infinity at minus infinity, as XLA has it."""
+    return b.select(b.op("eq", x, -math.inf), math.inf, b.op("lgamma", x))
+
+
+def incomplete_gamma(op: str):
+    """Return the rule of ``igamma`` or ``igammac``, which JAX leaves undefined at some limits.
+
+    So it is for a = 0 and x < 1 (``igamma`` alone), and for an infinite a and a finite x >= 1.
+    """
+    limit = 1.0 if op == "igamma" else 0.0
+
+    def of_one(b, a: Scalar, x: Scalar) -> Scalar:
+        found = b.op(op, a, x)
+        if op == "igamma":
+            found = b.select(b.op("and", b.op("eq", a, 0.0), b.op("lt", x, 1.0)), math.nan, found)
+        infinite = b.op("and", b.op("eq", a, math.inf), b.op("ge", x, 1.0))
+        return b.select(infinite, b.select(b.op("eq", x, math.inf), limit, math.nan), found)
+
+    return lambda b, eqn, a, x: elementwise(lambda u, v: of_one(b, u, v), a, x)
 
 
 def polygamma(b, eqn, order, x):
-    """The derivatives of digamma, of positive arguments."""
+    """The derivatives of digamma."""
 
     def of_one(m, v):
-        if type(m) is str or m != int(m) or m < 1:
-            raise NotImplementedError("of an order that is not a positive integer known at compile time")
+        if type(m) is str:
+            raise NotImplementedError("of an order that is not known at compile time")
+        if not math.isfinite(m) or m != int(m) or m < 0:
+            return math.nan
+        if m == 0:
+            return digamma(b, v)
         sign = 1.0 if int(m) % 2 else -1.0
         return b.mul(sign * math.factorial(int(m)), zeta(b, m + 1.0, v))
 

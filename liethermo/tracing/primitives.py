@@ -35,6 +35,21 @@ def _numeric(method: str) -> Rule:
     return rule
 
 
+def _extreme(method: str, of_truths: str) -> Rule:
+    """The larger, or the smaller, of two numbers, or of two truth values."""
+
+    def rule(b, eqn, x, y):
+        if _dtype(eqn).kind == "b":
+            return elementwise(lambda u, v: b.op(of_truths, u, v), x, y)
+        return elementwise(getattr(b, method), x, y)
+
+    return rule
+
+
+def _power(b, eqn, x, y):
+    return elementwise(b.pow, x, converted(b, y, _dtype(eqn, 1), _dtype(eqn)))
+
+
 def _plain(op: str) -> Rule:
     """An operation that has nothing to simplify."""
     return lambda b, eqn, *arrays: elementwise(lambda *args: b.op(op, *args), *arrays)
@@ -97,18 +112,32 @@ def _select(b, eqn, which, *cases):
 
 
 def _convert(b, eqn, x):
-    conversion = _dtype(eqn).kind + np.dtype(eqn.params["new_dtype"]).kind
-    conversion = conversion.replace("u", "i")
+    return converted(b, x, _dtype(eqn), np.dtype(eqn.params["new_dtype"]))
+
+
+def converted(b, x: np.ndarray, source: np.dtype, target: np.dtype) -> np.ndarray:
+    """Return an array of scalars of one type as those of another, integers not yet wrapped around.
+
+    A number becomes the nearest integer of the type that lies towards zero, and NaN becomes 0, as XLA has it.
+    """
+    conversion = (source.kind + target.kind).replace("u", "i")
     if conversion in ("ff", "ii", "bb", "cc"):
         return x
-    if conversion == "cf":
-        return elementwise(lambda a: pair(a).re, x)
-    if conversion[1] == "c":
-        return elementwise(lambda a: Pair(a if conversion[0] == "f" else b.real.op("float", a), 0.0), x)
-    if conversion in ("fb", "ib"):
+    if source.kind == "c":
+        if target.kind == "b":
+            return elementwise(lambda a: b.op("ne", a, Pair(0.0, 0.0)), x)
+        real = elementwise(lambda a: pair(a).re, x)
+        return real if target.kind == "f" else converted(b.real, real, np.dtype(np.float64), target)
+    if target.kind == "c":
+        return elementwise(lambda a: Pair(a if source.kind == "f" else b.real.op("float", a), 0.0), x)
+    if target.kind == "b":
         return elementwise(lambda a: b.op("ne", a, 0), x)
-    op = {"if": "float", "bf": "float", "bi": "int", "fi": "truncate"}[conversion]
-    return elementwise(lambda a: b.op(op, a), x)
+    if conversion == "fi":
+        limits, whole = np.iinfo(target), elementwise(lambda a: b.op("truncate", a), x)
+        if target == np.int64:
+            return whole
+        return elementwise(lambda a: b.min(b.max(a, int(limits.min)), int(limits.max)), whole)
+    return elementwise(lambda a: b.op("float" if target.kind == "f" else "int", a), x)
 
 
 def _reduction(combine: Callable[..., Scalar], start: Scalar | None = None) -> Rule:
@@ -195,11 +224,23 @@ def _dot_general(b, eqn, x, y):
     batch, size = math.prod(x.shape[i] for i in batch_x), math.prod(x.shape[i] for i in sum_x)
     left = x.transpose(*batch_x, *rest_x, *sum_x).reshape(batch, math.prod(x.shape[i] for i in rest_x), size)
     right = y.transpose(*batch_y, *rest_y, *sum_y).reshape(batch, math.prod(y.shape[i] for i in rest_y), size)
-    zero, result = constant(0, _dtype(eqn)).item(), []
+    dtype = eqn.outvars[0].aval.dtype
+    left, right = (converted(b, side, _dtype(eqn, i), dtype) for i, side in enumerate((left, right)))
+    if dtype.kind == "b":
+        both = _op("and")
+        return array(
+            [
+                reduce(lambda u, v: b.op("or", u, v), map(lambda u, v: both(b, u, v), row, column), False)
+                for rows, columns in zip(left.tolist(), right.tolist(), strict=True)
+                for row, column in itertools.product(rows, columns)
+            ],
+            shape,
+        )
+    zero, result = constant(0, dtype).item(), []
     for rows, columns in zip(left, right, strict=True):
         # as structure constants are
         sparse = [[(k, a) for k, a in enumerate(row) if not _zero(a)] for row in rows.tolist()]
-        if eqn.outvars[0].aval.dtype.kind in "fc" and _is_loop(b, rows, columns):
+        if dtype.kind in "fc" and _is_loop(b, rows, columns):
             result += algebra.product(b, rows, columns.T).ravel().tolist()
             continue
         for entries, column in itertools.product(sparse, columns.tolist()):
@@ -207,13 +248,13 @@ def _dot_general(b, eqn, x, y):
     return array(result, shape)
 
 
-def _broadcast(x, params):
+def broadcast(x, params):
     inner = np.ones(len(params["shape"]), int)
     inner[list(params["broadcast_dimensions"])] = x.shape
     return np.broadcast_to(x.reshape(inner), params["shape"])
 
 
-def _reshape(x, params):
+def reshape(x, params):
     return (x if params["dimensions"] is None else x.transpose(params["dimensions"])).reshape(params["new_sizes"])
 
 
@@ -265,10 +306,12 @@ def _split(x, params):
 
 
 def _gather(b, eqn, x, indices):
-    filling = eqn.params["fill_value"]
+    dtype, filling = _dtype(eqn), eqn.params["fill_value"]
     if filling is None:
-        filling = {"f": math.nan, "b": True, "c": Pair(math.nan, 0.0)}.get(_dtype(eqn).kind, np.iinfo(np.int64).min)
-    return indexing.gathered(b, eqn, x, indices, filling)
+        filling = {"f": math.nan, "b": True, "c": math.nan}.get(dtype.kind)
+    if filling is None:
+        filling = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+    return indexing.gathered(b, eqn, x, indices, constant(filling, dtype).item())
 
 
 def _scatter(combine: Callable[..., Scalar]) -> Rule:
@@ -279,7 +322,10 @@ def _scatter(combine: Callable[..., Scalar]) -> Rule:
 
 
 RULES: dict[str, Rule] = {
-    **{name: _numeric(name) for name in ("add", "sub", "mul", "neg", "pow", "max", "min", "logistic")},
+    **{name: _numeric(name) for name in ("add", "sub", "mul", "neg", "logistic")},
+    "max": _extreme("max", "or"),
+    "min": _extreme("min", "and"),
+    "pow": _power,
     "add_any": _numeric("add"),
     "div": _divide,
     "rem": _remainder,
@@ -306,11 +352,11 @@ RULES: dict[str, Rule] = {
     "cummax": _cumulative(_method("max")),
     "cummin": _cumulative(_method("min")),
     "dot_general": _dot_general,
-    "broadcast_in_dim": _move(_broadcast),
-    "reshape": _move(_reshape),
+    "broadcast_in_dim": _move(broadcast),
+    "reshape": _move(reshape),
     **{name: lambda b, eqn, x: x.reshape(eqn.outvars[0].aval.shape) for name in ("squeeze", "expand_dims")},
     "transpose": _move(lambda x, params: x.transpose(params["permutation"])),
-    "rev": _move(lambda x, params: np.flip(x, params["dimensions"])),
+    "rev": _move(lambda x, params: np.flip(x, params["dimensions"]) if params["dimensions"] else x),
     "slice": _move(_slice),
     "split": _move(_split),
     "concatenate": lambda b, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
@@ -324,7 +370,6 @@ RULES: dict[str, Rule] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
-    "scatter": _scatter(lambda b, old, new: new),
     "scatter-add": _scatter(_method("add")),
     "scatter-sub": _scatter(_method("sub")),
     "scatter-mul": _scatter(_method("mul")),
@@ -348,6 +393,10 @@ RULES: dict[str, Rule] = {
     "conv_general_dilated": algebra.convolution,
     "zeta": lambda b, eqn, s, q: elementwise(lambda u, v: algebra.zeta(b, u, v), s, q),
     "polygamma": algebra.polygamma,
+    "digamma": lambda b, eqn, x: elementwise(lambda a: algebra.digamma(b, a), x),
+    "lgamma": lambda b, eqn, x: elementwise(lambda a: algebra.lgamma(b, a), x),
+    "igamma": algebra.incomplete_gamma("igamma"),
+    "igammac": algebra.incomplete_gamma("igammac"),
 }
 """How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.tracing.scalarize`."""
 

@@ -9,9 +9,10 @@ is none.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
+from . import indexing
 from .builder import Around, Builder, LimitExceededError, Scalar, array, constant, elementwise
 from .complex_numbers import ComplexBuilder, arranged, flat, kinds
 from .once import LONG, has_products, written_once
@@ -57,6 +59,38 @@ class UnsupportedPrimitive(LiethermoError):
         super().__init__(f"{refusal} ({where})")
 
 
+class CompilerFault(UnsupportedPrimitive):
+    """An unexpected exception inside the compiled engine: a fault of this library.
+
+    It is raised in place of the exception, so that the array engine takes over where it may.
+
+    Attributes
+    ----------
+    error : Exception
+    """
+
+    def __init__(self, error: Exception, primitive: str = "", where: str = UNKNOWN):
+        super().__init__(primitive, where)
+        self.error = error
+        place = f" on the JAX primitive {primitive!r} ({where})" if primitive else ""
+        self.args = (
+            f"the compiled engine failed{place}: {type(error).__name__}: {str(error).strip()}. "
+            "This is a fault of liethermo, please report it",
+        )
+
+
+@contextlib.contextmanager
+def faults_reported() -> Iterator[None]:
+    """Raise whatever exception the compiler did not expect as a :class:`CompilerFault`."""
+    try:
+        yield
+    except LiethermoError:
+        raise
+    except Exception as error:
+        raise CompilerFault(error) from error
+
+
+@faults_reported()
 def scalarize(closed: ClosedJaxpr, known: Sequence | None = None, limit: int = LIMIT) -> Program:
     """Unroll a closed jaxpr, as ``jax.make_jaxpr`` gives it, into scalar instructions.
 
@@ -124,10 +158,16 @@ def _unroll(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[
         except UnsupportedPrimitive as inside:
             if inside.where != UNKNOWN:
                 raise
+            if isinstance(inside, CompilerFault):
+                raise CompilerFault(inside.error, inside.primitive, origin(eqn)) from inside.error
             raise UnsupportedPrimitive(inside.primitive, origin(eqn), inside.reason, inside.too_large) from None
         except LimitExceededError:
             reason = f"within the size limit: the program exceeds {b.limit} scalar instructions"
             raise UnsupportedPrimitive(name, origin(eqn), reason, too_large=True) from None
+        except LiethermoError:
+            raise
+        except Exception as error:
+            raise CompilerFault(error, name, origin(eqn)) from error
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
@@ -160,13 +200,15 @@ def _as_kept(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
     name, kept = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
         dtype = var.aval.dtype
+        if not isinstance(result, np.ndarray):  # NumPy makes of an array without axes its entry
+            result = array([result], ())
         assert result.shape == var.aval.shape, f"{name}: {result.shape} is not {var.aval.shape}"
         if name not in MOVES and name not in CONTROL:
             if dtype == np.float32:
                 result = elementwise(lambda a: b.op("single", a), result)
             elif dtype.kind in "iu" and dtype != np.int64 and (name in WRAPPING or name == "convert_element_type"):
                 bits, signed = 8 * dtype.itemsize, dtype.kind == "i"
-                if name in WRAPPING or eqn.invars[0].aval.dtype.kind in "fiu":
+                if name in WRAPPING or eqn.invars[0].aval.dtype.kind in "iu":
                     result = elementwise(lambda a, n=bits, s=signed: b.op("wrap", a, n, s), result)
             if dtype.kind == "i":
                 limits, numbers = np.iinfo(dtype), [a for a in result.flat if type(a) is not str]
@@ -177,7 +219,8 @@ def _as_kept(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
 
 
 WRAPPING = frozenset(
-    "add sub mul neg add_any integer_pow square div rem dot_general reduce_sum reduce_prod cumsum cumprod".split()
+    "add sub mul neg abs add_any integer_pow square div rem dot_general conv_general_dilated reduce_sum reduce_prod "
+    "cumsum cumprod".split()
 ) | {"scatter-add", "scatter-sub", "scatter-mul"}
 """Primitives whose results may not fit the type of integers that they are of."""
 
@@ -437,6 +480,19 @@ def _kept_scan(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     return carried.after(found[: len(moving)]) + stacked
 
 
+def _scatter(b, eqn, x, indices, updates):
+    """``scatter``, which replaces entries by updates, or by a function of the entries (``x.at[i].apply``)."""
+    own = ComplexBuilder(b) if eqn.invars[0].aval.dtype.kind == "c" else b
+    jaxpr, consts = eqn.params["update_jaxpr"], eqn.params["update_consts"]
+    if jaxpr is None:
+        return indexing.scattered(own, eqn, x, indices, updates, lambda old, new: new)
+
+    def applied(old, new):
+        return _unroll(b, jaxpr, consts, [array([old], ()), array([new], ())])[0].item()
+
+    return indexing.scattered(own, eqn, x, indices, updates, applied)
+
+
 CALLS = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2"
 CONTROL = {
     **dict.fromkeys(CALLS.split(), _call),
@@ -444,6 +500,7 @@ CONTROL = {
     chains.chain_p.name: _chain,
     "cond": _cond,
     "scan": _scan,
+    "scatter": _scatter,
     "while": _while,
 }
 

@@ -196,10 +196,14 @@ class _Recurrences:
         def read(v):
             return v.val if isinstance(v, Literal) else env[v]
 
+        has_powers = any(eqn.primitive.name == "pow" for eqn in jaxpr.eqns)
         for eqn in jaxpr.eqns:
             given, name = [read(v) for v in eqn.invars], eqn.primitive.name
             if name in CALLS:
                 found = _called(self, eqn, given)
+            elif has_powers and all(map(_is_small_constant, given)):
+                with jax.ensure_compile_time_eval():  # it may become an exponent, whose value says what is done
+                    found = _bound(eqn, given)
             elif not any(isinstance(value, _Series) for value in given) or not any(map(_is_real, eqn.outvars)):
                 found = _bound(eqn, map(self.start, given))  # tests are decided at the start
             else:
@@ -358,6 +362,42 @@ def _by_derivative(recurrences: _Recurrences, eqn, values) -> list:
     return [y]
 
 
+def _power(recurrences: _Recurrences, eqn, values) -> list:
+    """``a ** p``: products where p is whole, for ``p D a / a`` loses all digits where a is small, and is NaN at 0."""
+    a, p = values
+    if not isinstance(a, _Series) or isinstance(p, _Series):
+        return _by_derivative(recurrences, eqn, values)
+    if _is_small_constant(p):
+        exponents: Any = np.asarray(p)
+        whole = [int(n) for n in np.unique(exponents) if float(n).is_integer() and abs(n) <= MAX_WHOLE_EXPONENT]
+        if len(whole) == 1 and (exponents == whole[0]).all():
+            return recurrences.inlined(lambda x: [_whole_power(x, whole[0])], [a])
+    else:  # a parameter
+        exponents, whole = p, list(range(MAX_WHOLE_PARAMETER + 1))
+
+    def chosen(x, result):
+        for n in whole:
+            result = jnp.where(exponents == n, _whole_power(x, n), result)
+        return [result]
+
+    return recurrences.inlined(chosen, [a, *_by_derivative(recurrences, eqn, values)])
+
+
+def _is_small_constant(value) -> bool:
+    """Whether it is a number, or a few of them, known when the function is traced."""
+    return not isinstance(value, _Series | jax.core.Tracer) and np.size(value) <= MAX_EXPONENTS
+
+
+MAX_EXPONENTS = 64
+"""Entries of a constant that may be an array of exponents."""
+
+MAX_WHOLE_EXPONENT = 256
+"""Largest size of a whole exponent, known when the function is traced, for which a power is written as products."""
+
+MAX_WHOLE_PARAMETER = 6
+"""Largest whole exponent for which a power is, where the exponent is a parameter."""
+
+
 def _euler(recurrences: _Recurrences, a: _Series) -> _Series:
     zero = jnp.zeros_like(recurrences.start(a))
     return recurrences.add(zero, lambda n, number, now, past: number * now[0], (a.place,), rising=True)
@@ -379,13 +419,16 @@ def _rewritten(function: Callable) -> Callable:
 
 
 def _integer_power(params, x):
+    return _whole_power(x, params["y"])
+
+
+def _whole_power(x, y: int):
     def power(n: int):
         if n == 1:
             return x
         half = power(n // 2)
         return half * half * x if n % 2 else half * half
 
-    y = params["y"]
     if y == 0:
         return jnp.ones_like(x)
     return power(y) if y > 0 else 1.0 / power(-y)
@@ -452,6 +495,7 @@ RULES: dict[str, Callable] = {
     **dict.fromkeys(BY_DERIVATIVE.split(), _by_derivative),
     "square": _rewritten(lambda params, x: x * x),
     "integer_pow": _rewritten(_integer_power),
+    "pow": _power,
     "div": _divided,
     "custom_linear_solve": _solved_linearly,
     "triangular_solve": _solved_by_substitution,

@@ -25,6 +25,7 @@ from manifolds._module import Module
 from manifolds._precision import users_settings
 
 from ..errors import FunctionError
+from .index_check import check_indices
 from .lifting import Lifting
 from .trace_errors import check_precision, check_result
 
@@ -160,7 +161,7 @@ def _forwards(function: Callable) -> Callable:
 
 def traced(function: Callable, *arguments) -> Traced:
     """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
-    ours = _module(function).split(".")[0] in ("liethermo", "manifolds")
+    ours = _is_ours(function)
     name = getattr(function, "__name__", type(function).__name__)
 
     def called(*values):  # anew: JAX keeps the trace of a function object, and what the function reads may change
@@ -172,6 +173,7 @@ def traced(function: Callable, *arguments) -> Traced:
         closed, found = jax.make_jaxpr(called, return_shape=True)(*arguments)
     if not ours:
         check_precision(closed.jaxpr, name)
+    check_indices(closed)
     lifting = Lifting()
     jaxpr, constants, numbers = lifting.whole(closed)
     structure = jax.tree_util.tree_structure(found)
@@ -187,6 +189,20 @@ def traced(function: Callable, *arguments) -> Traced:
 def _module(function: Callable) -> str:
     """Where a function, or the class of one, is defined."""
     return getattr(function, "__module__", None) or type(function).__module__
+
+
+def _is_ours(function: Any) -> bool:
+    """Whether a function, or the class of an object, is defined in this library."""
+    return _module(function).split(".")[0] in ("liethermo", "manifolds")
+
+
+def _check_indices_of(tree: Any, use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
+    """Check the indices in a class of the user's, where it can be traced; where not, its use will say so."""
+    try:
+        closed = jax.make_jaxpr(lambda *a: use(tree, *a))(*(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes))
+    except Exception:
+        return
+    check_indices(closed)
 
 
 def is_plain(leaf) -> bool:
@@ -231,7 +247,8 @@ def _watched(leaves: list, structure, use: Callable, shapes, number: type | None
         return use(jax.tree_util.tree_unflatten(structure, watched), *arguments)
 
     scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
-    found = jax.eval_shape(used, [scalar for _ in moved], *arguments)
+    closed, found = jax.make_jaxpr(used, return_shape=True)([scalar for _ in moved], *arguments)
+    check_indices(closed)
     results = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
     with jax.ensure_compile_time_eval():
         for i in moved:
@@ -243,6 +260,8 @@ def settled(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callabl
     """As :func:`converted`, the pytree alone; nothing is traced where there is nothing to convert."""
     leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
     if not any(is_plain(leaf) or type(leaf) is float for leaf in leaves):
+        if not _is_ours(tree):
+            _check_indices_of(tree, use, shapes)
         return tree
     return converted(tree, use, *shapes, is_leaf=is_leaf)[0]
 

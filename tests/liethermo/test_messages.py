@@ -127,7 +127,9 @@ def end_of(call, **options):
     return lambda x: call(lt.models.rigid_body((3.0, 2.0, 1.0)), x, SPAN, STEP, **options)
 
 
-@pytest.mark.parametrize("transform", [jax.jit, lambda f: jax.grad(lambda x: f(x)[0]), jax.jacfwd], ids=str)
+@pytest.mark.parametrize(
+    "transform", [jax.jit, lambda f: jax.grad(lambda x: f(x)[0]), jax.jacfwd], ids=["jit", "grad", "jacfwd"]
+)
 def test_a_run_inside_of_jax(transform):
     """The message names lt.flow, which works in the place of integrate."""
     with pytest.raises(lt.InputError, match=r"integrate runs on numbers.*lt\.flow\(system, x0, t_span, step, method\)"):

@@ -18,6 +18,7 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.program import Program
+from ...tracing.scalarize import faults_reported
 from .blocks import Table
 from .machine_code import MachineCode
 from .writer import NUMBER, WHOLE, Writer
@@ -94,7 +95,7 @@ class Loops:
 
     def functions(self, steps: int, planned: int = 0) -> Sequence[Callable]:
         """``begin`` and ``advance`` for so many steps more, and others that are planned: compiled, or found so."""
-        with self._lock:
+        with self._lock, faults_reported():
             self._taken += steps
             hasty = self._small and self._taken + planned <= HASTY_STEPS
             if not self._loaded:

@@ -24,7 +24,7 @@ from ...integrators.fluctuating import driven_by, noise_dimension
 from ...systems import System
 from ...tracing.calls import deferred
 from ...tracing.remembered import Latest
-from ...tracing.scalarize import scalarize
+from ...tracing.scalarize import faults_reported, scalarize
 from ..array import portion_of
 from ..pacing import TOLD, Pace, Pacing, attempted, begun, shape_seen
 from ..rules import RULES, Rules
@@ -366,7 +366,7 @@ class Stepper:
 
     def _solver(self) -> int:
         """The address of Newton's method, which is compiled when a step first needs it."""
-        with self._lock:
+        with self._lock, faults_reported():
             if self._newton is None:
                 self._shapes[DEFERRED] = (self._layout.sizes[DEFERRED],)
                 program = self._piece(self._by_newton, ("p", DEFERRED)).program

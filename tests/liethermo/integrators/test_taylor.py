@@ -1,8 +1,10 @@
 """Taylor steps: orders on R^n and on manifolds, tolerances, states between the steps, events, and refusals."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
@@ -18,6 +20,42 @@ MULTIPLES = np.array([4, 5, 6, 7, 8])
 
 def reference(system, x, time, pieces=1):
     return lt.integrate(system, x, (0.0, time), time / pieces, lt.Reference(rtol=3e-14)).x
+
+
+POWERS = {
+    # name: (power of the first component, as the library has it; its derivative in NumPy)
+    "3.0": (lambda m: m[0] ** 3.0, lambda x: 3.0 * x**2),
+    "2.0": (lambda m: m[0] ** 2.0, lambda x: 2.0 * x),
+    "of NumPy": (lambda m: m[0] ** np.float64(4.0), lambda x: 4.0 * x**3),
+    "of JAX": (lambda m: jnp.power(m[0], jnp.array(3.0)), lambda x: 3.0 * x**2),
+    "of each entry": (lambda m: jnp.sum(m[:1] ** np.array([2.0, 3.0])), lambda x: 2.0 * x + 3.0 * x**2),
+}
+
+
+class Power(eqx.Module):
+    """Its exponent is a parameter of the system."""
+
+    exponent: float
+
+    def __call__(self, m):
+        return m[0] ** self.exponent
+
+
+@pytest.mark.parametrize("name", [*POWERS, "a parameter"])
+def test_whole_powers_as_floats_near_zero(name):
+    """Against DOP853 on Euler's equations in NumPy."""
+    power, derivative = POWERS.get(name) or (Power(3.0), lambda x: 3.0 * x**2)
+    system = lt.LiePoissonSystem(mf.so(3), lambda m: power(m) + m[1] ** 2 + 0.5 * m[2] ** 2 + 0.1 * m[0] ** 2)
+
+    def field(t, m):
+        return np.cross(m, [derivative(m[0]) + 0.2 * m[0], 2.0 * m[1], m[2]])
+
+    for start in (0.0, 1e-6, -1e-3):
+        x0 = np.array([start, 0.5, -0.3])
+        run = lt.integrate(system, x0, (0.0, 1.0), 0.05, Taylor(8))
+        right = solve_ivp(field, (0.0, 1.0), x0, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+        assert np.abs(run.x[-1] - right).max() <= 1e-10
+        assert run.audit().passed
 
 
 @pytest.mark.parametrize("nodes", range(2, 14))

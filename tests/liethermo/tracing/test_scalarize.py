@@ -1,10 +1,10 @@
 """Scalar programs from jaxprs: they agree with JAX to rounding, contain no needless operation, and refuse by name.
 
-Rounding is measured, not guessed: a program is run again with every result moved by a few units in its last place, and
-the spread is what rounding can do to it. A branch that rounding can turn (``floor`` of an integer) shows as a wide one.
+Rounding is measured, not guessed: see :mod:`tests.scalar_programs`.
 """
 
 import dataclasses
+import functools
 import subprocess
 import sys
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
@@ -22,66 +23,17 @@ from jax.extend.core import jaxprs_in_params
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import MetriplecticMidpoint, registered_methods
-from liethermo.tracing.builder import Instruction, meaning
+from liethermo.tracing.builder import Instruction
 from liethermo.tracing.primitives import RULES
-from liethermo.tracing.program import Program, Scan
+from liethermo.tracing.program import Scan
 from liethermo.tracing.scalarize import CONTROL, UnsupportedPrimitive, scalarize
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.linear import solve
 from tests.cases import DISSIPATIONS, EPS, build, state_of
 from tests.machine_code import compiled
+from tests.scalar_programs import agrees, check, jax_values, program_of
 
 rng = np.random.default_rng(0)
-
-
-def program_of(f, *args, **options) -> Program:
-    return scalarize(jax.make_jaxpr(f)(*map(jnp.asarray, args)), **options)
-
-
-def jax_values(f, *args) -> list[np.ndarray]:
-    return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(jax.jit(f)(*args))]
-
-
-def nudged(program: Program, args, seed: int) -> list[np.ndarray]:
-    """The outputs when every instruction's result is off by up to four units in its last place."""
-    noise = np.random.default_rng(seed)
-    values = dict(zip(sum(program.inputs, ()), np.concatenate([np.ravel(x) for x in args]), strict=True))
-    with np.errstate(all="ignore"):
-        for target, op, operands in program.instructions:
-            value = meaning(op)(*(values[a] if isinstance(a, str) else a for a in operands))
-            real = not isinstance(value, tuple) and np.asarray(value).dtype == np.float64
-            values[target] = value * (1.0 + EPS * noise.uniform(-4, 4, np.shape(value))) if real else value
-    return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
-
-
-def check(program: Program, args, expected: list[np.ndarray], found=None, hidden_nan: bool = False) -> None:
-    """Raise unless a program gives the expected outputs: numbers to rounding, NaN and infinity where they belong.
-
-    ``hidden_nan``: where JAX has NaN a number may stand, as a structural zero times NaN is zero.
-    """
-    found = program.evaluate(*args) if found is None else found
-    assert [a.shape for a in found] == [a.shape for a in expected]
-    runs = [nudged(program, args, seed) for seed in range(6)]
-    for i, (right, got) in enumerate(zip(expected, found, strict=True)):
-        right, got = right.astype(float).ravel(), got.astype(float).ravel()
-        moved = np.array([run[i] for run in runs])
-        steady = (kind(moved) == kind(got)).all(axis=0)
-        with np.errstate(all="ignore"):
-            spread = np.abs(moved - got).max(axis=0)
-            close = np.abs(got - right) <= 8 * spread + 16 * EPS * np.abs(right) + 1e-300
-        bad = ~np.where(np.isfinite(right), close, hidden_nan | (kind(right) == kind(got))) & steady
-        assert not bad.any(), f"output {i}: {got[bad]} is not {right[bad]}, spread {spread[bad]}"
-
-
-def kind(a):
-    """0 for a number, 1 for an infinity, 2 for NaN."""
-    return np.isinf(a) + 2 * np.isnan(a)
-
-
-def agrees(f, *args, **options) -> Program:
-    program = program_of(f, *args)
-    check(program, args, jax_values(f, *args), **options)
-    return program
 
 
 # -- every primitive --------------------------------------------------------------------------------------------------
@@ -91,6 +43,7 @@ v, w, c3 = rng.standard_normal(3), rng.standard_normal(5), rng.standard_normal((
 square = rng.standard_normal((3, 3))
 spd = square @ square.T + np.eye(3)
 c300 = rng.uniform(0.5, 1.0, 300)
+NARROW = (jnp.uint8, jnp.int8, jnp.uint16, jnp.int16, jnp.uint32, jnp.int32, jnp.int64)
 
 
 @jax.custom_vjp
@@ -315,8 +268,35 @@ INDICES = {
                       lax.rem(i, jnp.argmin(a) - jnp.argmin(a)), lax.div(i, jnp.argmin(a) - jnp.argmin(a)))
         ], w,
     ),
+    "numbers that become narrow integers": (
+        lambda a: [(300.0 * a).astype(t) for t in NARROW] + [jnp.float32(300.0 * a).astype(t) for t in NARROW],
+        np.array([-1.9, -0.003, 0.5, 3.0, 1e30, -1e30, np.inf, -np.inf, np.nan, 0.0]),
+    ),
+    "integers of a few bits": (
+        lambda a: [f((128.0 * a).astype(jnp.int8)) for f in (abs, jnp.negative, lambda i: (9 * i).astype(jnp.uint8))],
+        np.array([-1.0, 1.0, 0.3, -200.0]),
+    ),
     "integers that wrap around": (
         lambda a: [(1e9 * a).astype(jnp.int32) * 7, (1e9 * jnp.abs(a)).astype(jnp.uint32) * jnp.uint32(11)], w),
+    "scatter, applying a function": (
+        lambda a, b: [
+            a.at[2].apply(jnp.sin), a.at[jnp.argmax(b)].apply(lambda z: z * z + 1.0), a.at[1:3].apply(jnp.cos),
+            a.at[np.array([0, 9])].apply(jnp.exp), a.at[jnp.argmax(b) + 9].apply(jnp.exp),
+            *parts((a * 1j).at[1].apply(jnp.exp)), (a > 0).at[1].apply(jnp.logical_not),
+        ], w, w[::-1].copy(),
+    ),
+    "gather, that fills": (
+        lambda a: [
+            z
+            for i in [jnp.argmax(a) + jnp.array([0, 4])]
+            for z in (a.at[i].get(mode="fill", fill_value=0), a.at[i].get(mode="fill"),
+                      (9.0 * a).astype(jnp.int16).at[i].get(mode="fill"), (a * 1j).at[i].get(mode="fill").imag,
+                      jnp.abs(9.0 * a).astype(jnp.uint8).at[i].get(mode="fill"), (a > 0).at[i].get(mode="fill"))
+        ], w,
+    ),
+    "scatter, derivative at a narrow index": (
+        jax.grad(lambda a: jnp.sum(jnp.sin(a.at[jnp.abs(3.0 * a[0]).astype(jnp.uint8)].set(a[1])))), w,
+    ),
     "empty2": (jax.grad(lambda a: lax.cond(a[0] > 0.0, lambda b: b[0] ** 2, lambda b: 2 * b[1], a)), w),
 }  # fmt: skip
 
@@ -332,6 +312,27 @@ CASES = {
     "xor": truth["xor_"],
     "acosh": (both(lax.acosh), 1.0 + x),
     "pow": (both(lax.pow), x, y),
+    "pow, by integers": (
+        lambda a, b: [a ** jnp.sum(a > b), a ** jnp.argsort(b[0]), (1j + a[0]) ** jnp.argsort(a[0])][:2],
+        x,
+        y,
+    ),
+    "max, of truth values": (lambda a: [jnp.maximum(a > 0, a < 1), jnp.minimum(a > 0, a < 1)], y),
+    "dot_general, mixed": (
+        both(
+            lambda a, b: [
+                jnp.dot(a > 0.5, b.T),
+                jnp.einsum("ij,ij->", b, a > 0.5),
+                jnp.einsum("ij,j->i", b, jnp.arange(3)),
+                1.0 * jnp.dot(a > 0.5, (b > 0).T),
+                jnp.einsum("i,i->", jnp.argsort(b[0]), b[1]),
+                jnp.abs(jnp.einsum("i,i->", a[0] > 0.5, b[0] + 1j)),
+            ]
+        ),
+        x,
+        y,
+    ),
+    "rev, of a number": (lambda a: [jnp.flip(a[0, 0], ()), lax.rev(a[0, 0] > 0, ()), lax.slice(a[0, 0], (), ())], y),
     "pow by a number": (lambda a: [lax.pow(a, p) for p in (-3.0, -1.0, 0.0, 0.5, 2.0, 3.0, 7.0)], x),
     "integer_pow": (lambda a: [lax.integer_pow(a, n) for n in (-5, -1, 0, 1, 2, 3, 7, 15)], y),
     "add_any": (jax.grad(lambda a: jnp.sum(a * jnp.sin(a))), x),
@@ -545,6 +546,59 @@ def test_special_values_of_one_argument(name):
 @pytest.mark.parametrize("name", [*BINARY.split(), *COMPARISONS.split(), "pow"])
 def test_special_values_of_two_arguments(name):
     agrees(getattr(lax, name), np.repeat(SPECIAL, len(SPECIAL)), np.tile(SPECIAL, len(SPECIAL)))
+
+
+LIMITS = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -0.5, -2.5, -7.5, 3.0, 30.5, 1e-10, -1e-10, np.inf, -np.inf, np.nan])
+PAIRS = np.repeat(LIMITS, len(LIMITS)), np.tile(LIMITS, len(LIMITS))
+derivative = lambda f: lambda a: jax.jvp(f, (a,), (jnp.ones_like(a),))[1]  # noqa: E731
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        pytest.param(lax.digamma, [LIMITS], id="digamma"),
+        pytest.param(lax.lgamma, [LIMITS], id="lgamma"),
+        pytest.param(derivative(lax.digamma), [LIMITS], id="derivative of digamma"),
+        pytest.param(derivative(derivative(lax.lgamma)), [LIMITS], id="second derivative of lgamma"),
+        *(
+            pytest.param(functools.partial(jax.scipy.special.polygamma, n), [LIMITS], id=f"polygamma {n}")
+            for n in range(4)
+        ),
+        pytest.param(
+            derivative(functools.partial(jax.scipy.special.polygamma, 1)), [LIMITS], id="derivative of polygamma"
+        ),
+        pytest.param(lax.zeta, PAIRS, id="zeta"),
+        pytest.param(lax.igamma, PAIRS, id="igamma"),
+        pytest.param(lax.igammac, PAIRS, id="igammac"),
+    ],
+)
+def test_special_functions_at_their_limits(function, arguments):
+    """Poles, negative numbers, zeros and infinity, as JAX has them."""
+    program = program_of(function, *(a[0] for a in arguments))
+    right = np.asarray(jax.jit(jax.vmap(function))(*arguments))
+    (interpreted,) = program.evaluate(*arguments, batch=True)
+    run = compiled(program)
+    machine = np.array([run(*row)[0] for row in zip(*arguments, strict=True)])
+    for found in (interpreted, machine):
+        np.testing.assert_allclose(found, right, rtol=1e-11, atol=1e-14)  # JAX has 1 - igamma
+
+
+def test_digamma_of_negative_numbers_has_derivatives():
+    """Against the reflection formula of the trigamma function."""
+    x = np.array([-0.5, -0.25, -1.3, -2.5])
+    right = (np.pi / np.sin(np.pi * x)) ** 2 - scipy.special.polygamma(1, 1.0 - x)
+    (found,) = program_of(derivative(lax.digamma), x).evaluate(x)
+    np.testing.assert_allclose(found, right, rtol=1e-12)
+
+
+def test_a_complex_number_divided_by_infinity():
+    agrees(lambda a, b: parts((a + 2j) / (b + 3j)), np.array([1.0, -2.0, np.inf]), np.array([np.inf, -np.inf, np.inf]))
+    agrees(lambda a: parts(jax.jvp(lambda z: jnp.sqrt(z + 0j), (a,), (jnp.ones(2),))[1]), np.array([np.inf, 1.0]))
+
+
+def test_a_logarithm_of_a_large_complex_number():
+    z = np.array([1e300, -1e300, 1e200, 1e5, 3.0])
+    agrees(lambda a, b: parts(jnp.log1p(a + 1j * b)), z, z[::-1].copy())
 
 
 def test_special_values_of_reductions():

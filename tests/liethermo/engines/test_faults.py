@@ -1,0 +1,117 @@
+"""What crashed the compiler is compiled now, and a crash that nobody has seen yet becomes the array engine's run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.engines.choice import CompiledEngineWarning
+from liethermo.engines.compiled.writer import Writer
+from liethermo.tracing import scalarize
+from liethermo.tracing.builder import Builder
+from liethermo.tracing.primitives import RULES
+
+X0 = np.array([0.4, 0.5, -0.3])
+ENERGIES = {
+    "product with truth values": lambda m: 0.5 * jnp.dot(m > -9, m) * m[0] + m @ m / 2 + m[0] ** 2,
+    "truth values in einsum": lambda m: jnp.einsum("i,i->", m > -9, m) + m[0] ** 2,
+    "integers in einsum": lambda m: jnp.einsum("i,i->", (m > -9) * jnp.arange(3), m) + m[0] ** 2,
+    "truth values by truth values": lambda m: m[0] ** 2 * jnp.dot(m > -9, m > -9) + m[1] ** 2 / 2,
+    "integer exponent at run time": lambda m: (2.0 + m[0]) ** jnp.sum(m > -9),
+    "flip of a number": lambda m: m @ jnp.array([0.5, 1.0, 1.5]) * m[1] + jnp.flip(m[0], ()),
+    "gather with an index at run time": lambda m: jnp.take(m, jnp.argsort(m))[0] ** 2 + m[jnp.argmax(m)] ** 3,
+    "float to narrow integers": lambda m: m[0] ** 2 + m[1] ** 2 * (200.0 * m[2]).astype(jnp.uint8).astype(float),
+    "larger truth value": lambda m: m[0] ** 2 + m[1] ** 2 * jnp.maximum(m[2] > 0, m[0] > 0),
+}
+
+
+def run(system, engine, **options):
+    return lt.integrate(system, X0, (0.0, 0.5), 0.1, lt.MetriplecticRungeKutta(4), engine=engine, **options)
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_is_compiled(name):
+    system = lt.LiePoissonSystem(mf.so(3), ENERGIES[name])
+    ours, other = run(system, "auto"), run(system, "array")
+    assert ours.provenance["engine"] == "compiled"
+    assert np.abs(ours.x - other.x).max() <= 2e-14
+
+
+def test_entries_that_a_function_is_applied_to():
+    """``x.at[i].apply(f)`` was zero; JAX does not differentiate it, so that it stands in a friction."""
+
+    def friction(m):
+        return jnp.diag(m.at[1].apply(jnp.cos).at[0].apply(lambda a: 1.0 + a * a) ** 2)
+
+    system = lt.LiePoissonSystem(
+        mf.so(3), lambda m: m[0] ** 2 + m[1] ** 2 / 2, lambda m: m @ m, lt.FrictionOperator(friction), validate=False
+    )
+    ours, other = run(system, "compiled"), run(system, "array")
+    assert np.abs(ours.x - other.x).max() <= 2e-14
+
+
+def sine(m):
+    return m[0] ** 2 + jnp.sin(m[1]) * m[2]
+
+
+@pytest.fixture
+def fresh_programs(monkeypatch):
+    """No program that was made before is found again."""
+    monkeypatch.setattr("liethermo.engines.compiled.stepper._steppers", lt.tracing.remembered.Latest(4))
+    monkeypatch.setattr("liethermo.tracing.interpret._unrolled", lt.tracing.remembered.Latest(4))
+
+
+def raising(*arguments, **named):
+    raise ZeroDivisionError("nobody has seen this yet")
+
+
+FAULTS = {
+    "rule of a primitive": lambda patch: patch.setitem(RULES, "sin", raising),
+    "scalar compiler": lambda patch: patch.setattr(scalarize, "_program", raising),
+    "builder": lambda patch: patch.setattr(Builder, "mul", raising),
+    "writer": lambda patch: patch.setattr(Writer, "operation", raising),
+    "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fresh_programs):
+    system = lt.LiePoissonSystem(mf.so(3), sine)
+    right = run(system, "array").x
+    FAULTS[fault](monkeypatch)
+    with pytest.warns(CompiledEngineWarning, match="ZeroDivisionError: nobody has seen this yet.*array engine runs it"):
+        found = run(system, "auto")
+    assert found.provenance["engine"] == "array"
+    assert np.array_equal(found.x, right)
+    with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
+        many = lt.ensemble(system, [X0, X0], (0.0, 0.5), 0.1, lt.MetriplecticRungeKutta(4))
+    assert np.abs(many.x[1] - right[-1]).max() <= 1e-14
+    with pytest.raises(lt.LiethermoError, match=r"the compiled engine failed.*This is a fault of liethermo"):
+        run(system, "compiled")
+
+
+@pytest.mark.parametrize("options", [{"until": lambda m: m[0] + 9.0}, {}], ids=["event", "adaptive"])
+def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
+    system = lt.LiePoissonSystem(mf.so(3), sine)
+    monkeypatch.setattr(Writer, "operation", raising)
+    with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
+        found = lt.integrate(system, X0, (0.0, 0.5), lt.Adaptive(1e-8), **options)
+    assert found.provenance["engine"] == "array"
+
+
+def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
+    """Which is compiled when a step first needs it: the run goes on from there."""
+    system = lt.LiePoissonSystem(mf.so(3), sine)
+    monkeypatch.setattr("liethermo.engines.compiled.stepper.solver", raising)
+    with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
+        found = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
+    assert found.stats.newton_iterations > 0
+
+
+def test_the_primitive_and_the_line_of_a_fault_are_named(monkeypatch):
+    monkeypatch.setitem(RULES, "sin", raising)
+    with pytest.raises(scalarize.CompilerFault, match=r"on the JAX primitive 'sin' \(test_faults.py:\d+") as caught:
+        scalarize.scalarize(jax.make_jaxpr(sine)(X0))
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)

@@ -1,0 +1,161 @@
+"""Constant indices out of range are refused by name where a function is traced; what is meant so is not."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.errors import IndexOutOfRangeError
+from liethermo.learn.observation import observation
+from liethermo.tracing.index_check import check_indices
+
+X = jnp.array([0.4, 0.5, -0.3])
+TABLE = np.array([0, 3])
+NEIGHBOURS = np.array([[1, 3], [0, 2], [1, 3]])
+
+OUTSIDE = {
+    # name: (function of three components, the index as it is written, entries of the axis)
+    "one beyond": (lambda m: m[3], 3, 3),
+    "from the end": (lambda m: m[-4], -4, 3),
+    "of a matrix": (lambda m: jnp.outer(m, m)[1, 5], 5, 3),
+    "a column": (lambda m: jnp.outer(m, m)[:, 3], 3, 3),
+    "a table": (lambda m: m[TABLE], 3, 3),
+    "a table, half of it masked": (
+        lambda m: jnp.sum(jnp.where(NEIGHBOURS < 4, m[NEIGHBOURS], 0.0)),
+        3,
+        3,
+    ),
+    "a table from the end": (lambda m: m[np.array([-4, 0])], -4, 3),
+    "an integer of JAX": (lambda m: m[jnp.int32(7)], 7, 3),
+    "in a function that is jitted": (lambda m: jax.jit(lambda a: a[3])(m), 3, 3),
+    "in a function that is mapped": (lambda m: jax.vmap(lambda row: row[3])(jnp.outer(m, m)), 3, 3),
+    "in a loop": (lambda m: lax.fori_loop(0, 2, lambda i, s: s + m[3], 0.0), 3, 3),
+    "in a branch": (lambda m: lax.cond(m[0] > 0, lambda a: a[3], lambda a: a[0], m), 3, 3),
+    "in a derivative": (jax.grad(lambda m: m[3] ** 2), 3, 3),
+    "of a constant": (lambda m: m[0] * jnp.ones((3, 4))[0, 4], 4, 4),
+    "dynamic_slice": (lambda m: lax.dynamic_slice(m, (3,), (1,)), 3, 3),
+    "promised to be inside": (lambda m: m.at[3].get(mode="promise_in_bounds"), 3, 3),
+}
+
+MEANT = {
+    "inside": lambda m: m[2] + m[-3],
+    "clip": lambda m: m.at[3].get(mode="clip"),
+    "fill": lambda m: m.at[3].get(mode="fill", fill_value=0.0),
+    "drop": lambda m: m.at[3].set(1.0, mode="drop"),
+    "clip, a table": lambda m: m.at[TABLE].get(mode="clip"),
+    "clip, set": lambda m: m.at[TABLE].set(1.0, mode="clip"),
+    "take, clip": lambda m: jnp.take(m, 3, mode="clip"),
+    "take, fill": lambda m: jnp.take(m, TABLE, mode="fill"),
+    "computed": lambda m: m[jnp.argmax(m) + 3],
+    "counted": lambda m: lax.fori_loop(0, 4, lambda i, s: s + m[i], 0.0),
+    "neighbours that some do not have": lambda m: jnp.where(NEIGHBOURS < 3, m[NEIGHBOURS], 0.0).sum(),
+    "neighbours, in a function that is jitted": lambda m: jax.jit(
+        lambda a: jnp.where(NEIGHBOURS < 3, a[NEIGHBOURS], 0.0) ** 2
+    )(m),
+    "masked": lambda m: jnp.where(jnp.arange(3) < 2, m[jnp.arange(3) + 1], 0.0),
+    "a slice": lambda m: m[1:7],
+    "interp": lambda m: jnp.interp(m[0], m, m) + jnp.convolve(m, m)[0] + jnp.roll(m, 5)[0] + jnp.diff(m)[0],
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_an_index_out_of_range_is_found(name):
+    function, index, size = OUTSIDE[name]
+    with pytest.raises(IndexOutOfRangeError, match=f"the index {index} of an axis with {size} entries") as caught:
+        check_indices(jax.make_jaxpr(function)(X))
+    assert (caught.value.index, caught.value.size) == (index, size)
+    assert caught.value.where.startswith("test_index_check.py:")
+
+
+@pytest.mark.parametrize("name", MEANT)
+def test_what_is_meant_is_left_alone(name):
+    check_indices(jax.make_jaxpr(MEANT[name])(X))
+
+
+def energy(m):
+    return 0.5 * (m[0] ** 2 + 2.0 * m[1] ** 2 + 3.0 * m[2] ** 2)
+
+
+class Parametrised(eqx.Module):
+    scale: float
+
+    def __call__(self, m):
+        return self.scale * m[3] ** 2
+
+
+class Mine(lt.KillingDissipation):
+    """A dissipation of somebody else's."""
+
+    def force(self, system, x, *arguments):
+        return x[3] * super().force(system, x, *arguments)
+
+
+def body(H=energy, **options):
+    return lt.LiePoissonSystem(mf.so(3), H, **options)
+
+
+def with_bath(**options):
+    return body(dissipation=lt.DoubleBracket(0.1), baths=lt.HeatBaths(1.0, 1.0), **options)
+
+
+ROLES = {
+    "energy": (lambda: body(lambda m: m[3] ** 2), "the energy, a function of a state of shape"),
+    "energy of time": (lambda: body(lambda m, t: m[3] * t), "the energy"),
+    "energy, a module": (lambda: body(Parametrised(2.0)), "the energy"),
+    "energy beside a bath": (
+        lambda: body(lambda x: energy(x) + x[3], dissipation=lt.DoubleBracket(0.1), baths=lt.HeatBaths(1.0, 1.0)),
+        "the energy",
+    ),
+    "entropy": (lambda: body(entropy=lambda m: m[3], dissipation=lt.KillingDissipation(0.1)), "the entropy"),
+    "friction": (
+        lambda: body(entropy=lambda m: m @ m, dissipation=lt.FrictionOperator(lambda m: jnp.eye(3) * m[3])),
+        "the friction operator K, at a state of shape",
+    ),
+    "dissipation of the user's": (lambda: body(entropy=lambda m: m @ m, dissipation=Mine(0.1)), "has the index 3"),
+    "Poisson tensor": (
+        lambda: lt.MetriplecticSystem(poisson=lambda x: jnp.zeros((3, 3)) * x[3], energy=energy, dim=3),
+        "the Poisson tensor",
+    ),
+    "dissipation potential": (
+        lambda: body(
+            entropy=lambda m: m @ m,
+            dissipation=lt.DissipationPotential(lambda f: jnp.sum(f**2) + f[9], lt.KillingDissipation(0.1)),
+        ),
+        "has the index 9",
+    ),
+    "observation": (
+        lambda: observation(body(), None, lambda x: x[:1] + x[5]),
+        "observe, at a state of shape",
+    ),
+    "event": (lambda: lt.integrate(body(), X, (0.0, 1.0), 0.1, until=lambda m: m[3]), "the event function"),
+    "event, array engine": (
+        lambda: lt.integrate(body(), X, (0.0, 1.0), 0.1, until=lambda m: m[3], engine="array"),
+        "the event function",
+    ),
+    "event, ensemble": (lambda: lt.ensemble(body(), [X, X], (0.0, 1.0), 0.1, until=lambda m: m[3]), "the event"),
+    "event beyond the bath": (lambda: lt.integrate(with_bath(), X, (0.0, 1.0), 0.1, until=lambda x: x[4]), "index 4"),
+}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_function_of_a_user_is_checked(role):
+    make, message = ROLES[role]
+    with pytest.raises(lt.LiethermoError, match=message) as caught:
+        make()
+    assert isinstance(caught.value, IndexError | TypeError)
+    assert "Python counts from 0, so the last index is " in str(caught.value)
+
+
+def test_the_advice_works():
+    """What is meant is written as the message says, and is what JAX makes of it."""
+    system = body(lambda m: energy(m) + m.at[3].get(mode="clip"))
+    assert float(system.energy.value(X)) == float(energy(X) + X[2])
+
+
+def test_an_event_sees_the_entropy_of_a_bath():
+    found = lt.integrate(with_bath(), X, (0.0, 10.0), 0.1, until=lambda x: x[3] - 0.001)
+    assert found.status.code == "event"
