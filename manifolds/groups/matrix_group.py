@@ -360,6 +360,12 @@ class MatrixGroup:
                 "it back to the group first"
             )
         eigenvalues = np.linalg.eigvals(g)
+        if image == "logarithm" and self.is_complex and abs(total := np.angle(eigenvalues).sum()) > 3.0:
+            return (
+                f"has eigenvalues whose angles sum to {total:.6g}, so its principal logarithm is not in "
+                f"{self.algebra.name}: take the logarithm of g relative to a nearer element h, that is of "
+                "compose(inverse(h), g)"
+            )
         worst = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
             f"has the eigenvalue {worst:.6g} at the angle {abs(np.angle(worst)):.10f}, and det g = "

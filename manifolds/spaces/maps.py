@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -366,6 +367,20 @@ def _derivative_of_root(primals, tangents):
     small = z < EQUAL**2
     root = jnp.where(small, EQUAL, jnp.sqrt(jnp.where(small, 1.0, z)))
     return root, jnp.where(z < 0.0, 0.0, 0.5 / root) * dz
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def by_value(space: Any, x, y):
+    """The squared distance from ``_squared_distance_value``, defined at the cut locus too, with derivatives by the log.
+
+    At the cut locus there are no derivatives: they are NaN.
+    """
+    return space._squared_distance_value(x, y)
+
+
+@by_value.defjvp
+def _derivative_by_log(space, primals, tangents):
+    return by_value(space, *primals), jax.jvp(partial(Maps._squared_distance, space), primals, tangents)[1]
 
 
 # -- what several spaces have: ``_inner = by_flat`` in the body of a class ---------------------------------------------
