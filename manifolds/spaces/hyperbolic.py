@@ -120,8 +120,9 @@ class Hyperbolic(Space):
         radial = difference / (a * jnp.where(far, y0, 1.0) + b * jnp.where(far, x0, 1.0))  # sinh(s - r)
         ordered = a < b
         least, most, inner = jnp.where(ordered, a, b), jnp.where(ordered, b, a), jnp.where(ordered, p, q)
-        across = (q - p) - inner * (difference / (least * (a + b)))  # most (q/b - p/a), exact for neighbours
-        beyond = 2.0 * radial**2 / (1.0 + jnp.sqrt(1.0 + radial**2)) + least / most * _dot(across, across)
+        across = (q - p) - inner * (difference / (least * (a + b)))  # exact for neighbours
+        across = jnp.where(most < 2.0 * least, across / most, q / b - p / a)
+        beyond = 2.0 * radial**2 / (1.0 + jnp.sqrt(1.0 + radial**2)) + a * b * _dot(across, across)
         return jnp.where(far, beyond, jnp.where(apart > 1.0, apart, near))
 
     def _midpoint(self, x, y):

@@ -365,8 +365,9 @@ def safe_sqrt(z):
 def _derivative_of_root(primals, tangents):
     (z,), (dz,) = primals, tangents
     small = z < EQUAL**2
-    root = jnp.where(small, EQUAL, jnp.sqrt(jnp.where(small, 1.0, z)))
-    return root, jnp.where(z < 0.0, 0.0, 0.5 / root) * dz
+    far = jnp.sqrt(jnp.where(small, 1.0, z))
+    slope = jnp.where(small, 0.5 / EQUAL, 0.5 / far)  # of constants, which have no derivatives to overflow
+    return jnp.where(small, EQUAL, far), jnp.where(z < 0.0, 0.0, slope) * dz
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
