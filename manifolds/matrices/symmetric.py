@@ -82,7 +82,7 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
 
 
 def _axes_of_sweeps(n: int, sweeps: int) -> np.ndarray:
-    """The planes of cyclic rotations, shape (rotations, 2, n): unit vectors, so that the program has no varying index."""
+    """The axes of the planes of cyclic rotations, as unit vectors, shape (rotations, 2, n)."""
     pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)
     return np.tile(np.eye(n)[pairs], (sweeps, 1, 1))
 
@@ -140,7 +140,7 @@ def polar(a) -> jax.Array:
 
 @polar.defjvp
 def _polar_derivative(primals, tangents):
-    """With ``a = u h``: ``u' = u w + (1 - u u^H) a' h^-1``, and the skew-Hermitian w solves ``h w + w h = 2 skew(u^H a')``.
+    """With ``a = u h``: ``u' = u w + (1 - u u^H) a' h^-1``, and w solves ``h w + w h = u^H a' - a'^H u``.
 
     The operator on the left is its own adjoint, and a linear solve has derivatives of its own: those of higher order.
     """

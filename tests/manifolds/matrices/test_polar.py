@@ -47,12 +47,16 @@ def test_a_matrix_of_less_than_full_rank_has_none():
 
 @pytest.mark.parametrize(
     ("shape", "complex_numbers"),
-    [((3, 3), False), pytest.param((4, 2), False, marks=pytest.mark.slow), pytest.param((3, 3), True, marks=pytest.mark.slow)],
+    [
+        ((3, 3), False),
+        pytest.param((4, 2), False, marks=pytest.mark.slow),
+        pytest.param((3, 3), True, marks=pytest.mark.slow),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("repeated", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_derivatives_in_both_modes(shape, complex_numbers, repeated):
-    """Along ``a(t)`` both ``u^H u = 1`` and ``u^H a = a^H u`` hold with all their derivatives, also at equal singular values."""
+    """Along ``a(t)``, ``u^H u = 1`` and ``u^H a = a^H u`` hold with all their derivatives."""
     a, b, c = (random(shape, seed, complex_numbers) for seed in (3, 4, 5))
     a = scipy.linalg.polar(a)[0] if repeated else a
 

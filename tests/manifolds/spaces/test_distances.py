@@ -1,6 +1,6 @@
 """Distances: the derivatives of their squares at equal points, and their values at all scales and at cut loci.
 
-The references are Hessians known by definition, mpmath with enough digits, and points made from the angles between them.
+The references are Hessians known by definition, mpmath, and points made from the angles between them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def largest(a) -> float:
     return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
-# -- derivatives at equal points ----------------------------------------------------------------------------------------
+# -- derivatives at equal points ---------------------------------------------------------------------------------------
 
 COMPOSED = [
     mf.Sphere(2) * mf.SPD(2),
@@ -51,7 +51,7 @@ SPACES = [
 
 @pytest.mark.parametrize("space", SPACES)
 def test_the_square_of_a_distance_has_twice_the_metric_as_hessian(space):
-    """As an ambient function of either point: its gradient vanishes, so that its Hessian on tangent vectors is covariant."""
+    """As an ambient function of either point. Its gradient vanishes, so its Hessian on tangent vectors is covariant."""
     c = np.asarray(space.random(3))
     start, frame = space.to_vector(c), np.asarray(space.to_vector(space.frame(c)))
     for square in (
@@ -120,7 +120,7 @@ def test_a_run_from_the_centre_of_a_potential_of_the_distance(method):
     assert largest(runs[0].x[-1] - c) > 0.05  # control: it moves
 
 
-# -- hyperbolic space, far out --------------------------------------------------------------------------------------------
+# -- hyperbolic space, far out -----------------------------------------------------------------------------------------
 
 
 def hyperbolic_point(r, angle):
@@ -174,7 +174,7 @@ def test_hyperbolic_derivatives_far_out():
     assert largest(frame @ found + 2.0 * np.asarray(space.coordinates(c, space.log(c, y)))) < 1e-13
 
 
-# -- cut loci ---------------------------------------------------------------------------------------------------------------
+# -- cut loci ----------------------------------------------------------------------------------------------------------
 
 
 def subspaces(n, p, angles, seed):
@@ -271,7 +271,9 @@ def test_positive_definite_matrices_at_all_scales():
         logs = size * random.standard_normal(3)
         q = np.linalg.qr(random.standard_normal((3, 3)))[0]
         y = q @ np.diag(np.exp(logs)) @ q.T
-        assert abs(float(space.distance(np.eye(3), (y + y.T) / 2)) - np.linalg.norm(logs)) < 4e-14 * (1.0 + np.exp(size))
+        assert abs(float(space.distance(np.eye(3), (y + y.T) / 2)) - np.linalg.norm(logs)) < 4e-14 * (
+            1.0 + np.exp(size)
+        )
     g = np.diag([1e-6, 1.0, 1e6])
     x, y = g @ g, g @ np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 3.0]]) @ g
     inside = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 3.0]])
