@@ -87,17 +87,20 @@ def test_derivatives_of_every_order_at_equal_points():
 
 
 @pytest.mark.parametrize(
-    "method",
+    ("method", "allowed"),
     [
-        lt.MetriplecticGauss(2),
-        pytest.param(lt.MetriplecticMidpoint(), marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticRungeKutta(4), marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticTaylor(4), marks=pytest.mark.slow),
+        (lt.MetriplecticGauss(2), 1e-11),
+        pytest.param(lt.MetriplecticMidpoint(), 1e-7, marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticRungeKutta(4), 1e-9, marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticTaylor(4), 1e-11, marks=pytest.mark.slow),
     ],
-    ids=lambda m: type(m).__name__,
+    ids=lambda value: type(value).__name__,
 )
-def test_a_run_from_the_centre_of_a_potential_of_the_distance(method):
-    """A spin whose energy is the squared distance from its start, and a field that moves it away from there."""
+def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, allowed):
+    """A spin whose energy is the squared distance from its start, and a field that moves it away from there.
+
+    What is allowed is the error of the method: the two energies differ off the sphere, where stages are.
+    """
     space, c = mf.Sphere(2), np.array([0.6, 0.64, 0.48])
     field = np.array([0.3, -0.2, 0.5])
 
@@ -116,7 +119,7 @@ def test_a_run_from_the_centre_of_a_potential_of_the_distance(method):
         for H in (energy, smooth)
     ]
     assert np.isfinite(runs[0].x).all()
-    assert largest(runs[0].x - runs[1].x) < 1e-11  # terms of the series from gap^6 on
+    assert largest(runs[0].x - runs[1].x) < allowed
     assert largest(runs[0].x[-1] - c) > 0.05  # control: it moves
 
 
