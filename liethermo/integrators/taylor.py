@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..systems import System
 from ..tracing.taylor import NoSeriesError, check_series, solution
 from .base import OneStepMethod, register
+from .charts import retraction_of
 from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Unlawful
 from .lobatto import lobatto_rule
 
@@ -113,6 +114,25 @@ class MetriplecticTaylor(ExplicitMethod):
                 raise error.about(
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
                 ) from None
+        if system.space is not None and self.retraction is not None:
+            self._check_chart(system.space)
+
+    def _check_chart(self, space: mf.Space) -> None:
+        """Raise NoSeriesError unless the points of a chart have Taylor series."""
+        assert self.retraction is not None
+        chart = retraction_of(space, self.retraction).chart
+        z = space.random(0)
+
+        def point(c):
+            return space.to_vector(chart._point(z, space._from_coordinates(z, c)))
+
+        try:
+            check_series(point, jnp.zeros(space.dim))
+        except NoSeriesError as error:
+            raise error.about(
+                f"{self} needs Taylor series, and of {chart} ",
+                "leave out retraction=, or take lt.MetriplecticGauss or lt.MetriplecticRungeKutta",
+            ) from None
 
     def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
         nodes, b = self._rule

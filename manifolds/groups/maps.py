@@ -100,8 +100,14 @@ def _adjoint(algebra: LieAlgebra) -> LieAlgebra:
     return LieAlgebra(constants, name=f"ad({algebra.name})", basis=constants.swapaxes(1, 2))
 
 
+_OUTSIDE = 1e-3
+"""Part of a logarithm outside of the algebra, relative to its size: more than rounding makes, less than 2 pi / n."""
+
+
 def log(algebra: LieAlgebra, g) -> jax.Array:
     """Principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
+
+    NaN too where that of the matrix is not in the algebra, as in SU(n) where the angles of eigenvalues sum to 2 pi.
 
     Square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which keeps to the algebra of a group
     with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes the rounding that the
@@ -126,7 +132,9 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     Z2, series = Z @ Z, jnp.zeros_like(g)
     for k in reversed(range(9)):  # |Z| < 1/7, so the first term left out is below rounding
         series = identity / (2 * k + 1) + Z2 @ series
-    x = algebra.vee(size * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series)
+    X = size * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series
+    x = algebra.vee(X)
+    converged &= largest(X - algebra.hat(x)) < _OUTSIDE * (1.0 + largest(X))
     remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
     x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
     return jnp.where(converged[..., None], x, jnp.nan)

@@ -360,6 +360,14 @@ class MatrixGroup:
                 "it back to the group first"
             )
         eigenvalues = np.linalg.eigvals(g)
+        angles = np.angle(eigenvalues)
+        no_half_turn = np.abs(angles).max() < np.pi - HALF_TURN_MARGIN
+        if image == "logarithm" and self.is_complex and no_half_turn and abs(total := angles.sum()) > np.pi:
+            return (
+                f"has eigenvalues whose angles sum to {total:.6g}, so its principal logarithm is not in "
+                f"{self.algebra.name}: take the logarithm of g relative to a nearer element h, that is of "
+                "compose(inverse(h), g)"
+            )
         worst = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
             f"has the eigenvalue {worst:.6g} at the angle {abs(np.angle(worst)):.10f}, and det g = "

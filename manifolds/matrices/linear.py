@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices: elimination, frames, the polar decomposition."""
+"""Linear algebra of small matrices: elimination, frames, square roots."""
 
 from __future__ import annotations
 
@@ -12,18 +12,11 @@ def adjoint(a):
     return a.conj().swapaxes(-1, -2)
 
 
-def polar(a) -> jax.Array:
-    """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p."""
-    _, inverse_root, success = _square_root(adjoint(a) @ a)
-    u = a @ inverse_root
-    for _ in range(2):  # the root squares the condition number of a
-        u = orthonormalized(u)
-    success &= largest(adjoint(u) @ u - np.eye(a.shape[-1])) < 1e-12
-    return jnp.where(success[..., None, None], u, jnp.nan)
-
-
 def orthonormalized(u) -> jax.Array:
-    """One step of Newton and Schulz towards :func:`polar`: it squares the distance of ``u^H u`` from I."""
+    """One step of Newton and Schulz towards the nearest matrix with orthonormal columns.
+
+    It squares the distance of ``u^H u`` from I.
+    """
     return 1.5 * u - 0.5 * u @ (adjoint(u) @ u)
 
 

@@ -1,6 +1,6 @@
 """Symmetric matrices: Cholesky factors, eigenvectors by Jacobi's rotations, and a logarithm with all its derivatives.
 
-Beside them the logarithm of rotations, whose symmetric part shows the planes that are turned by pi.
+Beside them the polar decomposition of any matrix, by rotations of the same kind.
 
 Plain array operations of fixed length, for the reason given at :func:`manifolds.matrices.linear.solve` and so that
 small cases can be unrolled into scalar programs. Leading axes are batches.
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .exponential import expm
-from .linear import adjoint, largest, orthonormalized
+from .linear import adjoint, largest, orthonormalized, solve
 from .stumpff import hyperbolic_stumpff
 
 _NEARLY_ONE = 0.5
@@ -65,27 +65,13 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
     where eigenvalues meet.
     """
     n = a.shape[-1]
-    pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)
-    # one or two more than random matrices of size 3, 10, 30, 50 need: 4, 7, 8, 9
-    sweeps = 1 if n == 2 else 4 + n.bit_length()
-    axes = np.tile(np.eye(n)[pairs], (sweeps, 1, 1))  # as unit vectors, so that the program needs no indices that vary
-    is_complex = jnp.iscomplexobj(a)
+    # one or two sweeps more than random matrices of size 3, 10, 30, 50 need: 4, 7, 8, 9
+    axes = _axes_of_sweeps(n, 1 if n == 2 else 4 + n.bit_length())
 
     def rotate(state, axes):
         a, vectors = state
         e, f = axes
-        alpha, beta, entry = ((u @ a @ v)[..., None, None] for u, v in ((e, e), (f, f), (e, f)))
-        alpha, beta, gamma = alpha.real, beta.real, jnp.abs(entry) if is_complex else entry
-        done = gamma == 0.0
-        divisor = jnp.where(done, 1.0, gamma)
-        slope = (beta - alpha) / (2 * divisor)
-        tangent = jnp.where(slope < 0, -1.0, 1.0) / (jnp.abs(slope) + jnp.sqrt(1.0 + slope**2))
-        cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
-        sine = jnp.where(done, 0.0, tangent * cosine)
-        cosine = jnp.where(done, 1.0, cosine)
-        plane, upper = jnp.outer(e, e) + jnp.outer(f, f), jnp.outer(e, f)
-        turn = upper * (entry / divisor) - upper.T * (entry.conj() / divisor) if is_complex else upper - upper.T
-        J = np.eye(n) + (cosine - 1.0) * plane + sine * turn
+        J = _rotation(axes, *(u @ a @ v for u, v in ((e, e), (f, f), (e, f))))
         return (adjoint(J) @ a @ J, vectors @ J), None
 
     start = (a + adjoint(a)) / 2, jnp.broadcast_to(np.eye(n, dtype=a.dtype), a.shape)
@@ -93,6 +79,93 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
     values = jnp.diagonal(d, axis1=-2, axis2=-1).real
     converged = largest(d * (1.0 - np.eye(n))) <= 1e-14 * largest(a)
     return jnp.where(converged[..., None], values, jnp.nan), vectors
+
+
+def _axes_of_sweeps(n: int, sweeps: int) -> np.ndarray:
+    """The axes of the planes of cyclic rotations, as unit vectors, shape (rotations, 2, n)."""
+    pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)
+    return np.tile(np.eye(n)[pairs], (sweeps, 1, 1))
+
+
+def _rotation(axes, alpha, beta, entry):
+    """The rotation in the plane of two axes that makes ``[[alpha, entry], [conj(entry), beta]]`` diagonal."""
+    e, f = axes
+    alpha, beta, entry = (a[..., None, None] for a in (alpha.real, beta.real, entry))
+    is_complex = jnp.iscomplexobj(entry)
+    gamma = jnp.abs(entry) if is_complex else entry
+    done = gamma == 0.0
+    divisor = jnp.where(done, 1.0, gamma)
+    slope = (beta - alpha) / (2 * divisor)
+    tangent = jnp.where(slope < 0, -1.0, 1.0) / (jnp.abs(slope) + jnp.sqrt(1.0 + slope**2))
+    cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
+    sine = jnp.where(done, 0.0, tangent * cosine)
+    cosine = jnp.where(done, 1.0, cosine)
+    plane, upper = jnp.outer(e, e) + jnp.outer(f, f), jnp.outer(e, f)
+    turn = upper * (entry / divisor) - upper.T * (entry.conj() / divisor) if is_complex else upper - upper.T
+    return np.eye(len(e)) + (cosine - 1.0) * plane + sine * turn
+
+
+def orthogonal_images(a) -> tuple[jax.Array, jax.Array]:
+    """``a V``, shape (..., m, n), with orthogonal columns, and the unitary V, shape (..., n, n).
+
+    The norms of the columns are the singular values of a, in no order, each accurate to a rounding of the largest:
+    no product of a with itself is formed. By Jacobi rotations of the columns [Hestenes 1958].
+    """
+    n = a.shape[-1]
+    axes = _axes_of_sweeps(n, 5 + n.bit_length())
+
+    def rotate(state, axes):
+        images, vectors = state
+        u, v = images @ axes[0], images @ axes[1]
+        J = _rotation(axes, *((p.conj() * q).sum(axis=-1) for p, q in ((u, u), (v, v), (u, v))))
+        return (images @ J, vectors @ J), None
+
+    start = a, jnp.broadcast_to(np.eye(n, dtype=a.dtype), (*a.shape[:-2], n, n))
+    return jax.lax.scan(rotate, start, axes)[0]
+
+
+@jax.custom_jvp
+def polar(a) -> jax.Array:
+    """Nearest matrix with orthonormal columns, ``a (a^H a)^-1/2``, shape (..., n, p); NaN where the rank is below p.
+
+    It is accurate to rounding over the sum of the two least singular values, and has derivatives of every order.
+    """
+    images, vectors = orthogonal_images(a)
+    sizes = jnp.sqrt((jnp.abs(images) ** 2).sum(axis=-2, keepdims=True))
+    full = sizes.min(axis=-1, keepdims=True) > _RANK * sizes.max(axis=-1, keepdims=True)
+    u = orthonormalized((images / jnp.where(full, sizes, 1.0)) @ adjoint(vectors))
+    full &= (largest(adjoint(u) @ u - np.eye(a.shape[-1])) < 1e-12)[..., None, None]
+    return jnp.where(full, u, jnp.nan)
+
+
+@polar.defjvp
+def _polar_derivative(primals, tangents):
+    """With ``a = u h``: ``u' = u w + (1 - u u^H) a' h^-1``, and w solves ``h w + w h = u^H a' - a'^H u``.
+
+    The operator on the left is its own adjoint, and a linear solve has derivatives of its own: those of higher order.
+    """
+    (a,), (da,) = primals, tangents
+    u = polar(a)
+    along = adjoint(u) @ da
+    h = adjoint(u) @ a
+    h = 0.5 * (h + adjoint(h))
+    images, vectors = orthogonal_images(jax.lax.stop_gradient(a))
+    sizes = jnp.sqrt((jnp.abs(images) ** 2).sum(axis=-2))
+    sums = sizes[..., :, None] + sizes[..., None, :]
+
+    def solved(vectors, b):
+        return vectors @ ((adjoint(vectors) @ b @ vectors) / sums) @ adjoint(vectors)
+
+    w = jax.lax.custom_linear_solve(
+        lambda w: h @ w + w @ h,
+        along - adjoint(along),
+        solve=lambda _, b: solved(vectors, b),
+        transpose_solve=lambda _, b: solved(vectors.conj(), b),
+    )
+    du = u @ w
+    if a.shape[-2] > a.shape[-1]:
+        du = du + adjoint(solve(h, adjoint(da - u @ along)))
+    return u, du
 
 
 @jax.custom_jvp

@@ -247,6 +247,11 @@ class Space(Maps):
     def distance(self, x, y) -> jax.Array:
         """Length of the shortest geodesic from x to y, shape (...).
 
+        The distance has no derivative where x and y are one point; there its derivative is taken as 0. Its square has
+        all: ``distance(x, y)**2`` has the exact gradient 0 and, as its Hessian, twice the metric. Other functions of
+        the distance that are smooth there, such as ``1 - cos(d)``, have exact derivatives up to the third only: write
+        them with :meth:`squared_distance` where higher ones matter.
+
         Raises
         ------
         DomainError
@@ -256,6 +261,19 @@ class Space(Maps):
         d = self._distance(x, y)
         self._refuse_nan(d, 0, x, y, "distance")
         return d
+
+    def squared_distance(self, x, y) -> jax.Array:
+        """Square of :meth:`distance`, shape (...): a smooth function, also where x and y are one point.
+
+        Raises
+        ------
+        DomainError
+            As for :meth:`distance`.
+        """
+        x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
+        square = self._squared_distance(x, y)
+        self._refuse_nan(square, 0, x, y, "squared_distance")
+        return square
 
     def midpoint(self, x, y) -> jax.Array:
         """Half way along the shortest geodesic from x to y, shape ``(..., *shape)``; raises as :meth:`log`."""

@@ -120,5 +120,8 @@ class Correlation(Definite):
     def _log(self, x, y):
         return self._from_coordinates(x, self._chart(y) - self._chart(x))
 
+    def _squared_distance(self, x, y):
+        return ((self._chart(y) - self._chart(x)) ** 2).sum(axis=-1)
+
     def _transport(self, x, v, u):
         return self._from_coordinates(self._exp(x, v), self._coordinates(x, u))

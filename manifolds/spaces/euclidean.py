@@ -85,6 +85,9 @@ class Euclidean(Space):
     def _log(self, x, y):
         return y - x
 
+    def _squared_distance(self, x, y):
+        return ((y - x) ** 2).sum(axis=self._axes)
+
     def _midpoint(self, x, y):
         return 0.5 * (x + y)
 

@@ -14,8 +14,9 @@ from ..errors import ParameterError
 from ..matrices.exponential import expm
 from ..matrices.linear import complement, largest, skew
 from ..matrices.spectral import spectral
-from ..matrices.symmetric import eigh, orthonormal_columns, symmetrized
+from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrized
 from .base import CUT_MARGIN, Space, register
+from .maps import by_value
 
 _GAP = 1e-8
 """Least distance of the eigenvalues that are taken from those that are not, relative to the largest."""
@@ -24,10 +25,10 @@ _SETTLED = 60
 """Newton's steps for the sign of a matrix: enough for that gap."""
 
 _SMALL = 1 / 8
-"""``sin^2`` of an angle below which a series in it is summed, whose derivatives do not cancel."""
+"""``sin^2`` of half an angle below which a series in it is summed, whose derivatives do not cancel."""
 
 _SERIES = [math.factorial(k) / math.prod(j + 1.5 for j in range(k)) for k in reversed(range(24))]
-"""``t / (sin(t) cos(t)) = 1 + 2/3 s + 8/15 s^2 + …`` in powers of ``s = sin(t)^2``, the highest first."""
+"""``t / sin(t) = 1 + 2/3 s + 8/15 s^2 + …`` in powers of ``s = sin(t/2)^2``, the highest first."""
 
 
 @register((3, 1), (4, 2))
@@ -169,10 +170,31 @@ class Grassmann(Space):
         return symmetrized(turn @ x @ turn.swapaxes(-1, -2))
 
     def _log(self, x, y):
-        """A function of ``sin^2`` of the principal angles and the directions of the turn, which x and y give."""
-        along = self._project_tangent(x, y - x)  # its singular values are sin(t) cos(t)
-        scaled = spectral(_stretch, symmetrized(x @ (np.eye(self.n) - y) @ x)) @ x @ along
-        return self._project_tangent(x, scaled + scaled.swapaxes(-1, -2))
+        """From bases of both subspaces that are turned to each other: the one of y as near to that of x as it can be.
+
+        With the principal angles t, their difference has the singular values ``2 sin(t/2)``: nothing cancels, for
+        neighbours nor at a right angle [Zimmermann & Huper 2022].
+        """
+        at, to = self._near_basis(x), self._near_basis(y)
+        step = to @ polar(to.swapaxes(-1, -2) @ at) - at
+        square = 0.25 * step.swapaxes(-1, -2) @ step
+        across = step - at @ (at.swapaxes(-1, -2) @ step)  # its singular values are sin(t)
+        half = across @ spectral(_stretch, symmetrized(square)) @ at.swapaxes(-1, -2)
+        return half + half.swapaxes(-1, -2)
+
+    def _near_basis(self, x):
+        """An orthonormal basis of the subspace, shape (..., n, p), that is a smooth function of x near this one."""
+        basis = jax.lax.stop_gradient(self._basis(x)[..., : self.p])
+        return polar(x @ basis)
+
+    def _squared_distance(self, x, y):
+        return by_value(self, x, y)
+
+    def _squared_distance_value(self, x, y):
+        """Also at a right angle: eigenvalues of ``x + y - 1`` are cosines of the angles, each of them twice, or 1."""
+        cosines, vectors = eigh(x + y - np.eye(self.n))
+        sines = jnp.sqrt((((x - y) @ vectors) ** 2).sum(axis=-2))
+        return (jnp.arctan2(sines, jnp.abs(cosines)) ** 2).sum(axis=-1)
 
     def _transport(self, x, v, u):
         turn = expm(_bracket(v, x))
@@ -183,11 +205,11 @@ class Grassmann(Space):
 
 
 def _stretch(square):
-    """``t / (sin(t) cos(t))`` for a square of sin(t), by its series where it is small; NaN at a right angle."""
+    """``t / sin(t)`` for a square of ``sin(t/2)``, by its series where it is small; NaN at a right angle."""
     small = square < _SMALL
     series = jnp.polyval(jnp.asarray(_SERIES), jnp.where(small, square, 0.0))
-    sine = jnp.where(small, 0.5, square)
-    cosine = 1.0 - jnp.where(sine < 1.0 - (math.pi / 2 * CUT_MARGIN) ** 2, sine, jnp.nan)
+    sine = jnp.where(small, 0.25, jnp.where(square < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), square, jnp.nan))
+    cosine = 1.0 - sine
     return jnp.where(small, series, jnp.arctan2(jnp.sqrt(sine), jnp.sqrt(cosine)) / jnp.sqrt(sine * cosine))
 
 

@@ -17,10 +17,10 @@ from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
 from ..groups.closed_forms import affine, unchanged
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
-from ..matrices.linear import determinant, polar, skew, solve, spectral_radius, symmetric
-from ..matrices.symmetric import orthonormal_columns
+from ..matrices.linear import determinant, skew, solve, spectral_radius, symmetric
+from ..matrices.symmetric import orthogonal_images, orthonormal_columns, polar
 from .base import Space, register
-from .maps import by_coordinates, by_flat, by_projection
+from .maps import by_coordinates, by_flat, by_projection, by_value
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
@@ -235,6 +235,9 @@ class GroupSpace(Space):
 _MOST_RESTORES = 8
 """Each squares the distance, so that from 1/2 on these reach rounding."""
 
+_HEIGHT = 1e-9
+"""Sine of an angle up to which an eigenvalue is taken to be 1 or -1, so that its angle has no sign."""
+
 register(())(lambda: GroupSpace(Heisenberg(1)))
 register(())(lambda: GroupSpace(SL(2), np.diag([1.0, 2.0, 2.0]) + 0.5))
 
@@ -271,6 +274,29 @@ class BiInvariantSpace(GroupSpace):
     def _reach(self, x, v):
         return Space._reach(self, x, v)
 
+    def _squared_distance(self, x, y):
+        return by_value(self, x, y)
+
+    def _squared_distance_value(self, x, y):
+        """The squares of the angles of the eigenvalues of ``x^-1 y``, defined at half turns too.
+
+        ``|g v + v| = 2 cos(t/2)`` and ``|g v - v| = 2 sin(t/2)`` for eigenvectors v; they are found from the former,
+        to a rounding also where it is small. NaN where the angles are not those of one logarithm in the algebra.
+        """
+        g, one = self._relative(x, y), np.eye(self.shape[0])
+        cosines, vectors = orthogonal_images(g + one)
+        sines = (g - one) @ vectors
+        angles = 2.0 * jnp.arctan2(*(jnp.sqrt((jnp.abs(a) ** 2).sum(axis=-2)) for a in (sines, cosines)))
+        square = (angles**2).sum(axis=-1) / (jnp.abs(self.group.algebra._known_basis()[0]) ** 2).sum()
+        if not self.group.is_complex:
+            return square
+        heights = (vectors.conj() * (g @ vectors)).sum(axis=-2).imag
+        turned = jnp.sin(angles)
+        signs = jnp.where(turned > _HEIGHT, heights / jnp.where(turned > _HEIGHT, turned, 1.0), 0.0)
+        half_turns = (jnp.where(turned > _HEIGHT, 0.0, angles)).sum(axis=-1)
+        total = jnp.abs((signs * angles).sum(axis=-1))
+        return jnp.where(total <= half_turns + 1.0, square, jnp.nan)
+
     def _transport(self, x, v, u):
         """``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
@@ -300,6 +326,11 @@ class SpecialOrthogonal(BiInvariantSpace):
 
     def _project(self, x):
         return _rotation(x)
+
+    def _squared_distance(self, x, y):
+        if self.n <= 3:  # where every rotation has a logarithm
+            return Space._squared_distance(self, x, y)
+        return super()._squared_distance(x, y)
 
     @property
     def _normals(self):
@@ -448,6 +479,10 @@ class SpecialEuclidean(GroupSpace):
 
     def _log(self, x, y):
         return self._map(self.rotations._log, lambda x, y: y - x, x, y)
+
+    def _squared_distance(self, x, y):
+        moved = (y[..., :-1, -1] - x[..., :-1, -1]) / self.length
+        return self.rotations._squared_distance(x[..., :-1, :-1], y[..., :-1, :-1]) + (moved**2).sum(axis=-1)
 
     def _transport(self, x, v, u):
         return self._map(self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -182,10 +183,17 @@ class Maps(ABC):
     def _norm(self, x, v):
         return safe_sqrt(self._inner(x, v, v))
 
+    def _distance(self, x, y):
+        return safe_sqrt(self._squared_distance(x, y))
+
     # These two are made of compiled maps, as a logarithm can be long to compile.
 
-    def _distance(self, x, y):
-        return self._compiled("_norm", x, self._compiled("_log", x, y))
+    def _squared_distance(self, x, y):
+        """The square of the distance, with its derivatives of every order also where both points are one."""
+        if type(self)._distance is not Maps._distance:
+            return self._distance(x, y) ** 2
+        v = self._compiled("_log", x, y)
+        return self._compiled("_inner", x, v, v)
 
     def _midpoint(self, x, y):
         return self._compiled("_exp", x, 0.5 * self._compiled("_log", x, y))
@@ -337,10 +345,43 @@ run = jax.jit(_of_kernel, static_argnums=(0, 1, 2))
 run_hastily = jax.jit(_of_kernel, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0})
 
 
+EQUAL = 2.0**-300
+"""Lengths below this, of any unit, count as zero where a derivative divides by them; a power of two divides exactly."""
+
+
+@jax.custom_jvp
 def safe_sqrt(z):
-    """``sqrt(max(z, 0))``, with the derivative 0 where z <= 0."""
+    """``sqrt(max(z, 0))``, with a derivative that is zero where z and its derivative are, so that its square has all.
+
+    The root d of a square z has no derivative at zero, but ``d**2`` has: z', and z'' after it. JAX computes them as
+    ``2 d d'`` with ``d' = z' / (2 d)``. So where z vanishes, the derivative is that of a root EQUAL, and this root
+    enters the product too.
+    """
     positive = z > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
+
+
+@safe_sqrt.defjvp
+def _derivative_of_root(primals, tangents):
+    (z,), (dz,) = primals, tangents
+    small = z < EQUAL**2
+    far = jnp.sqrt(jnp.where(small, 1.0, z))
+    slope = jnp.where(small, 0.5 / EQUAL, 0.5 / far)  # of constants, which have no derivatives to overflow
+    return jnp.where(small, EQUAL, far), jnp.where(z < 0.0, 0.0, slope) * dz
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def by_value(space: Any, x, y):
+    """The squared distance from ``_squared_distance_value``, defined at the cut locus too, with derivatives by the log.
+
+    At the cut locus there are no derivatives: they are NaN.
+    """
+    return space._squared_distance_value(x, y)
+
+
+@by_value.defjvp
+def _derivative_by_log(space, primals, tangents):
+    return by_value(space, *primals), jax.jvp(partial(Maps._squared_distance, space), primals, tangents)[1]
 
 
 # -- what several spaces have: ``_inner = by_flat`` in the body of a class ---------------------------------------------

@@ -197,8 +197,8 @@ class Product(Space):
     def _midpoint(self, x, y):
         return self._joined("_midpoint", x, y)
 
-    def _distance(self, x, y):
-        return jnp.linalg.norm(jnp.stack(self._each("_distance", x, y)), axis=0)
+    def _squared_distance(self, x, y):
+        return sum(self._each("_squared_distance", x, y))
 
     def _transport(self, x, v, u):
         return self._joined("_transport", x, v, u)
@@ -363,8 +363,8 @@ class Power(Space):
     _log = forwarded("base")
     _midpoint = forwarded("base")
 
-    def _distance(self, x, y):
-        return jnp.linalg.norm(self.base._distance(x, y), axis=-1)
+    def _squared_distance(self, x, y):
+        return self.base._squared_distance(x, y).sum(axis=-1)
 
     _transport = forwarded("base")
 

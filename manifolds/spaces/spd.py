@@ -100,8 +100,16 @@ class SPD(Definite):
         return symmetrized(half @ half.swapaxes(-1, -2))  # positive definite by its form
 
     def _log(self, x, y):
+        return _congruent(cholesky(x), self._log_at_identity(x, y))
+
+    def _log_at_identity(self, x, y):
+        """The logarithm of y at x, as both are carried by the isometry that takes x to the identity."""
         inverse = self._inverse_factor(x)
-        return _congruent(cholesky(x), spd_log(_congruent(inverse, y), _congruent(inverse, y - x)))
+        return spd_log(_congruent(inverse, y), _congruent(inverse, y - x))
+
+    def _squared_distance(self, x, y):
+        v = self._log_at_identity(x, y)
+        return self._pair(v, v)
 
     def _transport(self, x, v, u):
         inverse = self._inverse_factor(x)

@@ -113,9 +113,9 @@ class Sphere(Space):
         defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
         return jnp.where(defined, arc(z, cosine) * w, jnp.nan)
 
-    def _distance(self, x, y):
-        chord, cochord = (safe_sqrt(((y + s * x) ** 2).sum(axis=-1)) for s in (-1.0, 1.0))
-        return 2.0 * jnp.arctan2(chord, cochord)
+    def _squared_distance(self, x, y):
+        chord, cochord = (((y + s * x) ** 2).sum(axis=-1) for s in (-1.0, 1.0))
+        return 4.0 * chord * arc(chord, safe_sqrt(cochord)) ** 2
 
     def _midpoint(self, x, y):
         total = x + y

@@ -12,8 +12,8 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
-from ..matrices.linear import complement, largest, lyapunov, orthonormalized, polar, skew, solve, symmetric
-from ..matrices.symmetric import orthonormal_columns
+from ..matrices.linear import complement, largest, lyapunov, orthonormalized, skew, solve, symmetric
+from ..matrices.symmetric import orthonormal_columns, polar
 from .base import CUT_MARGIN, Space, register
 from .maps import by_flat
 

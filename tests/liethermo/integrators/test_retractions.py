@@ -1,0 +1,112 @@
+"""Every space with every retraction that it has: a run ends where one without charts does."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from manifolds.retractions.charts import RETRACTIONS
+
+METHODS = {
+    "gauss": (lt.MetriplecticGauss, (2,), 1e-5),
+    "midpoint": (lt.MetriplecticMidpoint, (), 5e-4),
+    "explicit": (lt.MetriplecticRungeKutta, (4,), 1e-5),
+}
+"""The class, its arguments, and what two steps of 0.02 may miss by; at most 2e-6 and, on flags, 1.2e-4 seen."""
+
+QUICK = {("SO(3)", "projection", "midpoint"), ("S^2", "projection", "midpoint")}
+
+
+def kinds(space) -> list[str]:
+    """The retractions that a space has, by the table of its page."""
+    factors = space.factors if isinstance(space, mf.Product) else (space,)
+    found = ["exp", "midpoint", "projection"] if space.geodesics else ["projection"]
+    if all(isinstance(factor, mf.Euclidean | mf.SPD) for factor in factors):
+        found += ["euclidean", "midpoint_euclidean"]
+    if all(isinstance(factor, mf.Euclidean | mf.GroupSpace) for factor in factors):
+        found += ["group_exp", "midpoint_group_exp"]
+        found += [] if space.name == "SU(3)" else ["cayley", "midpoint_cayley"]
+    return found
+
+
+def methods(kind: str) -> list[str]:
+    """All of them by projection; of the others the one that it is meant for: most of the time is compilation."""
+    if kind == "projection":
+        return list(METHODS)
+    return ["midpoint" if kind.startswith("midpoint") else "gauss"]
+
+
+CASES = [
+    pytest.param(
+        space,
+        kind,
+        method,
+        id=f"{space.name}-{kind}-{method}",
+        marks=[] if (space.name, kind, method) in QUICK else [pytest.mark.slow],
+    )
+    for space in mf.registered_spaces()
+    for kind in kinds(space)
+    for method in methods(kind)
+]
+
+
+@pytest.mark.slow
+def test_each_space_has_the_retractions_of_its_page_and_no_others():
+    for space in mf.registered_spaces():
+        for kind in set(RETRACTIONS) - set(kinds(space)):
+            with pytest.raises(mf.ManifoldsError):
+                mf.retraction(space, kind)
+
+
+def falling(space) -> lt.MetriplecticSystem:
+    """A gradient flow; on a quotient that of a function of its classes."""
+    weights = np.random.default_rng(0).standard_normal(space.shape)
+
+    def energy(x):
+        if isinstance(space, mf.Homogeneous):
+            first = space.from_vector(space.to_vector(x))[:, :1]
+            return jnp.sum(weights[:, :1] * (first @ first.T) @ np.ones((space.shape[0], 1)))
+        return jnp.sum(weights * x).real
+
+    return lt.MetriplecticSystem(None, energy, dissipation=lt.Friction(), space=space, validate=False)
+
+
+@pytest.mark.parametrize(("space", "kind", "method"), CASES)
+def test_a_run_in_charts_ends_where_one_without_does(space, kind, method):
+    """The steps without charts are ten times as short, and of another method."""
+    build, arguments, allowed = METHODS[method]
+    system, start = falling(space), np.asarray(space.to_vector(space.random(5)))
+    run = lt.integrate(system, start, (0.0, 0.04), 0.02, build(*arguments, retraction=kind))
+    around = lt.MetriplecticRungeKutta(6) if space.surrounded else lt.MetriplecticRungeKutta(6, retraction="exp")
+    reference = lt.integrate(system, start, (0.0, 0.04), 0.002, around)
+    assert float(space.residual(system.points(run.x[-1]))) < 1e-14
+    ends = [system.points(found.x[-1]) for found in (run, reference)]
+    if isinstance(space, mf.Flag):  # a chart by projection leaves the horizontal way: the class is what is compared
+        ends = [space.projectors(end) for end in ends]
+    assert np.abs(np.asarray(ends[0] - ends[1])).max() < allowed * max(1.0, np.abs(start).max())
+    assert np.abs(run.x[-1] - start).max() > 2 * allowed  # control: it moves
+
+
+def test_taylor_steps_name_the_chart_that_has_no_series():
+    space = mf.SPD(2)
+    system, start = falling(space), space.random(5)
+    with pytest.raises(lt.LiethermoError, match=r"(?s)RiemannianRetraction.*leave out retraction="):
+        lt.integrate(system, start, (0.0, 0.04), 0.02, lt.MetriplecticTaylor(4, retraction="exp"))
+
+
+@pytest.mark.slow
+def test_the_advice_for_taylor_steps_works():
+    space = mf.SPD(2)
+    system, start = falling(space), space.random(5)
+    ends = [
+        lt.integrate(system, start, (0.0, 0.04), 0.01, method).x[-1]
+        for method in (
+            lt.MetriplecticTaylor(6),
+            lt.MetriplecticGauss(2, retraction="exp"),
+            lt.MetriplecticRungeKutta(4, retraction="exp"),
+        )
+    ]
+    assert np.abs(ends[1] - ends[0]).max() < 1e-6 > np.abs(ends[2] - ends[0]).max()
