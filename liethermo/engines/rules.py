@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..functions.gradients import EPS
-from ..integrators.levels import MAX_MISS
+from ..integrators.levels import MAX_MISS, MIN_MISS
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class Rules:
         What an explicit step may miss of the levels that it ends on, relative to its length. A step that leaves more
         has not been corrected, even where that is less than rounding of the state: near an equilibrium, where gradients
         depend on each other, all that is left has one sign, and adds up.
+    corrected_at_rest : float
+        What it may miss relative to the state, if the step is short.
     vanished : float
         Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
     steered : float
@@ -83,6 +85,7 @@ class Rules:
     floor: float = 1e-5 * EPS
     plateau: float = 1e3 * EPS
     corrected: float = MAX_MISS
+    corrected_at_rest: float = MIN_MISS
     vanished: float = 1e-280
     steered: float = 4 * EPS
     constant: float = 100.0

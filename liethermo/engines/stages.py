@@ -243,7 +243,7 @@ def explicit(system: System, method: OneStepMethod, x, compensation, h, k, rules
     x, none = system.solved_for(x)[1], jnp.zeros((), dtype=jnp.int64)
     size = rules.size(x.size)
     missed = size(jnp.zeros_like(x).at[0].set(defect(k)))  # it is the length of a vector
-    converged = missed <= rules.corrected * size(k[0]) + rules.floor * scale_of(x, h, k[0], rules)
+    converged = missed <= rules.corrected * size(k[0]) + rules.corrected_at_rest * scale_of(x, h, k[0], rules)
     return Solved(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
 
 

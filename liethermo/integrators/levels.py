@@ -21,8 +21,11 @@ CORRECTIONS = 4
 RELAXED_CORRECTIONS = 3
 """Further corrections of a step whose levels have no common point, which leave the growth of the entropy open."""
 
-MAX_MISS, MIN_MISS = 64.0 * EPS, 1e-5 * EPS
-"""What a corrected step may miss of its levels: relative to its length; and relative to the state, if it is short."""
+MAX_MISS = 64.0 * EPS
+"""What a corrected step may miss of its levels, relative to its length."""
+
+MIN_MISS = 0.01 * EPS
+"""What it may miss relative to the state: the step of a state at rest is rounding, of which no correction is known."""
 
 MAX_RELAXED_MISS = 1e-6
 """What a step may miss of the levels that stay, relative to its length and before any correction, for these corrections
@@ -194,7 +197,8 @@ def corrected(
     s, ends = moved(s)  # of a short step one correction is enough
     ended = done(s)
 
-    can_be_released = 0 < sum(law.sign == 0.0 for law in laws) < len(laws)
+    conserved = sum(law.sign == 0.0 for law in laws)
+    can_be_released = conserved < len(laws) and (conserved > 0 or surface is not None)
     number = corrections - 1 + (RELAXED_CORRECTIONS + 1 if can_be_released else 0)
 
     def further() -> tuple[Ended, jax.Array]:

@@ -29,7 +29,7 @@ STEP_LIMIT = 1e-2
 """Newton step of the learned numbers, in standard errors, below which the iteration has converged."""
 
 SCHUR_RTOL = 1e-12
-"""Eigenvalues of the scaled normal matrix, relative to the largest, below which a combination is not determined."""
+"""Eigenvalues of the normal matrix, scaled to a diagonal of ones, below which a combination is not determined."""
 
 FIRST_STATE_PRIOR = 1e-4
 """Weight of a first state staying where it is, in units of the search and of the variance of the residuals: a move by
@@ -188,7 +188,8 @@ def refine(
     total = costs[taken].sum()
     variance = total / freedom if freedom > 0 else np.nan
     inverse, _, condition = _inverse(schur)
-    without_prior, rank, _ = _inverse(_schur(squares, slopes, p, taken)[0])
+    of_weights = np.diag(squares[taken].sum(axis=0))[:p]  # with the first states known
+    without_prior, rank, _ = _inverse(_schur(squares, slopes, p, taken)[0], of_weights)
     if rank < p:  # the prior alone determines the rest
         inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
     held = np.nan
@@ -283,13 +284,21 @@ def _step(squares, slopes, p: int, taken, damping: float) -> tuple[np.ndarray, n
     return step, np.stack(moves)
 
 
-def _inverse(schur: np.ndarray) -> tuple[np.ndarray, int, float]:
-    """Return the inverse of a normal matrix, infinite where it has none, its rank, and the condition of its root."""
-    diagonal = np.diag(schur)
+def _inverse(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
+    """Return the inverse of a normal matrix, infinite where it has none, its rank, and the condition of its root.
+
+    Parameters
+    ----------
+    schur : array, shape (p, p)
+    diagonal : array, shape (p,), optional
+        The diagonal before first states were eliminated. What is left of an entry is rounding if the first states make
+        up for the weight; by default nothing was eliminated.
+    """
+    diagonal = np.diag(schur) if diagonal is None else diagonal
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(schur * np.outer(scale, scale))
-    is_determined = values > SCHUR_RTOL * max(values[-1], 0.0)
-    rank = int(is_determined.sum()) if values[-1] > 0.0 else 0
+    is_determined = values > SCHUR_RTOL
+    rank = int(is_determined.sum())
     condition = float(np.sqrt(values[-1] / values[0])) if rank == len(values) else np.inf
     scaled = vectors * scale[:, None]
     inverse = (scaled[:, is_determined] / values[is_determined]) @ scaled[:, is_determined].T

@@ -146,7 +146,7 @@ class _Members:
     # -- facts --------------------------------------------------------------------------------------------------------
 
     def multiples(self) -> np.ndarray:
-        """Of which function each preserved one is a multiple, shape (B, preserved): see ``names_of_preserved``."""
+        """The place of the function of which each preserved one is a multiple, shape (B, preserved); -1 for none."""
         count = len(self.member.preserved)
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)

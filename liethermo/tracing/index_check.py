@@ -95,7 +95,7 @@ def _check(jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, in_tables: list[
 def _called(eqn) -> tuple[Jaxpr, Sequence]:
     """Return the jaxpr that an equation calls, and its constants."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+    return (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
 
 
 def _depends_on_entries_outside(closed: ClosedJaxpr) -> bool:

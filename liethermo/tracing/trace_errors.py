@@ -24,7 +24,7 @@ REFUSED_IN_JAX = {
     ),
     jax.errors.TracerArrayConversionError: (
         "it passes a traced value to NumPy",
-        "Replace np by jnp, such as np.sin by jnp.sin",
+        "Replace np by jax.numpy, such as np.sin by jnp.sin",
     ),
     jax.errors.TracerIntegerConversionError: (
         "it uses a traced value as a Python integer",
@@ -36,7 +36,7 @@ REFUSED_IN_JAX = {
     ),
     jax.errors.ConcretizationTypeError: (
         "it converts a traced value to a Python number, as float and the functions of math do",
-        "Leave out float, and replace math by jnp, such as math.sin by jnp.sin",
+        "Leave out float, and replace math by jax.numpy, such as math.sin by jnp.sin",
     ),
 }
 """The errors that JAX raises if a traced value is used as a number: what the function does, and what to do instead."""
