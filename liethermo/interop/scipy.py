@@ -17,6 +17,7 @@ from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.integrate import integrate, solution_without_steps
+from ..runs.timetable import times_within
 from ..runs.watch import Watch
 from ..systems import System
 
@@ -255,10 +256,7 @@ def _times(t_eval, start: float, end: float) -> np.ndarray:
     times = np.asarray(t_eval, dtype=np.float64)
     if times.ndim != 1 or np.any(np.diff(times) <= 0.0):
         raise InputError("t_eval must be a list of increasing times")
-    outside = times[~((times >= start) & (times <= end))]
-    if outside.size:
-        raise InputError(f"t_eval has the time {outside[0]:g}, which is outside of t_span = ({start:g}, {end:g})")
-    return times
+    return times_within(times, start, end, "t_eval")
 
 
 def _tuple(args) -> tuple:

@@ -161,21 +161,33 @@ class Course:
 
 def course_of(span, step: float | Adaptive, every: int | None, save_at=None, endless: bool = False) -> Course:
     """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
-    size = span[1] - span[0] if isinstance(step, Adaptive) and len(span) == 2 else step
-    course = Course(span, size, every, endless=endless)
-    if save_at is None:
-        return course
-    return Course(span, size, None, _stops(save_at, course.start, course.end), endless)
+    start, end = _checked_span(span, endless)
+    size = end - start if isinstance(step, Adaptive) else step
+    stops = None if save_at is None else _stops(save_at, start, end)
+    return Course((start, end), size, every if stops is None else None, stops, endless)
 
 
 def _stops(save_at, start: float, end: float) -> np.ndarray:
     """The times at which steps have to end, the end of the span among them."""
     times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
-        raise InputError(f"save_at is a list of times, not {save_at!r}")
-    if times.min() < start or times.max() > end:
-        raise InputError(f"save_at has times from {times.min():g} to {times.max():g}, outside ({start:g}, {end:g})")
-    return np.unique([*times, end])
+        raise InputError(f"save_at must be a list of times, got {save_at!r}")
+    return np.unique([*times_within(times, start, end, "save_at"), end])
+
+
+def times_within(times: np.ndarray, start: float, end: float, name: str) -> np.ndarray:
+    """Return times that are moved to an end of a span if they lie beyond it by rounding: 0.1 + 0.1 + 0.1 > 0.3.
+
+    Raises
+    ------
+    InputError
+        If one lies outside of the span.
+    """
+    rounding = ROUNDINGS_OF_TIME * EPS * max(abs(start), abs(end) if math.isfinite(end) else 0.0)
+    outside = times[~((times >= start - rounding) & (times <= end + rounding))]
+    if outside.size:
+        raise InputError(f"{name} must be times of t_span = ({start:g}, {end:g}), got {outside[0]:g}, outside of it")
+    return np.clip(times, start, end)
 
 
 def _time_after(start, steps, h: float) -> np.ndarray:
@@ -202,13 +214,13 @@ def _checked_span(span, endless: bool) -> tuple[float, float]:
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
-        raise InputError(f"t_span must be two numbers (start, end), not {span!r}") from None
+        raise InputError(f"t_span must be two numbers (start, end), got {span!r:.60}") from None
     if not (math.isfinite(start) and end > start and (endless or math.isfinite(end))):
         cure = "" if end != math.inf else (
             ". An infinite end needs lt.integrate with adaptive steps and an event to stop at: step=lt.Adaptive(rtol), "
             "until=event"
         )  # fmt: skip
-        raise InputError(f"t_span must be finite and increasing, not ({start:g}, {end:g}){cure}")
+        raise InputError(f"t_span must be finite and increasing, got ({start:g}, {end:g}){cure}")
     return start, end
 
 
@@ -218,7 +230,7 @@ def _checked_step(step, start: float, end: float) -> float:
     except (TypeError, ValueError):
         raise InputError(f"step must be a number, not {step!r}") from None
     if not (math.isfinite(h) and h > 0.0):
-        raise InputError(f"step must be positive and finite, not {h:g}: time runs forwards, since entropy grows")
+        raise InputError(f"step must be positive and finite, got {h:g}")
     if start + h == start or end + h == end:
         raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
     return h

@@ -165,3 +165,42 @@ def test_a_small_tolerance_with_a_low_order(method):
     better = lt.MetriplecticRungeKutta(8) if "lt.MetriplecticRungeKutta(8)" in words else lt.MetriplecticGauss(4)
     assert better.order == 8
     assert run(system, span=(0.0, 20.0), step=step, method=better).status.ok
+
+
+# -- times ------------------------------------------------------------------------------------------------------------
+
+SUM = 0.1 + 0.1 + 0.1
+"""A rounding above 0.3."""
+
+
+def test_times_that_are_a_rounding_beyond_the_end_are_the_end():
+    system = lt.models.rigid_body((3.0, 2.0, 1.0))
+    assert SUM > 0.3
+    for step in (STEP, lt.Adaptive(1e-6)):
+        run_ = run(system, span=(0.0, 0.3), step=step, save_at=[0.1, SUM])
+        assert run_.t.tolist() == [0.0, 0.1, 0.3]
+    assert lt.scipy.solve_ivp(system, (0.0, 0.3), START, t_eval=[0.1, SUM]).t.tolist() == [0.1, 0.3]
+    many = lt.ensemble(system, START, (0.0, 0.3), STEP, save_at=[0.1, SUM])
+    assert many.t.tolist() == [0.0, 0.1, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"save_at": [0.5, 1.5]}, r"save_at must be times of t_span = \(0, 1\), got 1.5, outside of it"),
+        ({"step": 0.0}, "step must be positive and finite, got 0$"),
+        ({"span": 1.0}, r"t_span must be two numbers \(start, end\), got 1.0"),
+        ({"span": 1.0, "step": lt.Adaptive(1e-6)}, r"t_span must be two numbers \(start, end\), got 1.0"),
+        ({"span": "ab", "step": lt.Adaptive(1e-6)}, r"t_span must be two numbers \(start, end\), got 'ab'"),
+        ({"span": (1.0, 0.0)}, r"t_span must be finite and increasing, got \(1, 0\)"),
+    ],
+)
+def test_times_that_cannot_be_used(options, message):
+    with pytest.raises(lt.InputError, match=message):
+        run(lt.models.rigid_body((3.0, 2.0, 1.0)), **options)
+
+
+@pytest.mark.parametrize("span", [[0.0, 1.0], np.array([0.0, 1.0]), (0, 1)], ids=str)
+def test_a_span_may_be_any_pair_of_numbers(span):
+    assert run(lt.models.rigid_body((3.0, 2.0, 1.0)), span=span).t[-1] == 1.0
+    assert run(lt.models.rigid_body((3.0, 2.0, 1.0)), span=span, step=lt.Adaptive(1e-6)).t[-1] == 1.0
