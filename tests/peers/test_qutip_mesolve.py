@@ -61,6 +61,7 @@ HAMILTONIANS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("H", HAMILTONIANS)
 def test_constant_decay(H):
     """``9 exp(-kappa t)`` quanta; QuTiP asks for 1e-6."""
@@ -70,6 +71,7 @@ def test_constant_decay(H):
     assert run.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(8)], ids=str
 )
@@ -112,6 +114,7 @@ def test_a_hamiltonian_that_is_not_hermitian_is_refused():
 # -- a qubit: testQubitDynamics1, 2 ------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("g2", [0.1, 0.0])
 def test_qubit_dynamics(g2):
     """A rotation about x with dephasing by ``sqrt(g2) sz``; QuTiP compares with a formula that is right to 0.05."""
@@ -150,6 +153,7 @@ def test_vacuum_rabi_oscillations(end):
     assert run.audit().passed
 
 
+@pytest.mark.sampled(1)
 def test_decay_without_interaction():
     """Case 2: a cavity and an atom that decay each by itself, kappa = 0.005 and gamma = 0.01; QuTiP asks for 5e-3."""
     w, kappa, gamma, n = 2.0 * np.pi, 0.005, 0.01, 2

@@ -31,6 +31,7 @@ def run(system, engine, **options):
     return lt.integrate(system, X0, (0.0, 0.5), 0.1, lt.MetriplecticRungeKutta(4), engine=engine, **options)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", ENERGIES)
 def test_is_compiled(name):
     system = lt.LiePoissonSystem(mf.so(3), ENERGIES[name])

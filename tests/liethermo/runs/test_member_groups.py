@@ -45,6 +45,7 @@ def field(a):
     return rate
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_members_are_as_if_alone(method):
     alone = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP, method).x[-1] for a in A])
@@ -95,6 +96,7 @@ def test_a_point_of_a_study():
     assert np.abs(study.results.x.values - alone).max() < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS[1:3], ids=str)
 def test_a_flow_under_vmap(method):
     def end(a):

@@ -419,7 +419,7 @@ def test_dense_output_is_asked_for():
         ({"until": 3.0}, r"lt\.Relaxed\(tol\) or a function"),
         ({"until": lambda x: x}, "one number"),
         ({"until": lt.Relaxed(1e-3), "system": lt.models.free_rigid_body()}, "produces no entropy"),
-        ({"save_at": [0.5, 2.0]}, r"outside \(0, 1\)"),
+        ({"save_at": [0.5, 2.0]}, r"times of t_span = \(0, 1\), got 2, outside of it"),
         ({"save_at": [np.nan]}, "list of times"),
     ],
 )

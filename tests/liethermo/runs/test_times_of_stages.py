@@ -51,6 +51,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_is_known_in_the_span_only(method, step):
@@ -80,6 +81,7 @@ def test_kept_states_dense_output_and_events():
     assert np.array_equal(until.x[-1], dense.x[-1])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-8)], ids=["fixed", "adaptive"])
 def test_members_of_an_ensemble_are_single_runs_to_the_bit(step, engine):

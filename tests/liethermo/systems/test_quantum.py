@@ -746,6 +746,7 @@ def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
 SHIFTED_METHODS = [lt.MetriplecticRungeKutta(4), lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("coupling", [LOWER, X], ids=["lowering", "Hermitian"])
 @pytest.mark.parametrize("method", SHIFTED_METHODS, ids=str)
 def test_two_levels_relax_beside_a_third_one_far_below(method, coupling):
@@ -773,6 +774,7 @@ def test_a_bath_takes_the_heat_of_a_small_gap_between_large_energies():
     assert ends[1] == pytest.approx(ends[0], rel=1e-12)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("shift", [1e6, 1e10, 1e13])
 @pytest.mark.parametrize("kind", ["isolated", "noise", "bath", "driven", "terms", "steepest ascent"])
 def test_a_constant_added_to_the_hamiltonian_changes_no_state(kind, shift):
@@ -855,6 +857,7 @@ COLD = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "by", ["explicit", "midpoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Taylor", "Gauss"))]
 )
@@ -917,6 +920,7 @@ BATHS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("baths", BATHS)
 def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
     """With and without a floor of the entropy: the one that is asked for is the one that is seen."""
@@ -938,6 +942,7 @@ def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
             lt.integrate(q, [0.0, 1.0], (0.0, 2.0), 0.05, lt.MetriplecticMidpoint())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "method",
     [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(12)],

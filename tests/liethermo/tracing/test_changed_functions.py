@@ -206,6 +206,7 @@ def renewed(function):
     return types.FunctionType(function.__code__, function.__globals__, function.__name__)
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("name", USES)
 def test_it_is_traced_again(monkeypatch, name):
     function, use = USES[name]
