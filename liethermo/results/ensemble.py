@@ -401,7 +401,7 @@ STATES = ("x", "x0", "attitude", "attitude0")
 """The arrays of states, trajectories first."""
 
 
-class Part(NamedTuple):
+class Subset(NamedTuple):
     """Some trajectories of an ensemble.
 
     Attributes
@@ -415,12 +415,12 @@ class Part(NamedTuple):
     ensemble: Ensemble
 
 
-def joined(parts: Sequence[Part], size: int, **fields: Any) -> Ensemble:
+def join_subsets(parts: Sequence[Subset], size: int, **fields: Any) -> Ensemble:
     """Return the ensemble of all trajectories; those in no part are inadmissible.
 
     Parameters
     ----------
-    parts : sequence of Part
+    parts : sequence of Subset
         At least one.
     size : int
         The number of trajectories.

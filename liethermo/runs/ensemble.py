@@ -16,7 +16,7 @@ from ..engines.codes import Code
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
-from ..results.ensemble import Ensemble, Part, joined
+from ..results.ensemble import Ensemble, Subset, join_subsets
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, pacing_of
@@ -161,19 +161,19 @@ def ensemble(
     described["inertia"] = None if inertia is None else inertia.tolist()
     groups, refused = groups_of(family, method, states)
     reasons = dict(reasons) | {int(run[i]): text for i, text in refused.items()}
-    parts: list[Part] = []
+    parts: list[Subset] = []
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
         for places, group in groups:
             own = np.asarray(attitude)[run[places]] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
             done = sum(len(part.run) for part in parts)
             stopped = any((part.ensemble.status == Code.INTERRUPTED).any() for part in parts)
-            bar_of_group = functools.partial(_advance, bar, done)
-            part, why = plan.run(group, states[places], run[places], own, bar_of_group, stopped)
+            tell = functools.partial(_advance, bar, done)
+            part, why = plan.run(group, states[places], run[places], own, tell, stopped)
             parts += [] if part is None else [part]
             reasons |= why
     if not parts:
         raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
-    return joined(
+    return join_subsets(
         parts,
         size,
         reasons=reasons,
@@ -205,7 +205,7 @@ class _Plan(NamedTuple):
         attitude,
         tell: Callable[[float], None],
         stopped: bool,
-    ) -> tuple[Part | None, dict[int, str]]:
+    ) -> tuple[Subset | None, dict[int, str]]:
         """Run the members of a group from their initial states; None if none can be started.
 
         The second result says why trajectories could not be started, or have failed, by their numbers.
@@ -276,7 +276,7 @@ class _Plan(NamedTuple):
             witness=None if noise_dimension(method) else Followed(record, method, again, equal),
             alone=Alone(record, method, run),
         )
-        return Part(run, found), reasons | {int(run[j]): text for j, text in record.reasons.items()}
+        return Subset(run, found), reasons | {int(run[j]): text for j, text in record.reasons.items()}
 
 
 def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
