@@ -88,8 +88,7 @@ class Family:
                 "parameters of a system are a dict from names to arrays; "
                 "for another form give a function that builds the system in its place"
             )
-        paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
-        leaves = {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
+        leaves = named_parameters(system)
         values = {name: leaf[None] for name, leaf in leaves.items()}
         for name, value in parameters.items():
             if name not in leaves:
@@ -282,6 +281,12 @@ class Family:
         """The parameters of some members, in front where they differ, and the axes for ``vmap``."""
         arrays = [jnp.asarray(value[chosen] if varies else value[0]) for value, varies in self._columns]
         return arrays, [0 if varies else None for varies in self.varying]
+
+
+def named_parameters(system: System) -> dict[str, np.ndarray]:
+    """Return the parameters of a system by name, such as ``dissipation.rate``."""
+    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
+    return {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
 
 
 def common_size(*sizes: int) -> int:

@@ -163,8 +163,10 @@ def course_of(span, step: float | Adaptive, every: int | None, save_at=None, end
     """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
     start, end = _checked_span(span, endless)
     size = end - start if isinstance(step, Adaptive) else step
-    stops = None if save_at is None else _stops(save_at, start, end)
-    return Course((start, end), size, every if stops is None else None, stops, endless)
+    course = Course((start, end), size, every, endless=endless)
+    if save_at is None:
+        return course
+    return Course((start, end), size, None, _stops(save_at, start, end), endless)
 
 
 def _stops(save_at, start: float, end: float) -> np.ndarray:

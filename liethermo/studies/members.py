@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.conditions import noting, refusal
-from ..runs.family import Family
+from ..runs.family import Family, named_parameters
 from ..systems import System
 
 LOT = 8192
@@ -71,8 +71,7 @@ def builder(build: System | Callable[[dict], System], parameters: tuple[str, ...
         if not callable(build):
             raise InputError(f"a study takes a system, or a function that builds one, not {build!r:.60}")
         return build
-    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(build, eqx.is_inexact_array))
-    leaves = {jax.tree_util.keystr(path).removeprefix("."): np.shape(leaf) for path, leaf in paths}
+    leaves = {name: value.shape for name, value in named_parameters(build).items()}
     places = {}
     for name in parameters:
         # the name of a leaf may end with an index too, such as numbers[0]

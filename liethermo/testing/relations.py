@@ -17,8 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from manifolds.testing import Report, Suite
@@ -34,6 +32,7 @@ from ..results.load import load
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.ensemble import Ensemble, ensemble
+from ..runs.family import named_parameters
 from ..runs.fluctuations import Fluctuations
 from ..runs.integrate import integrate
 from ..studies.axes import replicas
@@ -403,7 +402,7 @@ def company(case: Case) -> Outcome:
 
     The others have the parameters of the system made equal, made zero in part, and of the other sign.
     """
-    names = parameters_of(case.system)
+    names = {name: value for name, value in named_parameters(case.system).items() if value.size}
     if not names:
         return "the system has no parameters"
     rows = {name: np.stack([value, *companions(value)]) for name, value in names.items()}
@@ -437,13 +436,6 @@ def company(case: Case) -> Outcome:
     case.near("in a study", first, place_of(alone, 0), case.rounding)
     case.near("in a study backwards", in_study(forwards[::-1]), first, 0.0)
     return None
-
-
-def parameters_of(system: System) -> dict[str, np.ndarray]:
-    """The parameters of a system by name."""
-    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
-    named = {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
-    return {name: value for name, value in named.items() if value.size}
 
 
 def companions(value: np.ndarray) -> list[np.ndarray]:
